@@ -1,0 +1,30 @@
+"""The car, its sensors and the Gymnasium environment around them."""
+
+# A second copy under another name breaks pickles and poisons numba's cache.
+if __name__ != "sideslip.envs":
+    raise ImportError(f"this folder is the package sideslip.envs; it was imported as {__name__}")
+
+from .kernel import FAILURES
+from .layout import Entry
+from .record import Log, Record, SlowSensor
+from .scenarios import SCENARIOS, Scenario, scenario_from
+from .stability import StabilityEnv
+from .vehicle import COMS, PASSENGER_CAR, VEHICLES, Vehicle, critical_speed, vehicle_from
+
+__all__ = [
+    "COMS",
+    "FAILURES",
+    "PASSENGER_CAR",
+    "SCENARIOS",
+    "VEHICLES",
+    "Entry",
+    "Log",
+    "Record",
+    "Scenario",
+    "SlowSensor",
+    "StabilityEnv",
+    "Vehicle",
+    "critical_speed",
+    "scenario_from",
+    "vehicle_from",
+]

@@ -1,0 +1,172 @@
+"""One text, several machines: the compiler's decorator and the table of primitives.
+
+The equations of sideslip are plain scalar functions over tuples. `jit` compiles them; `plain`
+rebuilds the very same functions for Python floats, NumPy arrays or any other table of primitives.
+"""
+
+import hashlib
+import math
+import os
+import shutil
+import types
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numba
+import numpy as np
+from numba.core.dispatcher import Dispatcher
+from numba.extending import overload
+from numba.np.unsafe.ndarray import to_fixed_tuple
+
+_PACKAGE = Path(__file__).resolve().parent.parent
+_FOLDERS = ("envs", "estimators", "agents", "benchmarks")
+_KEPT_CACHES = 4
+
+config: Any = numba.config
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def source_stamp() -> str:
+    """The hash of every source file of the package, which names the folder of compiled kernels.
+
+    numba watches only the file of the function itself: an edit in a callee's module would
+    otherwise silently give the numbers of the old text.
+    """
+    digest = hashlib.sha256()
+    for folder in _FOLDERS:
+        for path in sorted((_PACKAGE / folder).glob("*.py")):
+            digest.update(path.name.encode())
+            digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def _cache_folder() -> str | None:
+    """A writable folder for this version's kernels, or None; older versions' are pruned."""
+    home = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
+    base = Path(os.environ.get("NUMBA_CACHE_DIR") or Path(home) / "sideslip" / "kernels")
+    folder = base / source_stamp()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        os.utime(folder)
+        newest = sorted(base.iterdir(), key=lambda path: path.stat().st_mtime, reverse=True)
+    except OSError:
+        return None
+    if not os.access(folder, os.W_OK):
+        return None
+    if "NUMBA_CACHE_DIR" not in os.environ:  # a folder of the user's own is not ours to prune
+        for old in newest[_KEPT_CACHES:]:
+            shutil.rmtree(old, ignore_errors=True)
+    return str(folder)
+
+
+_CACHE = None if config.DISABLE_JIT else _cache_folder()
+
+
+def jit(function: F) -> F:
+    """Compile with numba: IEEE arithmetic in the order written, cached on disk where possible."""
+    options: dict[str, Any] = {"error_model": "numpy", "fastmath": False}
+    if _CACHE is None:
+        return numba.njit(**options)(function)  # type: ignore[no-any-return]
+    before, config.CACHE_DIR = config.CACHE_DIR, _CACHE
+    try:
+        return numba.njit(cache=True, **options)(function)  # type: ignore[no-any-return]
+    finally:
+        config.CACHE_DIR = before
+
+
+@jit
+def minimum(a: Any, b: Any) -> Any:
+    """The smaller of two numbers."""
+    return a if a < b else b
+
+
+@jit
+def maximum(a: Any, b: Any) -> Any:
+    """The larger of two numbers."""
+    return a if a > b else b
+
+
+@jit
+def absolute(a: Any) -> Any:
+    """|a|."""
+    return a if a > 0.0 else 0.0 - a
+
+
+@jit
+def floor(a: Any) -> Any:
+    """The largest whole number at or below a, as a float."""
+    return math.floor(a) * 1.0
+
+
+@jit
+def sqrt(a: Any) -> Any:
+    """The square root, correctly rounded."""
+    return math.sqrt(a)
+
+
+@jit
+def select(condition: Any, a: Any, b: Any) -> Any:
+    """a where the condition holds, else b (both are evaluated)."""
+    return a if condition else b
+
+
+@jit
+def to_float(a: Any) -> Any:
+    """An integer as a float."""
+    return a * 1.0
+
+
+def fixed_tuple(vector: Any, length: int) -> tuple[float, ...]:
+    """The first `length` entries of a vector as a tuple of scalars."""
+    return tuple(vector[:length].tolist())
+
+
+@overload(fixed_tuple, prefer_literal=True)
+def _fixed_tuple(vector, length):  # type: ignore[no-untyped-def]  # numba compares signatures
+    size = getattr(length, "literal_value", None)
+    if size is None:
+        return None  # numba asks again with the literal
+    return lambda vector, length: to_fixed_tuple(vector, size)  # type: ignore[call-arg]
+
+
+ARRAYS: dict[str, Callable[..., Any]] = {
+    "minimum": np.minimum,
+    "maximum": np.maximum,
+    "absolute": np.absolute,
+    "floor": np.floor,
+    "sqrt": np.sqrt,
+    "select": np.where,
+    "to_float": lambda a: np.multiply(a, 1.0),
+}
+"""The primitives for NumPy arrays, by the names the equations use."""
+
+
+def plain(function: F, table: Mapping[str, Callable[..., Any]] | None = None) -> F:
+    """The same text without the compiler.
+
+    Parameters: `function`, compiled by `jit` or not; `table`, primitives by name that replace
+    ours (`ARRAYS` for NumPy arrays, None for Python floats).
+    Returns: a function built from the same code object, its callees replaced likewise.
+    """
+    rebuilt: F = _rebuild(function, dict(table or {}), {})
+    return rebuilt
+
+
+def _rebuild(function: Any, table: dict[str, Any], done: dict[Any, Any]) -> Any:
+    source = function.py_func if isinstance(function, Dispatcher) else function
+    if source.__name__ in table and source.__module__ == __name__:
+        return table[source.__name__]
+    if source in done:
+        return done[source]
+    names: dict[str, Any] = dict(source.__globals__)
+    rebuilt = types.FunctionType(source.__code__, names, source.__name__, source.__defaults__)
+    done[source] = rebuilt
+    for name in source.__code__.co_names:
+        callee = names.get(name)
+        ours = isinstance(callee, types.FunctionType) and (callee.__module__ or "").startswith(
+            __name__.rpartition(".envs")[0]
+        )
+        if isinstance(callee, Dispatcher) or ours:
+            names[name] = _rebuild(callee, table, done)
+    return rebuilt

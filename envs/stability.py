@@ -1,0 +1,379 @@
+"""StabilityEnv: the Gymnasium environment of a car that is kept stable by its yaw moment."""
+
+import copy
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import numpy.typing as npt
+from gymnasium.error import ResetNeeded
+
+from .dynamics import Motion
+from .kernel import REFUSED, REPORT, RUNNING, reset_vehicle, step_vehicle
+from .layout import Entry, P, Z, observation_layout
+from .programme import DRAWS_WIDTH
+from .record import FAST_WIDTH, PACKET_WIDTH, SLOW_NAMES, TICK, Record, SlowSensor
+from .scenarios import Scenario, scenario_from
+from .sensors import IN_FLIGHT, ticks
+from .template import Template, template_of
+from .vehicle import Vehicle, vehicle_from
+
+CAMERA_33_30 = SlowSensor(period=0.033, delays=(0.030,))
+CAMERA_UNEVEN = SlowSensor(period=0.033, delays=(0.010,), jitter=0.020)
+GPS_5_HZ = SlowSensor(period=0.2)
+
+SENSOR_SETS: dict[str, dict[str, SlowSensor]] = {
+    "vision": {"camera": CAMERA_33_30},
+    "vision-uneven": {"camera": CAMERA_UNEVEN},
+    "gps": {"gps": GPS_5_HZ},
+}
+
+_OPTIONS = ("scenario", "vehicle", "friction", "state", "duration")
+
+
+class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
+    """Keep a car's sideslip angle where it should be, with the torque difference of two motors.
+
+    ## Action
+    `Box(-1, 1, (1,), float32)`: the yaw moment as a share of its full scale (372.7 N m for the
+    COMS; positive turns left and drives the right wheel). Zero is the uncontrolled car. Values
+    outside are clipped. A non-finite action or a wrong shape raises ValueError and steps nothing;
+    with `on_bad_action="fail"` a non-finite action ends the episode as a failure.
+
+    ## Observation
+    A float32 summary whose length does not depend on the control period. `layout` gives name,
+    unit and bounds of each entry:
+
+    | entries | unit | meaning |
+    |---|---|---|
+    | gyro, accel_y, accel_x, wheel_left, wheel_right | rad/s, m/s2, m/s | last sample of the step |
+    | ..._mean | | mean over the step (`fast="all"`: every sample instead of last and mean) |
+    | steer, torque_left, torque_right | rad, N m | applied, in the last tick |
+    | steer_command | rad | the driver's |
+    | camera_psi, camera_y_l | rad, m | newest camera sample (where the id has a camera) |
+    | gps_course, gps_speed, gps_X, gps_Y | rad, m/s, m | newest GPS sample |
+    | ..._age, ..._fresh | s, - | its age, at most 10 s; 1 if it arrived in this step |
+    | beta_ref, gamma_ref | rad, rad/s | reference from driver and nominal vehicle |
+
+    Before the first sample a slow sensor's values are 0, its age 10 s, fresh 0.
+
+    ## Record
+    `env.unwrapped.record` is what the car's wires carried in the step: a `Record` of fast rows
+    (one a millisecond) and time-stamped packets. Estimators read only this.
+
+    ## Reward
+    Minus the integral over the step of
+    c = (e_beta/0.02)^2 + (e_gamma/0.1)^2 + 0.01 (N_z/N_max)^2, capped at 100 per second; with the
+    reference "zero-slip" the yaw rate is not judged. On failure the rest of the episode is
+    charged at 100 per second.
+
+    ## Episode end
+    `terminated`: the car spun (sideslip above 0.5 rad) or left the ground. `truncated`: the
+    scenario's duration is over (the env truncates itself; there is no TimeLimit).
+
+    ## Info
+    `t, beta, gamma, psi, beta_ref, gamma_ref, steer, yaw_moment, cost, failure, is_success`
+    (floats, `failure` an int code of `sideslip.envs.FAILURES`, `is_success` a bool).
+
+    ## Options of reset
+    `scenario`, `vehicle`, `friction`, `state` (mapping of `v_x, v_y, gamma, psi, X, Y, s, y,
+    theta`), `duration` (s), for that episode; unknown keys raise ValueError.
+
+    ## Arguments
+    All JSON-able. sensors: "vision", "vision-uneven" or "gps". scenario: a name or a mapping.
+    vehicle: the true one; nominal: what estimators and controllers are told (default: the
+    vehicle). control_period: ticks of 1 ms. reference: "zero-slip", "model" (the nominal steady
+    state) or "limited" (by friction). fast: "summary" or "all". camera, gps: fields of
+    `SlowSensor` that replace the id's. yaw_first: yaw moment before acceleration where both pass
+    the motors' limit.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012  Gymnasium's convention
+
+    def __init__(
+        self,
+        sensors: str = "vision",
+        scenario: str | Mapping[str, Any] | Scenario = "random-steering",
+        vehicle: str | Mapping[str, Any] | Vehicle = "coms",
+        nominal: str | Mapping[str, Any] | Vehicle | None = None,
+        control_period: int = 10,
+        reference: str = "zero-slip",
+        fast: str = "summary",
+        camera: Mapping[str, Any] | None = None,
+        gps: Mapping[str, Any] | None = None,
+        yaw_first: bool = True,
+        on_bad_action: str = "raise",
+        render_mode: str | None = None,
+    ) -> None:
+        if sensors not in SENSOR_SETS:
+            raise ValueError(f"unknown sensors {sensors!r}; known: {', '.join(SENSOR_SETS)}")
+        if isinstance(control_period, bool) or not isinstance(control_period, int | np.integer):
+            raise TypeError(f"control_period is a number of ticks, got {control_period!r}")
+        if not 1 <= control_period <= 1000:
+            raise ValueError(f"control_period is 1 to 1000 ticks, got {control_period}")
+        if fast not in ("summary", "all"):
+            raise ValueError(f"fast is 'summary' or 'all', got {fast!r}")
+        if on_bad_action not in ("raise", "fail"):
+            raise ValueError(f"on_bad_action is 'raise' or 'fail', got {on_bad_action!r}")
+        if render_mode is not None:
+            raise ValueError(f"unknown render_mode {render_mode!r}; known: none")
+        self.render_mode = render_mode
+        self.control_period = int(control_period)
+        self._sensors = _with_changes(SENSOR_SETS[sensors], {"camera": camera, "gps": gps})
+        self._reference, self._fast = reference, fast
+        self._yaw_first, self._fail_bad = yaw_first, on_bad_action == "fail"
+        self._vehicle = vehicle_from(vehicle)
+        self._nominal = self._vehicle if nominal is None else vehicle_from(nominal)
+        self._base = self._template(scenario_from(scenario), self._vehicle)
+        self._now = self._base
+        self.annotations: dict[str, float] = {}
+
+        n = self.control_period
+        self.layout: tuple[Entry, ...] = observation_layout(tuple(self._sensors), n, fast)
+        self._bounds = np.array([[entry[2], entry[3]] for entry in self.layout]).T.copy()
+        low, high = self._bounds.astype(np.float32)
+        self.observation_space = gym.spaces.Box(low, high, dtype=np.float32)
+        self.action_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
+        self._params, self._state = np.zeros(P.end), np.zeros(Z.end)
+        self.rows = np.zeros((n, FAST_WIDTH))
+        room = sum(_most_packets(sensor, n) for sensor in self._sensors.values())
+        self.packets = np.zeros((room, PACKET_WIDTH))
+        self._report = np.zeros(len(REPORT))
+        self._drawn = np.zeros(DRAWS_WIDTH)
+        self.ticks_done = 0  # rows of the newest record
+        self.delivered = 0  # its packets
+        self._over = True
+
+    def _template(self, scenario: Scenario, vehicle: Vehicle) -> Template:
+        slow = dict(self._sensors)
+        if scenario.camera_delays is not None and "camera" in slow:
+            delays = scenario.camera_delays
+            slow["camera"] = dataclasses.replace(slow["camera"], delays=delays, jitter=0.0)
+        return template_of(
+            scenario,
+            vehicle,
+            self._nominal,
+            slow,
+            self._reference,
+            self._fast == "all",
+            self._yaw_first,
+            self._fail_bad,
+        )
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[npt.NDArray[np.float32], dict[str, Any]]:
+        """Start an episode; see the class docstring for the options."""
+        super().reset(seed=seed)
+        start = np.full(len(Motion._fields), np.nan)
+        self._now = self._optioned(dict(options), start) if options else self._base
+        now = self._now
+        key = int(self.np_random.integers(0, 2**64, dtype=np.uint64))
+        obs = np.empty(len(self.layout), np.float32)
+        reset_vehicle(
+            now.params,
+            now.low,
+            now.high,
+            now.switches,
+            start,
+            self._drawn,
+            key & 0xFFFFFFFF,
+            key >> 32,
+            self._bounds,
+            self._params,
+            self._state,
+            obs,
+            self.rows,
+            self.packets,
+            self._report,
+        )
+        self._over = False
+        self.annotations = {}
+        return obs, self._info(1, False)
+
+    def _optioned(self, options: dict[str, Any], start: npt.NDArray[np.float64]) -> Template:
+        unknown = sorted(set(options) - set(_OPTIONS))
+        if unknown:
+            raise ValueError(
+                f"unknown reset option {', '.join(unknown)}; known: {', '.join(_OPTIONS)}"
+            )
+        scenario = scenario_from(options.get("scenario", self._base.scenario))
+        vehicle = vehicle_from(options.get("vehicle", self._vehicle))
+        if "friction" in options:
+            scenario = scenario.replace(friction=float(options["friction"]))
+        if "duration" in options:
+            scenario = scenario.replace(duration=float(options["duration"]))
+        state = dict(options.get("state", {}))
+        for i, name in enumerate(Motion._fields):
+            start[i] = state.pop(name, np.nan)
+        if state:
+            raise ValueError(f"unknown state {', '.join(state)}; known: {Motion._fields}")
+        return self._template(scenario, vehicle)
+
+    def step(
+        self, action: npt.ArrayLike
+    ) -> tuple[npt.NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+        """Hold the action for one control period."""
+        if self._over:
+            raise ResetNeeded("the episode is over or was never started: call reset() first")
+        force = np.asarray(action, np.float32)
+        if force.shape != (1,):
+            raise ValueError(f"an action has shape (1,), got shape {force.shape}")
+        obs = np.empty(len(self.layout), np.float32)
+        done = step_vehicle(
+            self._params,
+            self._state,
+            self._now.switches,
+            force,
+            self.control_period,
+            self._bounds,
+            obs,
+            self.rows,
+            self.packets,
+            self._report,
+        )
+        if done <= 0:
+            if done == REFUSED:
+                raise ValueError(f"action {force.tolist()} is not finite; nothing was stepped")
+            obs = np.zeros_like(obs)
+        info = self._info(done, True)
+        terminated = info["failure"] != RUNNING
+        truncated = info["is_success"]
+        self._over = terminated or truncated
+        return obs, -info["cost"], terminated, truncated, info
+
+    def _info(self, done: int, stepped: bool) -> dict[str, Any]:
+        (
+            t, beta, gamma, psi, beta_ref, gamma_ref, steer, yaw_moment, cost,
+            code, delivered, _, ended,
+        ) = self._report.tolist()  # fmt: skip
+        self.ticks_done = done
+        self.delivered = int(delivered)
+        failure = int(code)
+        return {
+            "t": t,
+            "beta": beta,
+            "gamma": gamma,
+            "psi": psi,
+            "beta_ref": beta_ref,
+            "gamma_ref": gamma_ref,
+            "steer": steer,
+            "yaw_moment": yaw_moment,
+            "cost": cost,
+            "failure": failure,
+            "is_success": stepped and ended == 1.0 and failure == RUNNING,
+        }
+
+    @property
+    def record(self) -> Record:
+        """What the wires carried in the newest step, or at tick 0 after a reset (a copy)."""
+        last = int(self._state[Z.clock + 2])
+        return Record(
+            self.rows[: self.ticks_done].copy(),
+            self.packets[: self.delivered].copy(),
+            last - self.ticks_done + 1,
+        )
+
+    @property
+    def dt(self) -> float:
+        """The base tick in seconds."""
+        return TICK
+
+    @property
+    def scenario(self) -> Scenario:
+        """The scenario of this episode."""
+        return self._now.scenario
+
+    @property
+    def vehicle(self) -> Vehicle:
+        """The true vehicle of this episode, with what the seed drew."""
+        car = self._params
+        return (
+            self._now.vehicle.replace(
+                front_stiffness=float(car[P.car + 4]),
+                rear_stiffness=float(car[P.car + 5]),
+                friction=float(car[P.car + 10]),
+            )
+            if car[P.car] > 0.0
+            else self._now.vehicle
+        )
+
+    @property
+    def nominal(self) -> Vehicle:
+        """The vehicle that estimators and controllers are told."""
+        return self._now.nominal
+
+    @property
+    def held_speed(self) -> float | None:
+        """The speed in m/s that is held exactly (small-angle plant), else None."""
+        return self._now.scenario.held_speed
+
+    @property
+    def slow_sensors(self) -> dict[str, SlowSensor]:
+        """The slow sensors by name, with the clock phase that this episode drew."""
+        told = {}
+        for name, sensor in self._now.slow.items():
+            if sensor.phase is None:
+                at = Z.camera if name == SLOW_NAMES[0] else Z.gps
+                frames, upcoming = self._state[at], self._state[at + 1]
+                first = upcoming - frames * ticks(sensor.period)
+                sensor = dataclasses.replace(sensor, phase=first * TICK)
+            told[name] = sensor
+        return told
+
+    @property
+    def redraws(self) -> int:
+        """Unstable draws thrown away at this reset."""
+        return int(self._state[Z.clock + 4])
+
+    def annotate(self, **values: float) -> None:
+        """Numbers to draw beside the truth, from wrappers (beta_hat, ...)."""
+        self.annotations.update(values)
+
+    def get_state(self) -> dict[str, Any]:
+        """A snapshot that `set_state` continues from, bit for bit."""
+        return {
+            "params": self._params.copy(),
+            "state": self._state.copy(),
+            "template": self._now,
+            "rows": self.rows.copy(),
+            "packets": self.packets.copy(),
+            "report": self._report.copy(),
+            "progress": (self.ticks_done, self.delivered, self._over),
+            "rng": copy.deepcopy(self.np_random),
+        }
+
+    def set_state(self, snapshot: Mapping[str, Any]) -> None:
+        """Go back to a snapshot of this env or of one built with the same arguments."""
+        if np.shape(snapshot["rows"]) != self.rows.shape:
+            raise ValueError(
+                f"the snapshot has {len(snapshot['rows'])} ticks a step, this env {len(self.rows)}"
+            )
+        self._params[:] = snapshot["params"]
+        self._state[:] = snapshot["state"]
+        self._now = snapshot["template"]
+        self.rows[:] = snapshot["rows"]
+        self.packets[:] = snapshot["packets"]
+        self._report[:] = snapshot["report"]
+        self.ticks_done, self.delivered, self._over = snapshot["progress"]
+        self.np_random = copy.deepcopy(snapshot["rng"])
+
+
+def _with_changes(
+    sensors: dict[str, SlowSensor], changes: dict[str, Mapping[str, Any] | None]
+) -> dict[str, SlowSensor]:
+    changed = dict(sensors)
+    for name, fields in changes.items():
+        if fields is None:
+            continue
+        if name not in sensors:
+            raise ValueError(f"this id has no {name}; it has: {', '.join(sensors)}")
+        changed[name] = dataclasses.replace(sensors[name], **fields)
+    return changed
+
+
+def _most_packets(sensor: SlowSensor, n: int) -> int:
+    """Room for the worst case: all frames of a step and all that were under way."""
+    return 2 * (n // int(ticks(sensor.period)) + 1) + IN_FLIGHT

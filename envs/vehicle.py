@@ -1,0 +1,185 @@
+"""The vehicle's parameters, a unit on each, and two presets."""
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+GRAVITY = 9.81
+
+
+def _unit(unit: str, text: str, default: float | None = None) -> Any:
+    metadata = {"unit": unit, "text": text}
+    if default is None:
+        return field(metadata=metadata)
+    return field(default=default, metadata=metadata)
+
+
+_MAY_BE_ZERO = ("motor_lag", "steering_lag")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Vehicle:
+    """A car with two in-wheel motors at the rear axle.
+
+    Cornering stiffness is per tyre, as in the papers (an axle has 2 C). Letters of the papers
+    stand in the descriptions: `Vehicle.__dataclass_fields__[name].metadata` has text and unit.
+
+    Raises ValueError on a value that is not finite or not positive (lags may be zero).
+    """
+
+    name: str = "vehicle"
+    mass: float = _unit("kg", "m")
+    yaw_inertia: float = _unit("kg m2", "I, about the vertical axis")
+    front_arm: float = _unit("m", "l_f, centre of gravity to front axle")
+    rear_arm: float = _unit("m", "l_r, centre of gravity to rear axle")
+    front_stiffness: float = _unit("N/rad", "C_f, one front tyre")
+    rear_stiffness: float = _unit("N/rad", "C_r, one rear tyre")
+    front_track: float = _unit("m", "d_f, between the front wheels")
+    rear_track: float = _unit("m", "d_r, between the rear wheels")
+    wheel_radius: float = _unit("m", "r")
+    gravity_height: float = _unit("m", "h, height of the centre of gravity")
+    motor_torque: float = _unit("N m", "T_max, limit of one motor")
+    motor_lag: float = _unit("s", "time constant of the motors", 0.005)
+    steering_lag: float = _unit("s", "time constant of the steering actuator", 0.03)
+    preview: float = _unit("m", "l_pre, the camera's preview distance", 5.135)
+    friction: float = _unit("-", "mu, tyre to road", 0.9)
+
+    def __post_init__(self) -> None:
+        for entry in dataclasses.fields(self):
+            if entry.name == "name":
+                continue
+            value = getattr(self, entry.name)
+            if not isinstance(value, int | float) or isinstance(value, bool):
+                raise TypeError(f"Vehicle.{entry.name}: expected a number, got {value!r}")
+            low_ok = value >= 0.0 if entry.name in _MAY_BE_ZERO else value > 0.0
+            if not (math.isfinite(value) and low_ok):
+                least = "zero or more" if entry.name in _MAY_BE_ZERO else "positive"
+                unit = entry.metadata["unit"]
+                raise ValueError(
+                    f"Vehicle.{entry.name}: {value!r} {unit} is not {least} and finite"
+                )
+
+    def replace(self, **changes: Any) -> "Vehicle":
+        """A copy with some parameters changed; TypeError on an unknown name."""
+        return dataclasses.replace(self, **changes)
+
+    def scaled(self, front: float, rear: float | None = None) -> "Vehicle":
+        """A copy whose cornering stiffnesses are `front` and `rear` (or `front`) times ours."""
+        return self.replace(
+            front_stiffness=self.front_stiffness * front,
+            rear_stiffness=self.rear_stiffness * (front if rear is None else rear),
+        )
+
+    @property
+    def wheelbase(self) -> float:
+        """l = l_f + l_r in m."""
+        return self.front_arm + self.rear_arm
+
+    @property
+    def yaw_moment_limit(self) -> float:
+        """The largest yaw moment of the two motors in N m (372.7 for the COMS)."""
+        return self.motor_torque * self.rear_track / self.wheel_radius
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON types only; `vehicle_from` reads it back."""
+        return dataclasses.asdict(self)
+
+
+def critical_speed(vehicle: Vehicle) -> float:
+    """The speed in m/s above which the linear vehicle is unstable; inf if it understeers."""
+    excess = vehicle.front_stiffness * vehicle.front_arm - vehicle.rear_stiffness * vehicle.rear_arm
+    if excess <= 0.0:
+        return math.inf
+    product = 2.0 * vehicle.front_stiffness * vehicle.rear_stiffness * vehicle.wheelbase**2
+    return math.sqrt(product / (vehicle.mass * excess))
+
+
+COMS = Vehicle(  # Table I of tie-vision; front track and height of the centre are assumed
+    name="coms",
+    mass=380.0,
+    yaw_inertia=136.08,
+    front_arm=0.8,
+    rear_arm=0.6,
+    front_stiffness=6000.0,
+    rear_stiffness=6000.0,
+    front_track=0.84,
+    rear_track=0.82,
+    wheel_radius=0.22,
+    gravity_height=0.45,
+    motor_torque=100.0,
+)
+
+PASSENGER_CAR = Vehicle(  # a compact electric car with two 700 N m in-wheel motors
+    name="passenger-car",
+    mass=1500.0,
+    yaw_inertia=2400.0,
+    front_arm=1.2,
+    rear_arm=1.5,
+    front_stiffness=55000.0,
+    rear_stiffness=60000.0,
+    front_track=1.55,
+    rear_track=1.55,
+    wheel_radius=0.31,
+    gravity_height=0.55,
+    motor_torque=700.0,
+    preview=12.0,
+)
+
+VEHICLES: dict[str, Vehicle] = {"coms": COMS, "passenger-car": PASSENGER_CAR}
+
+_STIFFNESS_KEYS = {
+    f"{axle}_stiffness{suffix}": (f"{axle}_stiffness", factor)
+    for axle in ("front", "rear")
+    for suffix, factor in (("_per_tyre", 1.0), ("_axle", 0.5))
+}
+
+
+def vehicle_from(source: "str | Vehicle | Mapping[str, Any]") -> Vehicle:
+    """A vehicle from a preset's name, a mapping of parameters, or a vehicle itself.
+
+    A mapping may name a preset to start from under `"base"`. Raises ValueError for an unknown
+    preset, TypeError for an unknown or missing parameter.
+    """
+    if isinstance(source, Vehicle):
+        return source
+    if isinstance(source, str):
+        if source not in VEHICLES:
+            raise ValueError(f"unknown vehicle {source!r}; known: {', '.join(VEHICLES)}")
+        return VEHICLES[source]
+    values = dict(source)
+    base = values.pop("base", None)
+    known = {entry.name for entry in dataclasses.fields(Vehicle)}
+    unknown = sorted(set(values) - known)
+    if unknown:
+        raise TypeError(f"unknown vehicle parameter {', '.join(map(repr, unknown))}")
+    if base is not None:
+        return vehicle_from(base).replace(**values)
+    return Vehicle(**values)
+
+
+def vehicle_from_file_values(values: Mapping[str, Any], where: str) -> Vehicle:
+    """A vehicle from a file's keys, where the stiffness keys must name their convention.
+
+    `front_stiffness_per_tyre` or `front_stiffness_axle` (two tyres together), and so for the
+    rear. Parameters that a file leaves out (tracks, wheel radius, ...) come from the preset under
+    `base`, by default the passenger car.
+
+    Raises ValueError if a stiffness has no convention, TypeError for an unknown key.
+    """
+    read: dict[str, Any] = {"base": "passenger-car"}
+    for key, value in values.items():
+        if key in ("front_stiffness", "rear_stiffness"):
+            raise ValueError(f"{where}: {key!r} must say {key}_per_tyre or {key}_axle")
+        if key in _STIFFNESS_KEYS:
+            name, factor = _STIFFNESS_KEYS[key]
+            if name in read:
+                raise ValueError(f"{where}: {name} is given twice")
+            read[name] = value * factor
+        else:
+            read[key] = value
+    try:
+        return vehicle_from(read)
+    except (TypeError, ValueError) as error:
+        raise type(error)(f"{where}: {error}") from None
