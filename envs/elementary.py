@@ -83,7 +83,7 @@ def atan(x: Any) -> Any:
 def atan2(y: Any, x: Any) -> Any:
     """The angle of the vector (x, y) in [-pi, pi]; 0 at the origin."""
     safe = select(absolute(x) > 1e-300, x, 1e-300)
-    half_turn = select(x < 0.0, select(y < 0.0, -PI, PI), 0.0)
+    half_turn = select(safe < 0.0, select(y < 0.0, -PI, PI), 0.0)
     return atan(y / safe) + half_turn
 
 

@@ -138,6 +138,7 @@ def _deliver(z: Any, tick: Any, packets: Any, count: int) -> int:
             z[newest + 2] = z[best + PACKET.captured]
             for i in range(VALUES):
                 z[newest + 3 + i] = z[best + PACKET.value + i]
+            z[newest + 3 + VALUES] = tick
         z[best + PACKET.arrived] = NEVER
         count += 1
 
@@ -235,7 +236,8 @@ def _observe(
             obs[k] = _clip(select(seen, (tick - z[at + 2]) * TICK, AGE_CAP), 0.0, AGE_CAP)
             fresh = 0.0
             for i in range(count):
-                if packets[i, PACKET.sensor] == sensor:
+                newest = packets[i, PACKET.arrived] == z[at + 3 + VALUES]  # not late, no duplicate
+                if packets[i, PACKET.sensor] == sensor and newest:
                     fresh = 1.0
             obs[k + 1] = fresh
             k += 2
@@ -372,7 +374,7 @@ def step_vehicle(
 
     A non-finite action does nothing and returns REFUSED, or fails the episode (`fail_bad`).
     """
-    share = action[0] * 1.0
+    share = float(action[0])  # in plain Python a float32 would make float32 of all that follows
     if share - share != 0.0:  # NaN or infinite
         if switches[5] == 0:
             return REFUSED
@@ -404,13 +406,27 @@ def step_vehicle(
     left, right, steer_acted = T_l, T_r, delta
     done = 0
     lagging = motor.start + steering.start > 0.0
+    both_lag = motor.start * steering.start > 0.0
     start = load_of(Inputs(delta, T_l, T_r), car, small_angle)
     command = steering_at(tick, programme)
     for j in range(n):
         a_x, integral = acceleration_command(tick, motion.v_x, integral, pace, limit)
         to_l, to_r = distribute(N_z, a_x, car, task.yaw_first)
         F_w, N_w = wind_at(tick, wind)
-        if lagging:  # the actuators move continuously: a tick starts where the last one ended
+        if lagging:  # actuators that lag move continuously: a tick starts where the last one ended
+            if not both_lag:  # the other one jumps
+                start = _load_at(
+                    command,
+                    delta,
+                    steering.start,
+                    to_l,
+                    T_l,
+                    to_r,
+                    T_r,
+                    motor.start,
+                    car,
+                    small_angle,
+                )
             middle = _load_at(
                 command,
                 delta,
@@ -463,6 +479,7 @@ def step_vehicle(
         finite = motion.v_x + motion.v_y + motion.gamma + motion.psi + motion.Y
         if finite - finite != 0.0:
             failure = NOT_FINITE
+            motion, beta, refs = before, 0.0, (0.0, 0.0)  # the last that is fit for `info`
         elif absolute(beta) > task.spin:
             failure = SPIN
         elif absolute(motion.y) > task.half_width:

@@ -70,6 +70,7 @@ class Slow(NamedTuple):
     v_1: Any
     v_2: Any
     v_3: Any
+    arrived: Any  # tick of its delivery
 
 
 def _offsets(parts: dict[str, int]) -> dict[str, int]:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+import math
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -72,12 +73,13 @@ class SlowSensor:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "delays", tuple(float(d) for d in self.delays))
-        if not self.period >= TICK:
+        if not TICK <= self.period < math.inf:
             raise ValueError(f"a slow sensor's period must be at least one tick, got {self.period}")
         if not self.delays or len(self.delays) > 4:
             raise ValueError(f"expected one to four delays, got {self.delays}")
-        if min(self.delays) < 0.0 or self.jitter < 0.0 or (self.phase or 0.0) < 0.0:
-            raise ValueError("delays, jitter and phase of a slow sensor must not be negative")
+        times = (*self.delays, self.jitter, self.phase or 0.0)
+        if not all(0.0 <= time < math.inf for time in times):
+            raise ValueError(f"{self}: delays, jitter and phase must be finite and not negative")
         for name in ("loss", "duplicate"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ValueError(f"{name} is a probability, got {getattr(self, name)}")

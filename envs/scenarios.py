@@ -94,13 +94,19 @@ class Scenario:
             low, high = self.range(name)
             if not (math.isfinite(low) and math.isfinite(high) and low <= high):
                 raise ValueError(f"scenario {self.name!r}: {name} {getattr(self, name)!r}")
-        for name in ("frequency", "front_stiffness", "rear_stiffness", "friction"):
+        numbers = {name: getattr(self, name) for name in _NUMBERS} | dict(self.noise)
+        for name, value in (numbers | {"acceleration": self.acceleration or 0.0}).items():
+            if not math.isfinite(value):
+                raise ValueError(f"scenario {self.name!r}: {name} {value!r} is not finite")
+        for name in ("frequency", "frequency_3", "front_stiffness", "rear_stiffness", "friction"):
             if self.range(name)[0] <= 0.0:
                 raise ValueError(f"scenario {self.name!r}: {name} must be positive")
-        if self.range("speed")[0] < 0.0 or self.disturbance_time <= 0.0 or self.curve_ramp <= 0.0:
+        if self.range("speed")[0] < 0.0 or not all(
+            value > 0.0 for value in (self.disturbance_time, self.curve_ramp, self.half_width)
+        ):
             raise ValueError(
-                f"scenario {self.name!r}: speed must not be negative, disturbance_time and "
-                "curve_ramp must be positive"
+                f"scenario {self.name!r}: speed must not be negative, disturbance_time, "
+                "curve_ramp and half_width must be positive"
             )
 
     def range(self, name: str) -> tuple[float, float]:
@@ -147,6 +153,14 @@ class Scenario:
 
 
 _SIDES = ("side", "wind_side")
+_NUMBERS = (
+    "disturbance_force",
+    "disturbance_moment",
+    "disturbance_time",
+    "curvature",
+    "curve_start",
+    "curve_ramp",
+)
 
 _DRAWN: dict[str, Any] = {
     "mirror": True,

@@ -59,7 +59,8 @@ def link_of(sensor: SlowSensor | None, outage: tuple[float, float] | None = None
     """
     if sensor is None:
         return Link._make([0.0] * len(Link._fields))
-    most = int(ticks(sensor.longest_delay) // ticks(sensor.period)) + 1
+    longest = max(ticks(delay) for delay in sensor.delays) + ticks(sensor.jitter)
+    most = int(longest // ticks(sensor.period)) + 1
     if sensor.duplicate > 0.0:
         most = 2 * (most + 1)
     if most > IN_FLIGHT:

@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -207,9 +208,13 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
             scenario = scenario.replace(duration=float(options["duration"]))
         state = dict(options.get("state", {}))
         for i, name in enumerate(Motion._fields):
-            start[i] = state.pop(name, np.nan)
+            value = state.pop(name, None)
+            if value is not None and not math.isfinite(value):
+                raise ValueError(f"reset option state: {name} is {value!r}, not a finite number")
+            start[i] = np.nan if value is None else value
         if state:
-            raise ValueError(f"unknown state {', '.join(state)}; known: {Motion._fields}")
+            known = ", ".join(Motion._fields)
+            raise ValueError(f"unknown state {', '.join(state)}; known: {known}")
         return self._template(scenario, vehicle)
 
     def step(
@@ -338,6 +343,7 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
             "params": self._params.copy(),
             "state": self._state.copy(),
             "template": self._now,
+            "layout": self.layout,
             "rows": self.rows.copy(),
             "packets": self.packets.copy(),
             "report": self._report.copy(),
@@ -351,6 +357,8 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
             raise ValueError(
                 f"the snapshot has {len(snapshot['rows'])} ticks a step, this env {len(self.rows)}"
             )
+        if snapshot["layout"] != self.layout:
+            raise ValueError("the snapshot is of an env with other sensors or another observation")
         self._params[:] = snapshot["params"]
         self._state[:] = snapshot["state"]
         self._now = snapshot["template"]

@@ -1,0 +1,65 @@
+# The developer's verbs; `make help` lists them. Each makes the virtual environment it needs.
+PYTHON ?= python3
+WORKERS ?= 2
+
+BIN := .venv/bin
+PYTEST := $(BIN)/python -m pytest --confcutdir=tests
+# Pip's build environments are pinned as well (the second name is pip 25.3's and later).
+INSTALL := PIP_CONSTRAINT=constraints.txt PIP_BUILD_CONSTRAINT=constraints.txt \
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
+
+.DEFAULT_GOAL := help
+.NOTPARALLEL:
+.DELETE_ON_ERROR:
+.PHONY: help bench test test-all coverage lint types wheel clean
+
+help: ## list the targets
+	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1\t\2/p' Makefile | expand -t 18
+
+bench: .venv/ready-bench ## compare estimators and controllers; writes report.html and results.json (LOG=file adds a recorded drive)
+	$(BIN)/sideslip bench --html report.html --json results.json $(if $(LOG),--log "$(LOG)")
+
+test: .venv/ready-all ## the tests, the examples in docstrings, and the marked tests without compilation
+	$(PYTEST) -n $(WORKERS) -m "not long"
+	$(PYTEST) --doctest-modules src/sideslip
+	NUMBA_DISABLE_JIT=1 $(PYTEST) -n $(WORKERS) -m "plain and not long"
+
+test-all: .venv/ready-all ## the same with the long tests
+	$(PYTEST) -n $(WORKERS)
+	$(PYTEST) --doctest-modules src/sideslip
+	NUMBA_DISABLE_JIT=1 $(PYTEST) -n $(WORKERS) -m plain
+
+coverage: .venv/ready-all ## lines reached by the tests marked plain, without compilation
+	NUMBA_DISABLE_JIT=1 $(BIN)/coverage run -m pytest --confcutdir=tests -m plain
+	$(BIN)/coverage report
+
+lint: .venv/ready-all ## style, format, direction of imports
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/lint-imports
+
+types: .venv/ready-all ## mypy, strict
+	$(BIN)/mypy
+
+wheel: .venv/ready-all ## source distribution and wheel, in dist/
+	rm -rf dist
+	$(BIN)/python -m build --no-isolation
+
+clean: ## remove the virtual environment and everything made here
+	rm -rf .venv dist build report.html results.json .coverage .hypothesis .import_linter_cache .mypy_cache .pytest_cache .ruff_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# One stamp for each set of extras: the benchmark does without torch.
+.venv/ready-bench: EXTRAS := design,report
+.venv/ready-all: EXTRAS := all,dev
+.venv/ready-bench .venv/ready-all: pyproject.toml constraints.txt | $(BIN)/python
+	@echo "Installing sideslip[$(EXTRAS)] into .venv (the first time takes a minute or more)"
+	$(INSTALL) -e ".[$(EXTRAS)]"
+	@touch $@
+
+# Some distributions ship venv without its copy of pip; then the interpreter's own pip fetches one.
+$(BIN)/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "sideslip needs Python 3.11 or newer, this is " + sys.version.split()[0] + ": make PYTHON=python3.11 ...")'
+	$(PYTHON) -m venv .venv 2>/dev/null || { \
+		$(PYTHON) -m venv --clear --without-pip .venv && \
+		$(PYTHON) -m pip --python .venv/bin/python install --quiet pip; } || { rm -rf .venv; exit 1; }

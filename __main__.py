@@ -1,0 +1,8 @@
+"""The command line: `sideslip` and `python -m sideslip`."""
+
+from .benchmarks.cli import main
+
+__all__ = ["main"]
+
+if __name__ == "__main__":
+    main()

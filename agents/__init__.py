@@ -1,0 +1,29 @@
+"""Everything that acts: classical controllers with stable-baselines3's `predict`."""
+
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+
+from .controller import Controller, NoControl
+from .two_dof import Feedforward, TwoDof
+
+AGENTS: dict[str, Callable[..., Controller]] = {
+    "none": NoControl,
+    "feedforward": Feedforward,
+    "two-dof": TwoDof,
+}
+
+__all__ = ["AGENTS", "Controller", "Feedforward", "NoControl", "TwoDof", "make_agent"]
+
+
+def make_agent(name: str, env: gym.Env[Any, Any], **options: Any) -> Controller:
+    """A controller designed for an env, from the env's nominal vehicle.
+
+    name: a key of `AGENTS`. options: arguments of that controller.
+    Raises ValueError for an unknown name or an observation without what the controller needs,
+    TypeError for an unknown option.
+    """
+    if name not in AGENTS:
+        raise ValueError(f"unknown agent {name!r}; known: {', '.join(AGENTS)}")
+    return AGENTS[name](env, **options)

@@ -1,0 +1,151 @@
+"""One episode as a table of every signal with its unit."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import gymnasium as gym
+import numpy as np
+import numpy.typing as npt
+
+from ..envs.record import Log, Record, concatenate
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+INFO_UNITS = {
+    "t": "s",
+    "beta": "rad",
+    "gamma": "rad/s",
+    "psi": "rad",
+    "beta_ref": "rad",
+    "gamma_ref": "rad/s",
+    "steer": "rad",
+    "yaw_moment": "N m",
+    "cost": "-",
+    "failure": "-",
+}
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """An episode. Row 0 is the reset, row k the state after the k-th step.
+
+    columns: arrays of one value a row: the numbers of `info`, then every entry of the observation
+    (`obs_...`), the action that led to the row and its reward. units: by column. log: the record
+    of every tick, with the truth at the ticks of the rows.
+    """
+
+    columns: dict[str, npt.NDArray[np.float64]]
+    units: dict[str, str]
+    log: Log
+
+    def __getitem__(self, name: str) -> npt.NDArray[np.float64]:
+        return self.columns[name]
+
+    @property
+    def cost(self) -> float:
+        """The episode's cost J: minus the return."""
+        return float(-self.columns["reward"].sum())
+
+    @property
+    def failed(self) -> bool:
+        """Whether the episode ended by a failure."""
+        return bool(self.columns["failure"][-1])
+
+    def to_parquet(self, path: str | Path) -> None:
+        """Write the table; units stand in the columns' metadata (needs the extra `report`)."""
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        fields = [
+            pa.field(name, pa.float64(), metadata={"unit": self.units[name]})
+            for name in self.columns
+        ]
+        table = pa.table(list(self.columns.values()), schema=pa.schema(fields))
+        part = Path(f"{path}.part")
+        pq.write_table(table, part)
+        part.replace(path)
+
+    def plot(self) -> "Figure":
+        """Sideslip angle, yaw rate, yaw moment and steering over time (needs `report`)."""
+        from matplotlib.figure import Figure
+
+        figure = Figure(figsize=(8.0, 7.0), layout="constrained")
+        axes = figure.subplots(4, 1, sharex=True)
+        t = self.columns["t"]
+        for axis, (names, label, scale) in zip(axes, _PANELS, strict=True):
+            for name, text in names:
+                if name in self.columns:
+                    axis.plot(t, scale * self.columns[name], label=text)
+            axis.set_ylabel(label)
+            axis.grid(alpha=0.3)
+            axis.legend(loc="upper right", fontsize="small")
+        axes[-1].set_xlabel("time / s")
+        figure.suptitle(f"{self.log.name}: cost {self.cost:.3g}")
+        return figure
+
+
+_DEGREES = 180.0 / np.pi
+_PANELS: tuple[tuple[tuple[tuple[str, str], ...], str, float], ...] = (
+    (
+        (("beta", "true"), ("obs_beta_hat", "estimate"), ("beta_ref", "reference")),
+        "sideslip angle / deg",
+        _DEGREES,
+    ),
+    ((("gamma", "true"), ("gamma_ref", "reference")), "yaw rate / (deg/s)", _DEGREES),
+    ((("yaw_moment", "delivered"),), "yaw moment / (N m)", 1.0),
+    ((("steer", "front wheels"),), "steering angle / deg", _DEGREES),
+)
+
+
+def rollout(
+    env: gym.Env[Any, Any] | str,
+    agent: Any = None,
+    seed: int | None = 0,
+    options: dict[str, Any] | None = None,
+) -> Rollout:
+    """Run one episode.
+
+    env: an environment or its id. agent: anything with stable-baselines3's `predict`; None leaves
+    the car alone. options: of the env's reset.
+    """
+    if isinstance(env, str):
+        env = gym.make(env)
+    base: Any = env.unwrapped
+    layout = env.get_wrapper_attr("layout")
+    obs, info = env.reset(seed=seed, options=options)
+    actions = np.zeros(env.action_space.shape or (1,), np.float32)
+    rows, records, state = [_row(info, obs, actions, 0.0)], [base.record], None
+    start = np.ones(1, bool)
+    over = False
+    while not over:
+        if agent is not None:
+            actions, state = agent.predict(obs, state, start, deterministic=True)
+        obs, reward, terminated, truncated, info = env.step(actions)
+        start = np.zeros(1, bool)
+        rows.append(_row(info, obs, actions, float(reward)))
+        records.append(base.record)
+        over = terminated or truncated
+    numbers = [name for name in info if name != "is_success"]
+    names = [*numbers, "reward"]
+    names += ["action"] if actions.size == 1 else [f"action_{i}" for i in range(actions.size)]
+    names += [f"obs_{entry.name}" for entry in layout]
+    table = np.array(rows).T
+    units = {name: INFO_UNITS.get(name, "-") for name in names}
+    units |= {f"obs_{entry.name}": entry.unit for entry in layout}
+    columns = dict(zip(names, table, strict=True))
+    record = concatenate(records)
+    return Rollout(columns, units, _log(base, record, columns))
+
+
+def _row(info: dict[str, Any], obs: Any, action: Any, reward: float) -> list[float]:
+    numbers = [float(value) for name, value in info.items() if name != "is_success"]
+    return [*numbers, reward, *map(float, action), *map(float, obs)]
+
+
+def _log(base: Any, record: Record, columns: dict[str, npt.NDArray[np.float64]]) -> Log:
+    """The record with the truth; ticks between rows are interpolated."""
+    t = record.ticks * record.dt
+    truth = {name: np.interp(t, columns["t"], columns[name]) for name in ("beta", "gamma", "psi")}
+    return Log(record, base.slow_sensors, truth, base.scenario.name)

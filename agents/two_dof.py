@@ -1,0 +1,185 @@
+"""tie-vision's two-degree-of-freedom controller: feedforward (24) and a PI on the sideslip angle.
+
+Both are designed from the nominal vehicle on a grid of speeds and interpolated by the measured
+speed, the mean of the two front wheel speeds.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from ..envs.backend import jit
+from ..envs.linear import bicycle
+from ..envs.record import TICK
+from ..envs.vehicle import COMS, Vehicle
+from .controller import Array, Controller
+
+SPEEDS = np.arange(2.0, 61.0, 0.5)  # m/s
+POLE = 2.0 * math.pi * 2.0  # rad/s: Table II of tie-vision places a pole at -2 Hz
+CAMERA_PERIOD = 0.033  # s
+
+
+def feedforward_gain(vehicle: Vehicle, speed: float) -> float:
+    """C_FF in N m/rad: the yaw moment per steering angle that brings static slip to zero.
+
+    Where the yaw moment has no static effect on beta (m V^2 = 2 (l_r C_r - l_f C_f), which exists
+    for understeering cars only) the gain is limited to what 5 % of the terms would give.
+    """
+    m, l_f, l_r, l = vehicle.mass, vehicle.front_arm, vehicle.rear_arm, vehicle.wheelbase  # noqa: E741
+    C_f, C_r = vehicle.front_stiffness, vehicle.rear_stiffness
+    mV2 = m * speed * speed
+    numerator = 4.0 * l_r * l * C_f * C_r - 2.0 * l_f * C_f * mV2
+    denominator = mV2 + 2.0 * (l_f * C_f - l_r * C_r)
+    least = 0.05 * (mV2 + 2.0 * abs(l_f * C_f - l_r * C_r))
+    if abs(denominator) < least:
+        denominator = math.copysign(least, denominator)
+    return numerator / denominator  # tie-vision (24)
+
+
+@dataclass(frozen=True)
+class PI:
+    """Gains of the yaw moment on the slip error: k_p in N m/rad, k_i in N m/(rad s)."""
+
+    k_p: float
+    k_i: float
+
+
+def design_pi(vehicle: Vehicle, speed: float, pole: float = POLE) -> PI:
+    """A PI whose zero lies on the plant's slow pole, with a closed-loop pole at -`pole` rad/s.
+
+    With G = k / ((s + p_1)(s + p_2)), p_1 < p_2, and C = k_p (s + p_1) / s the closed loop is
+    s^2 + p_2 s + k k_p: two poles whose sum is p_2. One goes to -pole, but not beyond -0.8 p_2,
+    or the other would be slower than a quarter of it. Gains are capped at the full yaw moment
+    for 0.02 rad (near the speed where the yaw moment does not move beta, k is nearly zero).
+
+    Raises ModuleNotFoundError without python-control (the extra `design`).
+    """
+    import control
+
+    model = bicycle(vehicle, speed)
+    plant = control.StateSpace(model.A, model.B[:, 1:], [[1.0, 0.0]], 0.0)
+    transfer = control.tf(plant)
+    k = float(transfer.num[0][0][-1] / transfer.den[0][0][0])
+    slow_first = sorted(-float(p.real) for p in plant.poles())
+    p_1, p_2 = max(slow_first[0], 0.0), slow_first[1]
+    fast = min(pole, 0.8 * p_2)
+    most = vehicle.yaw_moment_limit / 0.02
+    k_p = np.clip(fast * (p_2 - fast) / k, -most, most) if k != 0.0 else 0.0
+    return PI(float(k_p), float(k_p) * p_1)
+
+
+COMS_PI = PI(-4756.977, -28925.54)
+"""What `design_pi` gives for the COMS at 25 km/h: used where python-control is not installed."""
+
+
+def _pi_table(vehicle: Vehicle, gain: float) -> Array:
+    """(len(SPEEDS), 2) of k_p and k_i; one row's gains everywhere without python-control."""
+    try:
+        gains = [design_pi(vehicle, float(speed)) for speed in SPEEDS]
+    except ModuleNotFoundError:
+        if vehicle.name != COMS.name:
+            raise ModuleNotFoundError(
+                "designing two-dof for another car than the COMS needs python-control: "
+                "pip install 'sideslip[design]'"
+            ) from None
+        gains = [COMS_PI] * len(SPEEDS)
+    return gain * np.array([(each.k_p, each.k_i) for each in gains])
+
+
+@jit
+def _scheduled(table: Any, v: Any) -> Any:
+    """A column of a table over SPEEDS, interpolated at v and held beyond its ends."""
+    at = min(max((v - 2.0) / 0.5, 0.0), len(table) - 1.000001)
+    i = int(at)
+    return table[i] + (at - i) * (table[i + 1] - table[i])
+
+
+@jit
+def _feedforward_law(x: Any, gains: Any, full_scale: float, action: Any) -> None:
+    for n in range(len(x)):
+        v = 0.5 * (x[n, 0] + x[n, 1])
+        action[n, 0] = _scheduled(gains, v) * x[n, 2] / full_scale
+
+
+@jit
+def _two_dof_law(
+    x: Any,
+    state: Any,
+    gains: Any,
+    k_p: Any,
+    k_i: Any,
+    full_scale: float,
+    wait: int,
+    dt: float,
+    action: Any,
+) -> None:
+    """state: integral in N m, decisions until the next update, the action now held."""
+    for n in range(len(x)):
+        if state[n, 1] > 0.0:
+            state[n, 1] -= 1.0
+            action[n, 0] = state[n, 2]
+            continue
+        v = 0.5 * (x[n, 0] + x[n, 1])
+        error = x[n, 4] - x[n, 3]
+        forward = _scheduled(gains, v) * x[n, 2]
+        wanted = forward + _scheduled(k_p, v) * error + state[n, 0]
+        held = min(max(wanted, -full_scale), full_scale)
+        step = _scheduled(k_i, v) * error * dt  # forward Euler
+        if wanted == held or (wanted > held) != (step > 0.0):  # else it would wind up further
+            state[n, 0] += step
+        state[n, 1] = wait - 1.0
+        state[n, 2] = held / full_scale
+        action[n, 0] = state[n, 2]
+
+
+class Feedforward(Controller):
+    """The yaw moment of tie-vision (24) for the driver's steering command."""
+
+    needs = ("wheel_left", "wheel_right", "steer_command")
+
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
+        super().__init__(env)
+        self.gains = np.array([feedforward_gain(self.nominal, float(v)) for v in SPEEDS])
+
+    def _law(self, inputs: Array, state: Array, action: Array) -> None:
+        _feedforward_law(inputs, self.gains, self.full_scale, action)
+
+
+class TwoDof(Controller):
+    """Feedforward (24) plus a PI on beta_ref - beta_hat, tie-vision section V.
+
+    rate: "control" updates at every decision of the env, "camera" every 33 ms (held between;
+    for a control period that is no divisor of it, the next decision). gain: a factor on the PI.
+    Memory: the integral, the decisions until the next update, the held action.
+
+    Raises ValueError for an unknown rate or an env whose observation lacks beta_hat.
+    """
+
+    needs = ("wheel_left", "wheel_right", "steer_command", "beta_hat", "beta_ref")
+    memory = 3
+
+    def __init__(self, env: gym.Env[Any, Any], rate: str = "control", gain: float = 1.0) -> None:
+        super().__init__(env)
+        if rate not in ("control", "camera"):
+            raise ValueError(f"rate is 'control' or 'camera', got {rate!r}")
+        period = self.control_period * TICK
+        self.wait = 1 if rate == "control" else max(1, math.ceil(CAMERA_PERIOD / period - 1e-9))
+        self.dt = self.wait * period
+        self.gains = np.array([feedforward_gain(self.nominal, float(v)) for v in SPEEDS])
+        self.k_p, self.k_i = np.ascontiguousarray(_pi_table(self.nominal, gain).T)
+
+    def _law(self, inputs: Array, state: Array, action: Array) -> None:
+        _two_dof_law(
+            inputs,
+            state,
+            self.gains,
+            self.k_p,
+            self.k_i,
+            self.full_scale,
+            self.wait,
+            self.dt,
+            action,
+        )

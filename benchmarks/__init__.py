@@ -1,0 +1,1 @@
+"""The comparisons, their tables and report, and the command line."""

@@ -1,0 +1,43 @@
+"""A benchmark's work as a list of independent cases, run side by side with a progress bar."""
+
+import os
+from collections.abc import Callable, Sequence
+from typing import TypeVar
+
+import joblib
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+Case = TypeVar("Case")
+Result = TypeVar("Result")
+
+
+def cores() -> int:
+    """The processors this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def run_cases(
+    function: Callable[[Case], Result],
+    cases: Sequence[Case],
+    title: str,
+    jobs: int | None = None,
+    console: Console | None = None,
+) -> list[Result]:
+    """function(case) for every case, in the order of the cases.
+
+    function: importable by workers. jobs: processes (default: the processors at hand); 1 runs in
+    this process. console: where the progress bar goes; None shows none.
+    """
+    jobs = min(jobs or cores(), len(cases))
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
+    with Progress(
+        *columns, TimeElapsedColumn(), console=console, disable=console is None
+    ) as progress:
+        task = progress.add_task(title, total=len(cases))
+        results = []
+        pool = joblib.Parallel(n_jobs=jobs, return_as="generator")
+        for result in pool(joblib.delayed(function)(case) for case in cases):
+            results.append(result)
+            progress.advance(task)
+    return results

@@ -1,0 +1,233 @@
+"""The command line: list, run, bench, replay."""
+
+import platform
+import shlex
+import sys
+from collections.abc import Sequence
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table as RichTable
+
+from .. import __version__
+from .rows import Row, Suite, write_json, write_parquet
+
+app = typer.Typer(
+    help="Lateral stability of electric vehicles: environments, estimators, controllers.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+console = Console()
+
+Quick = Annotated[bool, typer.Option("--quick", help="Few seeds: a first look in seconds.")]
+Json = Annotated[Path | None, typer.Option("--json", help="Write the rows as JSON.")]
+Parquet = Annotated[Path | None, typer.Option("--parquet", help="Write the rows as Parquet.")]
+Html = Annotated[Path | None, typer.Option("--html", help="Write a self-contained report.")]
+Jobs = Annotated[int | None, typer.Option("--jobs", "-j", min=1, help="Processes.")]
+
+_SHOWN = ("numpy", "scipy", "numba", "gymnasium", "control", "plotly")
+
+
+def main() -> None:
+    """Entry point of `sideslip`; a user's error is one line and exit status 2."""
+    try:
+        app()
+    except (ValueError, TypeError, FileNotFoundError, ModuleNotFoundError, OSError) as error:
+        Console(stderr=True).print(f"[bold red]error:[/] {error}", highlight=False)
+        sys.exit(2)
+
+
+@app.command("list")
+def list_names() -> None:
+    """What there is: environments, scenarios, vehicles, estimators, agents, suites."""
+    import gymnasium as gym
+
+    from ..agents import AGENTS
+    from ..envs import SCENARIOS, VEHICLES
+    from ..estimators import ESTIMATORS
+
+    for title, names in {
+        "environments": [name for name in gym.registry if name.startswith("sideslip/")],
+        "scenarios": list(SCENARIOS),
+        "vehicles": list(VEHICLES),
+        "estimators": list(ESTIMATORS),
+        "agents": list(AGENTS),
+        "suites": list(SUITES),
+    }.items():
+        console.print(f"[bold]{title}[/]: {', '.join(names)}", highlight=False)
+
+
+@app.command()
+def run(
+    env_id: Annotated[str, typer.Argument(help="An environment's id.")] = "sideslip/YawVision-v0",
+    agent: Annotated[str, typer.Option(help="An agent's name.")] = "none",
+    estimator: Annotated[str | None, typer.Option(help="An estimator's name.")] = None,
+    scenario: Annotated[str | None, typer.Option(help="A scenario's name.")] = None,
+    seed: Annotated[int, typer.Option(help="Seed of the episode.")] = 0,
+    control_period: Annotated[int, typer.Option(help="Ticks of 1 ms.")] = 10,
+    plot: Annotated[Path | None, typer.Option(help="Write a PNG.")] = None,
+    parquet: Annotated[Path | None, typer.Option(help="Write every signal.")] = None,
+) -> None:
+    """Drive one episode, print its score, draw it."""
+    import gymnasium as gym
+    import numpy as np
+
+    from ..agents import make_agent
+    from ..agents.rollout import rollout
+    from ..estimators import EstimateObservation
+
+    options: dict[str, Any] = {} if scenario is None else {"scenario": scenario}
+    env: gym.Env[Any, Any] = gym.make(env_id, control_period=control_period, **options)
+    if estimator is not None:
+        env = EstimateObservation(env, estimator)
+    drive = rollout(env, make_agent(agent, env), seed)
+    slip = drive["beta"]
+    console.print(
+        f"{drive.log.name}: {drive['t'][-1]:.2f} s, cost {drive.cost:.4g}, "
+        f"RMS slip {1e3 * np.sqrt(np.mean(slip**2)):.2f} mrad, "
+        f"peak {1e3 * np.max(np.abs(slip)):.2f} mrad" + (", FAILED" if drive.failed else ""),
+        highlight=False,
+    )
+    if plot is not None:
+        drive.plot().savefig(plot, dpi=120)
+    if parquet is not None:
+        drive.to_parquet(parquet)
+
+
+def _estimation(quick: bool, jobs: int | None) -> Suite:
+    from . import estimation
+
+    return estimation.run(
+        estimation.QUICK_SEEDS if quick else estimation.SEEDS, jobs, console=console
+    )
+
+
+def _control(quick: bool, jobs: int | None) -> Suite:
+    from . import control
+
+    return control.run(control.QUICK_SEEDS if quick else control.SEEDS, jobs, console=console)
+
+
+def _speed(quick: bool, jobs: int | None) -> Suite:
+    from . import speed
+
+    return speed.run()
+
+
+SUITES = {"estimation": _estimation, "control": _control, "speed": _speed}
+
+
+@app.command()
+def bench(
+    suites: Annotated[list[str] | None, typer.Argument(help="Suites; default: all.")] = None,
+    quick: Quick = False,
+    log: Annotated[Path | None, typer.Option(help="Replay this recorded drive too.")] = None,
+    vehicle: Annotated[Path | None, typer.Option(help="The vehicle of the recorded drive.")] = None,
+    html: Html = None,
+    json: Json = None,
+    parquet: Parquet = None,
+    picture: Annotated[Path | None, typer.Option(help="Write the summary as a PNG.")] = None,
+    jobs: Jobs = None,
+) -> None:
+    """Compare estimators and controllers, and a recorded drive if one is given."""
+    names = suites or list(SUITES)
+    unknown = [name for name in names if name not in SUITES]
+    if unknown:
+        raise ValueError(f"unknown suite {', '.join(unknown)}; known: {', '.join(SUITES)}")
+    done = []
+    if log is not None:  # first: a log that cannot be read should not cost minutes
+        from .replay import replay_file
+
+        done.append(replay_file(log, vehicle))
+    done += [SUITES[name](quick, jobs) for name in names]
+    order = [*names, "replay"]
+    done.sort(key=lambda suite: order.index(suite.name))
+    _give(done, html, json, parquet)
+    if picture is not None:
+        from .picture import write_picture
+
+        write_picture(picture, done)
+        console.print(f"picture: {picture}", highlight=False)
+
+
+def _give(
+    suites: Sequence[Suite], html: Path | None, json: Path | None, parquet: Path | None
+) -> None:
+    """Print the tables and write what was asked for."""
+    for suite in suites:
+        for table in suite.tables:
+            console.print(_screen(table.title, table.header, table.cells))
+            if table.note:
+                console.print(f"[dim]{table.note}[/]\n", highlight=False)
+    rows: list[Row] = [row for suite in suites for row in suite.rows]
+    if json is not None:
+        write_json(json, rows)
+        console.print(f"rows: {json}", highlight=False)
+    if parquet is not None:
+        write_parquet(parquet, rows)
+        console.print(f"rows: {parquet}", highlight=False)
+    if html is not None:
+        from .report import write_report
+
+        write_report(html, list(suites), _command(), environment())
+        console.print(f"report: {html}", highlight=False)
+
+
+def _command() -> str:
+    return shlex.join(["sideslip", *sys.argv[1:]])
+
+
+def environment() -> dict[str, str]:
+    """Versions that the numbers depend on."""
+    found = {"sideslip": __version__, "Python": platform.python_version()}
+    for name in _SHOWN:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def _screen(title: str, header: Sequence[str], cells: Sequence[Sequence[str]]) -> RichTable:
+    table = RichTable(title=title, title_justify="left")
+    for i, name in enumerate(header):
+        table.add_column(name, justify="left" if i == 0 else "right")
+    for row in cells:
+        table.add_row(*row)
+    return table
+
+
+@app.command()
+def replay(
+    log: Annotated[Path, typer.Argument(help="A recorded drive, CSV or Parquet.")],
+    vehicle: Annotated[Path | None, typer.Option(help="The car: TOML or JSON.")] = None,
+    mapping: Annotated[
+        list[str] | None, typer.Option("--map", help="NAME=COLUMN of the log; repeatable.")
+    ] = None,
+    course_rate: Annotated[float, typer.Option(help="Hz of the emulated course.")] = 10.0,
+    course_noise: Annotated[float, typer.Option(help="deg, standard deviation.")] = 0.5,
+    course_delay: Annotated[float, typer.Option(help="s the course arrives late.")] = 0.0,
+    course_bias: Annotated[float, typer.Option(help="deg.")] = 0.0,
+    gyro_bias: Annotated[float, typer.Option(help="deg/s added to the gyro.")] = 0.0,
+    html: Html = None,
+    json: Json = None,
+    parquet: Parquet = None,
+) -> None:
+    """Run the estimators over a recorded drive and score them."""
+    from .replay import replay_file
+
+    suite = replay_file(
+        log,
+        vehicle,
+        mapping=mapping,
+        course_rate=course_rate,
+        course_noise_deg=course_noise,
+        delay=course_delay,
+        bias_deg=course_bias,
+        gyro_bias_degps=gyro_bias,
+    )
+    _give([suite], html, json, parquet)

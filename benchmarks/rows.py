@@ -1,0 +1,135 @@
+"""The row: one measured number with everything needed to find it again."""
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+METRICS = {
+    "rmse": "rad",
+    "rmse_over_bound": "-",
+    "us_per_tick": "us",
+    "us_per_step": "us",
+    "rms_slip": "rad",
+    "peak_slip": "rad",
+    "largest_step": "N m",
+    "saturation": "-",
+    "effort": "-",
+    "cost": "-",
+    "ratio": "-",
+}
+"""The vocabulary of metrics with their units; a new one is added here first."""
+
+VERDICTS = ("", "reproduced", "partly", "not reproduced", "report only")
+
+
+@dataclass(frozen=True)
+class Row:
+    """One number of a benchmark.
+
+    suite, scenario, estimator, controller, metric: what was measured. value with its 95 % interval
+    [low, high] over n runs (NaN bounds where there is no spread). salt: what salted the seeds.
+    spec: the env's JSON, "" where no env was run. verdict and paper: for claims.
+
+    Raises ValueError for a metric or verdict outside the vocabulary.
+    """
+
+    suite: str
+    scenario: str
+    metric: str
+    value: float
+    estimator: str = ""
+    controller: str = ""
+    low: float = math.nan
+    high: float = math.nan
+    n: int = 1
+    salt: str = ""
+    env_version: str = ""
+    spec: str = ""
+    verdict: str = ""
+    paper: str = ""
+
+    def __post_init__(self) -> None:
+        if self.metric not in METRICS:
+            raise ValueError(f"unknown metric {self.metric!r}; known: {', '.join(METRICS)}")
+        if self.verdict not in VERDICTS:
+            raise ValueError(f"unknown verdict {self.verdict!r}")
+
+
+@dataclass
+class Table:
+    """A table for the screen and the report: texts, a header, and what each column means."""
+
+    title: str
+    header: Sequence[str]
+    cells: Sequence[Sequence[str]]
+    note: str = ""
+
+
+@dataclass
+class Suite:
+    """What a benchmark module gives: rows for machines, tables and figures for people.
+
+    figures: (title, plotly figure, a sentence on what to see). Empty where the extra `report` is
+    not installed or pictures were not asked for.
+    """
+
+    name: str
+    title: str
+    text: str
+    rows: list[Row] = field(default_factory=list)
+    tables: list[Table] = field(default_factory=list)
+    figures: list[tuple[str, Any, str]] = field(default_factory=list)
+
+
+def write_whole(path: str | Path, text: str) -> None:
+    """Write a file or nothing: the text goes to a neighbour first and is then renamed."""
+    target = Path(path)
+    part = target.with_name(f".{target.name}.part")
+    try:
+        part.write_text(text, encoding="utf-8")
+        part.replace(target)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def write_json(path: str | Path, rows: Sequence[Row]) -> None:
+    """The rows as a JSON list of objects; NaN becomes null."""
+    plain = [
+        {
+            key: None if isinstance(value, float) and not math.isfinite(value) else value
+            for key, value in asdict(row).items()
+        }
+        for row in rows
+    ]
+    write_whole(path, json.dumps(plain, indent=1) + "\n")
+
+
+def read_json(path: str | Path) -> list[Row]:
+    """Rows that `write_json` wrote."""
+    names = {entry.name: entry.type for entry in fields(Row)}
+    rows = []
+    for entry in json.loads(Path(path).read_text(encoding="utf-8")):
+        unknown = sorted(set(entry) - set(names))
+        if unknown:
+            raise ValueError(f"{path}: unknown column {', '.join(unknown)}")
+        floats = ("value", "low", "high")
+        rows.append(
+            Row(**{k: math.nan if v is None and k in floats else v for k, v in entry.items()})
+        )
+    return rows
+
+
+def write_parquet(path: str | Path, rows: Sequence[Row]) -> None:
+    """The rows as a Parquet table (needs the extra `report`)."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    part = Path(path).with_name(f".{Path(path).name}.part")
+    try:
+        pq.write_table(pa.Table.from_pylist([asdict(row) for row in rows]), part)
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)

@@ -1,0 +1,1 @@
+"""Sideslip estimators: filters for fast, slow and late sensors."""

@@ -1,0 +1,78 @@
+"""One contract over every agent: stable-baselines3's predict."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+import sideslip
+from sideslip.agents import AGENTS, make_agent
+from sideslip.estimators import EstimateObservation
+
+
+@pytest.fixture
+def env() -> gym.Env[Any, Any]:
+    return EstimateObservation(
+        gym.make("sideslip/YawVision-v0", scenario="lane-change"), "bicycle-kf"
+    )
+
+
+@pytest.mark.parametrize("name", AGENTS)
+def test_single_and_batch_agree_and_memory_is_outside(name: str, env: gym.Env[Any, Any]) -> None:
+    agent = make_agent(name, env)
+    rng = np.random.default_rng(0)
+    observations = rng.normal(size=(40, 3, env.observation_space.shape[0])).astype(np.float32)  # type: ignore[index]
+    together: Any = None
+    alone: list[Any] = [None] * 3
+    for obs in observations:
+        before = None if together is None else together.copy()
+        actions, after = agent.predict(obs, together)
+        again, _ = agent.predict(obs, before)
+        assert (actions == again).all()
+        together = after
+        for i in range(3):
+            action, alone[i] = agent.predict(obs[i], alone[i])
+            assert action.shape == (1,) and env.action_space.contains(action)
+            assert (action == actions[i]).all()
+
+
+def test_episode_start_clears_the_memory(env: gym.Env[Any, Any]) -> None:
+    agent = make_agent("two-dof", env)
+    obs = np.full((2, env.observation_space.shape[0]), 0.01, np.float32)  # type: ignore[index]
+    _, state = agent.predict(obs)
+    _, state = agent.predict(obs, state)
+    fresh, _ = agent.predict(obs)
+    action, _ = agent.predict(obs, state, episode_start=np.array([True, False]))
+    assert action[0] == fresh[0] and action[1] != fresh[1]
+
+
+@pytest.mark.parametrize("name", AGENTS)
+def test_stable_baselines3_evaluates_them(name: str, env: gym.Env[Any, Any]) -> None:
+    agent: Any = make_agent(name, env)
+    reward, _ = evaluate_policy(agent, DummyVecEnv([lambda: env]), n_eval_episodes=2, warn=False)
+    assert np.isfinite(reward) and float(np.mean(reward)) < 0.0
+
+
+def test_rollout_and_evaluate_policy_agree(env: gym.Env[Any, Any]) -> None:
+    agent: Any = make_agent("two-dof", env)
+    vec = DummyVecEnv([lambda: env])
+    vec.seed(3)
+    reward, _ = evaluate_policy(agent, vec, n_eval_episodes=1, warn=False)
+    assert -sideslip.rollout(env, agent, seed=3).cost == pytest.approx(reward, rel=1e-6)
+
+
+def test_bad_input(env: gym.Env[Any, Any]) -> None:
+    bare = gym.make("sideslip/YawVision-v0")
+    with pytest.raises(ValueError, match="unknown agent 'pid'"):
+        make_agent("pid", env)
+    with pytest.raises(ValueError, match=r"beta_hat.*EstimateObservation"):
+        make_agent("two-dof", bare)
+    with pytest.raises(ValueError, match="rate is 'control' or 'camera'"):
+        make_agent("two-dof", env, rate="fast")
+    with pytest.raises(TypeError, match="speed"):
+        make_agent("two-dof", env, speed=3)
+    with pytest.raises(ValueError, match="width"):
+        make_agent("none", env).predict(np.zeros(3, np.float32))

@@ -1,0 +1,140 @@
+"""tie-vision's controller: the published formula, the poles where they were placed, the claims."""
+
+import sys
+from typing import Any
+
+import control
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import sideslip
+from sideslip.agents import make_agent
+from sideslip.agents.two_dof import COMS_PI, POLE, design_pi, feedforward_gain
+from sideslip.envs import COMS, PASSENGER_CAR
+from sideslip.envs.linear import bicycle
+from sideslip.estimators import EstimateObservation
+
+KMH = 1 / 3.6
+
+
+@pytest.mark.smoke
+def test_feedforward_is_the_ratio_of_dc_gains() -> None:
+    """(24): -G_delta(0) / G_N(0), whose printed middle has the wrong sign."""
+    for kmh in (10.0, 20.0, 25.0, 45.0):
+        model = bicycle(COMS, kmh * KMH)
+        static = -np.linalg.solve(model.A, model.B)[0]  # beta over delta_f and N_z
+        assert feedforward_gain(COMS, kmh * KMH) == pytest.approx(-static[0] / static[1], rel=1e-12)
+
+
+def test_feedforward_at_25_kmh_and_its_change_of_sign() -> None:
+    assert feedforward_gain(COMS, 25 * KMH) == pytest.approx(-2652.0, abs=0.1)
+    assert feedforward_gain(COMS, 20.72 * KMH) > 0 > feedforward_gain(COMS, 20.74 * KMH)
+
+
+def test_feedforward_stays_finite_where_the_moment_does_not_move_beta() -> None:
+    """An understeering car has a speed at which (24) divides by zero."""
+    m, l_f, l_r = PASSENGER_CAR.mass, PASSENGER_CAR.front_arm, PASSENGER_CAR.rear_arm
+    C_f, C_r = PASSENGER_CAR.front_stiffness, PASSENGER_CAR.rear_stiffness
+    speed = np.sqrt(2 * (l_r * C_r - l_f * C_f) / m)
+    assert np.isfinite(feedforward_gain(PASSENGER_CAR, float(speed)))
+
+
+@pytest.mark.parametrize("kmh", [10.0, 18.0, 25.0, 32.0, 45.0])
+def test_feedforward_brings_static_slip_to_zero(kmh: float) -> None:
+    """tie-vision (24), exact on the small-angle plant: |beta_ss| < 1e-9 at 0.001 rad."""
+    steer = 0.001
+    env: Any = gym.make(
+        "sideslip/YawVision-v0",
+        scenario={
+            "base": "tie-vision-fig7",
+            "vehicle": {},
+            "steering": "straight",
+            "speed": kmh * KMH,
+            "disturbance_force": 0.0,
+            "disturbance_moment": 0.0,
+            "duration": 20.0,
+            "half_width": 1e6,
+        },
+    ).unwrapped
+    env.reset(seed=0)
+    snapshot = env.get_state()
+    from sideslip.envs.layout import P
+    from sideslip.envs.programme import SINES
+
+    step = P.steering + 5 * SINES
+    snapshot["params"][step : step + 3] = steer, 0.0, 1.0
+    env.set_state(snapshot)
+    moment = feedforward_gain(COMS, kmh * KMH) * steer / COMS.yaw_moment_limit
+    info: dict[str, float] = {}
+    for _ in range(1000):
+        info = env.step(np.array([moment], np.float32))[4]
+    # the action is a float32: its rounding, 6e-8 of the moment, leaves 6e-8 of the slip it cancels
+    static = abs(np.linalg.solve(bicycle(COMS, kmh * KMH).A, bicycle(COMS, kmh * KMH).B)[0, 0])
+    assert abs(info["beta"]) < 1e-9 + 6e-8 * steer * static
+    assert abs(info["gamma"]) > 1e-4
+
+
+@pytest.mark.parametrize("kmh", [15.0, 25.0, 40.0])
+def test_closed_loop_pole_is_where_it_was_placed(kmh: float) -> None:
+    model = bicycle(COMS, kmh * KMH)
+    pi = design_pi(COMS, kmh * KMH)
+    plant = control.StateSpace(model.A, model.B[:, 1:], [[1.0, 0.0]], 0.0)
+    loop = control.feedback(control.tf(plant) * control.tf([pi.k_p, pi.k_i], [1.0, 0.0]), 1)
+    poles = np.sort(loop.poles().real)
+    fast = -model.to_control().poles().real.min()
+    assert abs(loop.poles().imag).max() < 1e-5  # a cancelled double pole is ill-conditioned
+    assert min(abs(poles + min(POLE, 0.8 * fast))) < 1e-6
+    assert poles.max() < 0
+
+
+def test_shipped_gains_are_the_designed_ones() -> None:
+    pi = design_pi(COMS, 25 * KMH)
+    assert (COMS_PI.k_p, COMS_PI.k_i) == pytest.approx((pi.k_p, pi.k_i), rel=1e-6)
+
+
+def test_without_python_control_only_the_coms_has_gains(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "control", None)
+    env = EstimateObservation(gym.make("sideslip/YawVision-v0"), "bicycle-kf")
+    assert np.unique(make_agent("two-dof", env).k_p).size == 1  # type: ignore[attr-defined]
+    other = EstimateObservation(
+        gym.make("sideslip/YawVision-v0", vehicle="passenger-car"), "bicycle-kf"
+    )
+    with pytest.raises(ModuleNotFoundError, match=r"sideslip\[design\]"):
+        make_agent("two-dof", other)
+
+
+def _lane_change(agent: str, estimator: str, scenario: str, **options: Any) -> Any:
+    env: gym.Env[Any, Any] = gym.make("sideslip/YawVision-v0", scenario=scenario, control_period=1)
+    if estimator:
+        env = EstimateObservation(env, estimator)
+    return sideslip.rollout(env, make_agent(agent, env, **options), seed=0)
+
+
+@pytest.mark.parametrize(
+    ("scenario", "limit"), [("tie-vision-fig8", 0.40), ("tie-vision-fig8-stiff", 0.55)]
+)
+@pytest.mark.parametrize(
+    ("estimator", "rate"), [("single-rate-kf", "camera"), ("multirate-kf", "control")]
+)
+def test_fig8_control_against_none(scenario: str, limit: float, estimator: str, rate: str) -> None:
+    """PAPERS section 3: RMS slip with control at most 0.40 (tyres 1.2 x: 0.55) of none's."""
+    none = _lane_change("none", "", scenario)
+    controlled = _lane_change("two-dof", estimator, scenario, rate=rate)
+    ratio = np.sqrt(np.mean(controlled["beta"] ** 2) / np.mean(none["beta"] ** 2))
+    assert ratio <= limit
+
+
+def test_the_integral_does_not_wind_up() -> None:
+    """While the moment is saturated the memory stays below one full scale."""
+    env = EstimateObservation(gym.make("sideslip/YawVision-v0"), "bicycle-kf")
+    agent = make_agent("two-dof", env)
+    names = [entry.name for entry in env.get_wrapper_attr("layout")]
+    obs = np.zeros(len(names), np.float32)
+    obs[names.index("wheel_left")] = obs[names.index("wheel_right")] = 7.0
+    obs[names.index("beta_hat")] = 0.2
+    state = None
+    for _ in range(1000):
+        action, state = agent.predict(obs, state)
+    assert action == pytest.approx([1.0])
+    assert state is not None and abs(state[0, 0]) < COMS.yaw_moment_limit
