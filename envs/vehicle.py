@@ -176,6 +176,8 @@ def vehicle_from_file_values(values: Mapping[str, Any], where: str) -> Vehicle:
             name, factor = _STIFFNESS_KEYS[key]
             if name in read:
                 raise ValueError(f"{where}: {name} is given twice")
+            if not isinstance(value, int | float):
+                raise TypeError(f"{where}: {key}: expected a number, got {value!r}")
             read[name] = value * factor
         else:
             read[key] = value

@@ -1,1 +1,16 @@
-"""Sideslip estimators: filters for fast, slow and late sensors."""
+"""Sideslip estimators: filters for fast, slow and late sensors.
+
+`make_estimator` builds one by name; `EstimateObservation` puts it around an environment.
+"""
+
+from .estimator import Estimates, Estimator, UnobservableWarning
+from .make import make_estimator
+from .papers import FILTERS
+
+__all__ = [
+    "FILTERS",
+    "Estimates",
+    "Estimator",
+    "UnobservableWarning",
+    "make_estimator",
+]

@@ -44,7 +44,7 @@ FILTER = np.dtype(
         # the model: dx = A x + B u on the first `dense` states, the rest decay by themselves
         ("n", _INT),  # states
         ("dense", _INT),
-        ("size", _INT),  # states and clones
+        ("total", _INT),  # states and clones
         ("forces", _INT),  # 1: disturbances are a force and a moment; 0: d_1, d_2 of (5)
         ("car", _FLOAT, (6,)),  # m, I, l_f, l_r, C_f, C_r
         ("preview", _FLOAT),
@@ -70,7 +70,7 @@ FILTER = np.dtype(
         ("period", _INT, (SLOW,)),  # 0: not used
         ("phase", _INT, (SLOW,)),
         ("frames", _INT, (SLOW,)),  # clones are held for so many frames
-        ("base", _INT, (SLOW,)),  # where they start
+        ("home", _INT, (SLOW,)),  # where they start
         ("ignore", _INT),  # 1: late samples are taken for fresh ones
         # gains
         ("periodic", _INT),
@@ -97,6 +97,8 @@ FILTER = np.dtype(
         ("x", _FLOAT, (WIDTH,)),
         ("P", _FLOAT, (WIDTH, WIDTH)),
         ("e", _FLOAT, (WIDTH,)),  # estimated error, tie-vision (18)
+        ("expected", _FLOAT, (ROWS,)),  # C x before this tick's corrections, slow rows
+        ("eps", _FLOAT, (1 + ROWS,)),  # residuals used in this tick: gyro, slow rows
         ("ph", _FLOAT, (WIDTH,)),
         ("gain", _FLOAT, (WIDTH,)),  # of the last measurement
         ("work", _FLOAT, (3, CORE, CORE)),

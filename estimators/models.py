@@ -84,7 +84,7 @@ def write_model(
     """
     names, dense = model.names, len(model.states)
     n = len(names)
-    f.n = f.size = n
+    f.n = f.total = n
     f.dense = dense
     f.forces = int(model.disturbances == "forces")
     f.car[:] = [

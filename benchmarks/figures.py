@@ -1,0 +1,234 @@
+"""The figures of the report, as plotly figures: time series, errors, tracks, bars.
+
+Every axis carries its unit, every name has its colour (`colours`). Lines longer than `POINTS` are
+thinned so that no peak is lost, and numbers are stored in single precision: a report of twenty
+figures stays a few megabytes. Importing this module needs plotly, the extra `report`.
+"""
+
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from .colours import COLOURS, FACTS, GREY, INK, colour, line_styles
+
+try:
+    from plotly import graph_objects as go
+except ModuleNotFoundError as error:
+    raise ModuleNotFoundError(
+        "figures need plotly: pip install 'sideslip[report]'", name=error.name
+    ) from error
+
+__all__ = ["COLOURS", "bars_with_interval", "colour", "error_series", "time_series", "track"]
+
+Array = npt.NDArray[np.floating[Any]]
+
+POINTS = 2000
+"""The most points a line is drawn with."""
+
+
+def peaks(y: Array, limit: int = POINTS) -> npt.NDArray[np.intp]:
+    """Indices of at most `limit` samples of y (n,) that draw the same line: the smallest and
+    largest of each of limit/2 - 1 stretches, and both ends. A stretch of NaN stays a gap.
+
+    >>> peaks(np.array([0.0, 9.0, 0.0, 1.0, 1.0, -9.0, 0.0, 1.0]), limit=6)
+    array([0, 1, 4, 5, 7])
+    """
+    n = len(y)
+    if n <= limit:
+        return np.arange(n)
+    size = -(-n // (limit // 2 - 1))
+    starts = np.arange(0, n, size)
+    padded = np.full(len(starts) * size, np.nan)
+    padded[:n] = y
+    table = padded.reshape(len(starts), size)
+    low = np.where(np.isnan(table), np.inf, table).argmin(axis=1)
+    high = np.where(np.isnan(table), -np.inf, table).argmax(axis=1)
+    return np.unique(np.concatenate([starts + low, starts + high, [0, n - 1]]))
+
+
+def time_series(
+    title: str,
+    t: Array,
+    series: Mapping[str, Array],
+    unit_label: str,
+    x_label: str = "time / s",
+    dots: Collection[str] = (),
+) -> Any:
+    """Lines over time, all on one axis.
+
+    t: (n,). series: name to (n,); "truth" is drawn first and thicker. unit_label: quantity and
+    unit, "sideslip angle / mrad". dots: names drawn as dots, for packets (NaN between them).
+    Raises ValueError for a series that is not as long as t.
+    """
+    t = np.asarray(t, float)
+    figure = go.Figure()
+    for name, colour_and_dash in line_styles(series).items():
+        y = np.asarray(series[name], float)
+        if y.shape != t.shape:
+            raise ValueError(f"series {name!r} has shape {y.shape}, its time {t.shape}")
+        there = ~np.isnan(y) if name in dots else np.ones(len(y), bool)
+        x, y = t[there], y[there]
+        kept = peaks(y)
+        trace = _line(name, x[kept], y[kept], *colour_and_dash, name in dots)
+        if len(y) > 4 * POINTS and name not in (*dots, *FACTS):
+            trace.line.width = 1.0  # a dense line is noisy: leave room to see the others
+        figure.add_trace(trace)
+    figure.update_xaxes(range=[float(t[0]), float(t[-1])] if len(t) > 1 else None)
+    return _finish(_facts_first(figure), title, x_label, unit_label, 380, hovermode="x unified")
+
+
+def error_series(
+    title: str,
+    t: Array,
+    errors: Mapping[str, Array],
+    unit_label: str,
+    x_label: str = "time / s",
+    band: tuple[str, Array] | None = None,
+) -> Any:
+    """Estimate minus truth over time, around a line at zero.
+
+    Arguments as of `time_series`. band: name and half-width (n,) of a grey band around zero,
+    such as twice the bound's standard deviation.
+    """
+    figure = time_series(title, t, errors, unit_label, x_label)
+    figure.add_hline(y=0.0, line={"color": GREY, "width": 1}, layer="below")
+    if band is not None:
+        name, half = band[0], np.asarray(band[1], float)
+        kept = peaks(half)
+        there = np.asarray(t, float)[kept]
+        area = go.Scatter(
+            x=_single(np.concatenate([there, there[::-1]])),
+            y=_single(np.concatenate([half[kept], -half[kept][::-1]])),
+            name=name,
+            mode="lines",
+            fill="toself",
+            fillcolor="rgba(127,127,127,0.25)",
+            line={"width": 0},
+            hoverinfo="skip",
+        )
+        figure.add_trace(area)
+        figure.data = (figure.data[-1], *figure.data[:-1])
+        figure.update_layout(showlegend=True)
+    return figure
+
+
+def track(
+    x: Array | Mapping[str, tuple[Array, Array]],
+    y: Array | None = None,
+    title: str = "",
+    x_label: str = "x / m",
+    y_label: str = "y / m",
+) -> Any:
+    """Paths seen from above, a metre as long in x as in y.
+
+    x, y: (n,) each, or one mapping from name to (x, y). Raises ValueError for unequal lengths.
+    """
+    if not isinstance(x, Mapping):
+        if y is None:
+            raise ValueError("a track needs y, or a mapping from name to (x, y)")
+        x = {"truth": (x, y)}
+    figure = go.Figure()
+    for name, colour_and_dash in line_styles(x).items():
+        across, up = (np.asarray(values, float) for values in x[name])
+        if across.shape != up.shape:
+            raise ValueError(f"track {name!r}: x has shape {across.shape}, y {up.shape}")
+        kept = np.unique(np.linspace(0, len(up) - 1, min(len(up), POINTS)).round().astype(int))
+        figure.add_trace(_line(name, across[kept], up[kept], *colour_and_dash))
+    figure.update_yaxes(scaleanchor="x", scaleratio=1)
+    height = int(np.clip(120 + 900 * _slimness(figure), 280, 640))
+    return _finish(_facts_first(figure), title, x_label, y_label, height, hovermode="closest")
+
+
+def bars_with_interval(
+    labels: Sequence[str],
+    values: Sequence[float],
+    lows: Sequence[float],
+    highs: Sequence[float],
+    unit: str,
+    log: bool = False,
+    title: str = "",
+) -> Any:
+    """One bar a label, the first on top, with the interval [low, high] as whiskers.
+
+    unit: quantity and unit, "RMSE / mrad". log: a logarithmic axis, with dots instead of bars (a
+    bar's length would mean nothing). No whiskers where a bound is NaN or both equal the value.
+    """
+    if not len(labels) == len(values) == len(lows) == len(highs):
+        raise ValueError("labels, values, lows and highs differ in length")
+    value = np.asarray(values, float)
+    above, below = np.asarray(highs, float) - value, value - np.asarray(lows, float)
+    none = ~(np.isfinite(above) & np.isfinite(below)) | ((above == 0) & (below == 0))
+    whiskers = {
+        "type": "data",
+        "symmetric": False,
+        "array": np.where(none, np.nan, above),
+        "arrayminus": np.where(none, np.nan, below),
+        "color": INK,
+        "thickness": 1.5,
+        "width": 5,
+    }
+    text = [
+        f"{v:.3g}" if off else f"{v:.3g} [{v - b:.3g}, {v + a:.3g}]"
+        for v, a, b, off in zip(value, above, below, none, strict=True)
+    ]
+    common: dict[str, Any] = {
+        "x": value,
+        "y": list(labels),
+        "error_x": whiskers,
+        "showlegend": False,
+        "customdata": text,
+        "hovertemplate": "%{y}: %{customdata}<extra></extra>",
+    }
+    colours = [colour(label) for label in labels]
+    if log:
+        trace = go.Scatter(mode="markers", marker={"color": colours, "size": 12}, **common)
+    else:
+        trace = go.Bar(orientation="h", marker={"color": colours}, width=0.6, **common)
+    figure = go.Figure(trace)
+    figure.update_xaxes(type="log" if log else "linear")
+    figure.update_yaxes(type="category", autorange="reversed", ticks="", showgrid=log)
+    return _finish(figure, title, unit, "", 100 + 34 * len(labels), hovermode="closest")
+
+
+def _line(name: str, x: Array, y: Array, colour: str, dash: str, dots: bool = False) -> Any:
+    x, y = _single(x), _single(y)
+    if dots:
+        return go.Scatter(x=x, y=y, name=name, mode="markers", marker={"color": colour, "size": 4})
+    pen = {"color": colour, "dash": dash, "width": 4.0 if name in FACTS else 1.8}
+    return go.Scatter(x=x, y=y, name=name, mode="lines", line=pen)
+
+
+def _single(values: Array) -> Array:
+    """Single precision where nobody can see it, not for a small range far from zero."""
+    seen = values[np.isfinite(values)]
+    lost = np.abs(seen - seen.astype(np.float32))
+    far = len(seen) > 0 and lost.max() > 1e-4 * np.ptp(seen)
+    return values if far else values.astype(np.float32)
+
+
+def _slimness(figure: Any) -> float:
+    """Height over width of all paths together."""
+    spans = []
+    for values in ([trace.y for trace in figure.data], [trace.x for trace in figure.data]):
+        seen = np.concatenate([*values, np.zeros(0)])
+        seen = seen[np.isfinite(seen)]
+        spans.append(float(np.ptp(seen)) if len(seen) else 0.0)
+    return spans[0] / max(spans[1], 1e-9)
+
+
+def _facts_first(figure: Any) -> Any:
+    """Truth below the estimates, so that they stay visible."""
+    figure.data = sorted(figure.data, key=lambda trace: trace.name not in FACTS)
+    return figure
+
+
+def _finish(figure: Any, title: str, x: str, y: str, height: int, **layout: Any) -> Any:
+    legend = {"orientation": "h", "x": 0, "xanchor": "left", "y": 1.02, "yanchor": "bottom"}
+    figure.update_layout(height=height, legend=legend, showlegend=len(figure.data) > 1, **layout)
+    figure.update_xaxes(title_text=x, hoverformat=".4~g", automargin=True)
+    figure.update_yaxes(title_text=y, hoverformat=".4~g", automargin=True)
+    if title:
+        figure.update_layout(title_text=title)
+    return figure

@@ -1,0 +1,86 @@
+"""The benchmark at a glance: one PNG from the rows, for a README."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from .rows import Row, Suite
+
+_BAR, _BEST, _LINE = "#56B4E9", "#0072B2", "#D55E00"
+
+
+def write_picture(path: str | Path, suites: Sequence[Suite]) -> None:
+    """Bars of every estimator's error and every controller's slip, with their intervals.
+
+    Needs the extra `report`. Suites without estimation or control rows give an empty picture's
+    ValueError.
+    """
+    try:
+        from matplotlib.figure import Figure
+    except ModuleNotFoundError:
+        raise ModuleNotFoundError(
+            "pictures need matplotlib: pip install 'sideslip[report]'"
+        ) from None
+    rows = [row for suite in suites for row in suite.rows]
+    panels = [
+        (title, [r for r in rows if r.scenario == scenario and r.metric == metric], label)
+        for scenario, metric, title, label in (
+            (
+                "tie-vision-fig7",
+                "rmse",
+                "Estimating with a late camera",
+                "error of sideslip / mrad",
+            ),
+            ("dakf-fig6", "rmse", "Estimating with GPS, wind, outage", "error of sideslip / mrad"),
+            ("tie-vision-fig8", "rms_slip", "Controlling a lane change", "RMS sideslip / mrad"),
+        )
+    ]
+    panels = [panel for panel in panels if panel[1]]
+    if not panels:
+        raise ValueError("nothing to draw: the picture needs the suites estimation or control")
+    figure = Figure(figsize=(4.0 * len(panels), 2.6), layout="constrained")
+    axes = figure.subplots(1, len(panels), squeeze=False)[0]
+    for axis, (title, mine, label) in zip(axes, panels, strict=True):
+        _bars(axis, mine, title, label)
+        bounds = [
+            r for r in rows if r.metric == "rmse_over_bound" and r.scenario == mine[0].scenario
+        ]
+        if bounds:
+            value = next(r.value for r in mine if r.estimator == bounds[0].estimator)
+            axis.axvline(1e3 * value / bounds[0].value, color=_LINE, linewidth=1.5)
+            axis.annotate(
+                "bound",
+                (1e3 * value / bounds[0].value, 1.0),
+                xycoords=("data", "axes fraction"),
+                color=_LINE,
+                fontsize=7,
+                ha="right",
+                va="bottom",
+            )
+    part = Path(path).with_name(f".{Path(path).name}.part.png")
+    try:
+        figure.savefig(part, dpi=110)
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def _bars(axis: Any, rows: Sequence[Row], title: str, label: str) -> None:
+    """Horizontal bars, the best on top and darker."""
+    ordered = sorted(rows, key=lambda row: -row.value)
+    names = [row.estimator if row.metric == "rmse" else _contestant(row) for row in ordered]
+    values = [1e3 * row.value for row in ordered]
+    colours = [_BAR] * (len(ordered) - 1) + [_BEST]
+    errors = [
+        [1e3 * (row.value - row.low) for row in ordered],
+        [1e3 * (row.high - row.value) for row in ordered],
+    ]
+    axis.barh(names, values, color=colours, xerr=errors, ecolor="0.3", capsize=2)
+    axis.set_title(title, fontsize=9)
+    axis.set_xlabel(label, fontsize=8)
+    axis.tick_params(labelsize=8)
+    axis.spines[["top", "right"]].set_visible(False)
+
+
+def _contestant(row: Row) -> str:
+    return row.controller if not row.estimator else f"{row.controller}\n{row.estimator}"

@@ -1,0 +1,169 @@
+"""Estimators over one recorded drive: what they are told, and how far they are from the truth."""
+
+import dataclasses
+import math
+import time
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ..envs.record import Array, Log, SlowSensor
+from ..envs.vehicle import Vehicle
+from ..estimators import UnobservableWarning, make_estimator
+from .emulate import Emulation
+
+GYRO_ONLY = "bicycle-kf"
+ESTIMATORS: dict[str, tuple[str, ...]] = {
+    GYRO_ONLY: (),
+    "single-rate-kf": ("gps", "camera"),
+    "multirate-kf": ("gps", "camera"),
+    "multirate-residual-kf": ("gps", "camera"),
+    "course-kf": ("gps",),
+    "dakf": ("gps",),
+    "exact-kf": ("gps", "camera"),
+}
+"""The estimators of a replay and the slow sensors that serve them, the better one first."""
+
+SETTLED = 2.0  # s: errors count from here on
+LEAST_NOISE = 0.01  # deg, of the course, that estimators are told
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings(Emulation):
+    """How a drive is replayed, on top of `Emulation`.
+
+    estimators: names in `ESTIMATORS`; None: all. The gyro-only one always runs along.
+    q_beta, q_gamma, q_psi: process noise told to every estimator in rad2/s, (rad/s)2/s, rad2/s; the
+    course noise they are told is `course_noise_deg`. seeds: how many noises of the emulated course,
+    from `seed` on. stiffness_factor: of both tyre stiffnesses the estimators are told. figures:
+    whether to draw.
+
+    Raises ValueError for a value out of range and an unknown estimator.
+    """
+
+    estimators: Sequence[str] | None = None
+    q_beta: float = 1e-3
+    q_gamma: float = 0.1
+    q_psi: float = 0.0
+    seeds: int = 5
+    seed: int = 0
+    stiffness_factor: float = 1.0
+    figures: bool = True
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        unknown = [name for name in self.estimators or () if name not in ESTIMATORS]
+        if unknown:
+            raise ValueError(
+                f"unknown estimator {', '.join(unknown)}; known here: {', '.join(ESTIMATORS)}"
+            )
+        if self.seeds < 1 or self.seed < 0:
+            raise ValueError(f"expected seeds >= 1 and seed >= 0, got {self.seeds}, {self.seed}")
+        for name in ("q_beta", "q_gamma", "q_psi"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value >= 0.0):
+                raise ValueError(f"{name} must be finite and not negative, got {value}")
+
+    def as_dict(self) -> dict[str, Any]:
+        """JSON types: everything that moves a number."""
+        plain = dataclasses.asdict(self)
+        del plain["figures"]
+        plain["estimators"] = list(self.estimators or ESTIMATORS)
+        return plain
+
+
+@dataclass
+class Result:
+    """Errors of one vehicle's estimators on one drive.
+
+    squares: by estimator, mean squared error in rad2 of each seed (empty without truth). cost: CPU
+    us per row. traces: sideslip of the first seed in rad, (rows,). remarks: by estimator, why it
+    was left out or what it cannot see.
+    """
+
+    squares: dict[str, Array] = field(default_factory=dict)
+    cost: dict[str, float] = field(default_factory=dict)
+    traces: dict[str, Array] = field(default_factory=dict)
+    remarks: dict[str, str] = field(default_factory=dict)
+
+    def rmse(self, name: str) -> tuple[float, float, float]:
+        """Median, least and most over the seeds, in rad."""
+        return _spread(np.sqrt(self.squares[name]))
+
+    def ratio(self, name: str) -> tuple[float, float, float]:
+        """RMSE over that of the gyro-only estimator, seed by seed: median, least and most."""
+        return _spread(np.sqrt(self.squares[name] / self.squares[GYRO_ONLY]))
+
+
+def _spread(values: Array) -> tuple[float, float, float]:
+    return float(np.median(values)), float(np.min(values)), float(np.max(values))
+
+
+def drives_of(log: Log, how: Settings) -> list[Log]:
+    """What the estimators see: a drive for each noise of the course, or the one that was logged.
+
+    Raises ValueError for a log that is over before errors count.
+    """
+    lasts = log.time[-1] - log.time[0]
+    if lasts < SETTLED:
+        raise ValueError(
+            f"{log.name}: the drive lasts {lasts:.3g} s, errors count from {SETTLED:g} s on"
+        )
+    if log.slow or "beta" not in log.truth:
+        return [how.with_gyro_bias(log)]
+    return [how.with_course(log, how.seed + i) for i in range(how.seeds)]
+
+
+def run_estimators(drives: Sequence[Log], told: Vehicle, how: Settings) -> Result:
+    """Every wanted estimator that the drives' slow sensors serve, over every drive."""
+    log, result = drives[0], Result()
+    counts = log.time >= log.time[0] + SETTLED - 1e-9
+    truth = log.truth.get("beta")
+    if truth is not None:
+        counts &= np.isfinite(truth)
+        if not counts.any():
+            raise ValueError(f"{log.name}: the sideslip truth is unknown from {SETTLED:g} s on")
+    for name, serves in ESTIMATORS.items():
+        if how.estimators is not None and name not in (GYRO_ONLY, *how.estimators):
+            continue
+        slow = next((sensor for sensor in serves if sensor in log.slow), None)
+        if serves and slow is None:
+            result.remarks[name] = f"left out: needs {' or '.join(serves)}"
+            continue
+        try:
+            estimator = _estimator(name, slow, log, told, how)
+        except ValueError as error:
+            if name == GYRO_ONLY:
+                raise
+            result.remarks[name] = f"left out: {error}"
+            continue
+        if estimator.unobservable:
+            result.remarks[name] = f"cannot see {'; '.join(estimator.unobservable)}"
+        squares = []
+        for drive in (log, *drives):  # the first run designs the gains
+            start = time.process_time()
+            estimates = estimator.run(drive)
+            spent = (time.process_time() - start) / len(counts) * 1e6
+            result.cost[name] = min(spent, result.cost.get(name, math.inf))
+            beta = estimates.x[:, estimates.names.index("beta")]
+            result.traces.setdefault(name, beta)
+            if truth is not None:
+                squares.append(np.mean((beta - truth)[counts] ** 2))
+        if truth is not None:
+            result.squares[name] = np.array(squares[1:])
+    return result
+
+
+def _estimator(name: str, slow: str | None, log: Log, told: Vehicle, how: Settings) -> Any:
+    sensors: dict[str, SlowSensor] = {} if slow is None else {slow: log.slow[slow]}
+    options: dict[str, Any] = {"q_beta": how.q_beta, "q_gamma": how.q_gamma}
+    if slow is not None:
+        options |= {"slow": slow, "q_psi": how.q_psi}
+    if slow == "gps":
+        options["course_noise"] = math.radians(max(how.course_noise_deg, LEAST_NOISE))
+    with warnings.catch_warnings():  # the result says it
+        warnings.simplefilter("ignore", UnobservableWarning)
+        return make_estimator(name, vehicle=told, sensors=sensors, dt=log.record.dt, **options)

@@ -1,0 +1,251 @@
+"""Question: which estimator comes closest to the sideslip angle of a real, recorded drive?"""
+
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .. import __version__
+from ..envs.logs import parse_mapping, read_log
+from ..envs.record import Log
+from ..envs.vehicle import Vehicle
+from .emulate import path
+from .recorded import ESTIMATORS, GYRO_ONLY, SETTLED, Result, Settings, drives_of, run_estimators
+from .rows import Row, Suite, Table
+from .vehicles import read_vehicle
+
+__all__ = ["Settings", "corners", "read_vehicle", "replay", "replay_file"]
+
+CORNERS = ((0.7, 0.7), (0.7, 1.3), (1.3, 0.7), (1.3, 1.3))
+FITTED, NOMINAL = "ferrari-250lm-fitted", "ferrari-250lm-nominal"
+FACTOR = 0.7  # of the fitted tyres, where no vehicle is named
+DEGREES = 180.0 / math.pi
+WINDOW = 10.0  # s to either side of the largest sideslip
+HIDDEN = "Names that are pale in the legend are hidden; a click shows them."
+
+
+def replay(log: Log, vehicle: Vehicle, **settings: Any) -> Suite:
+    """Run the estimators over a recorded drive, told this vehicle, and score them.
+
+    settings: of `Settings` (course_rate, course_noise_deg, delay, bias_deg, gyro_bias_degps,
+    estimators, q_beta, q_gamma, q_psi, seeds, seed, stiffness_factor, figures). A log that carries
+    slow sensors is replayed with those; else a GPS course is emulated where the log knows the true
+    sideslip; else estimators that need a slow sensor are left out, and the table says so. Without
+    truth nothing is scored, but drawn.
+
+    Rows: rmse (rad, from 2 s on), ratio (over gyro-only) and us_per_tick; value is the median, low
+    and high are the least and most over the noises.
+
+    Raises TypeError for an unknown setting, ValueError for a bad one and for a drive under 2 s.
+    """
+    how = Settings(**settings)
+    told = vehicle.scaled(how.stiffness_factor)
+    drives = drives_of(log, how)
+    result = run_estimators(drives, told, how)
+    suite = Suite("replay", f"A recorded drive: {log.name}", _text(log, drives, told, how))
+    suite.rows = _rows(result, log.name, told, how)
+    suite.tables = [_table(result, log.name, told, len(drives))]
+    if how.figures:
+        suite.figures = _figures(result, log)
+    return suite
+
+
+def corners(log: Log, vehicle: Vehicle, **settings: Any) -> Suite:
+    """`replay` told the four corners of a vehicle: front and rear stiffness x 0.7 and x 1.3.
+
+    settings: of `replay`. One table, the rows of every corner, no figures. Raises what `replay`
+    does, and ValueError for a log without truth.
+    """
+    how = Settings(**settings)
+    if "beta" not in log.truth:
+        raise ValueError(f"{log.name}: corners are scored against sideslip truth; there is none")
+    drives = drives_of(log, how)
+    suite = Suite("replay", f"A recorded drive: {log.name}", "")
+    names = [name for name in ESTIMATORS if how.estimators is None or name in how.estimators]
+    lines = []
+    for front, rear in CORNERS:
+        told = vehicle.scaled(how.stiffness_factor).scaled(front, rear)
+        label = f"front x {front}, rear x {rear}"
+        result = run_estimators(drives, told, how)
+        suite.rows += _rows(result, f"{log.name}: {vehicle.name}, {label}", told, how)
+        lines.append([label, *(_error(result, name) for name in names)])
+    suite.tables = [
+        Table(
+            f"{log.name}, estimators told {vehicle.name} with wrong tyres: RMSE / deg",
+            ("told stiffness", *names),
+            lines,
+            "The same process noise in all corners; medians over the noises.",
+        )
+    ]
+    return suite
+
+
+def replay_file(
+    log: str | Path,
+    vehicle: str | Path | None = None,
+    *,
+    mapping: Sequence[str] | None = None,
+    **settings: Any,
+) -> Suite:
+    """Read a drive and its vehicle, replay it, and where it has truth the vehicle's corners too.
+
+    vehicle: a TOML or JSON file, or the name of one that comes with the package. None: the Ferrari
+    250 LM of the Stanford log, told the fitted tyres x 0.7, and the corners of the nominal one.
+    mapping: texts such as "steer_rad=Delta". settings: of `replay`. Raises what `read_log`,
+    `read_vehicle` and `replay` do.
+    """
+    drive = read_log(log, parse_mapping(mapping or ()))
+    if vehicle is None:
+        told, nominal = read_vehicle(FITTED), read_vehicle(NOMINAL)
+        suite = replay(drive, told, **{"stiffness_factor": FACTOR} | settings)
+        suite.text += (
+            "\n\nNo vehicle was named, so the estimators were told the Ferrari 250 LM of the "
+            f"Stanford log, fitted tyres x {FACTOR}. For another car name its file: "
+            "`--vehicle FILE`."
+        )
+    else:
+        told = nominal = read_vehicle(vehicle)
+        suite = replay(drive, told, **settings)
+    if "beta" in drive.truth:
+        wrong = corners(drive, nominal, **settings)
+        suite.rows += wrong.rows
+        suite.tables += wrong.tables
+    return suite
+
+
+def _text(log: Log, drives: Sequence[Log], told: Vehicle, how: Settings) -> str:
+    lasts, rate = log.time[-1] - log.time[0], 1.0 / log.record.dt
+    text = [f"{lasts:.0f} s at {rate:.4g} Hz. The estimators are told the vehicle {told.name!r}"]
+    if how.stiffness_factor != 1.0:
+        text.append(f"with both tyre stiffnesses x {how.stiffness_factor:g}")
+    text.append(
+        f"and one process noise: {how.q_beta:g} rad2/s on sideslip, {how.q_gamma:g} (rad/s)2/s on "
+        f"yaw rate, {how.q_psi:g} rad2/s on heading."
+    )
+    if log.slow:
+        text.append(f"Slow sensors are the log's own: {', '.join(log.slow)}.")
+    elif "gps" in drives[0].slow:
+        gps = drives[0].slow["gps"]
+        text.append(
+            f"A GPS course is emulated every {gps.period:.4g} s from the sideslip truth and the "
+            f"integral of the logged yaw rate: noise {how.course_noise_deg:g} deg, "
+            f"{gps.longest_delay:.4g} s late, bias {how.bias_deg:g} deg."
+        )
+    else:
+        text.append("The log has no slow sensor and no truth to emulate one from.")
+    if how.gyro_bias_degps:
+        text.append(f"{how.gyro_bias_degps:g} deg/s are added to the gyro.")
+    if "beta" in log.truth:
+        text.append(f"Errors count from {SETTLED:g} s on.")
+    else:
+        text.append("The log has no sideslip truth, so nothing is scored.")
+    return " ".join(text)
+
+
+def _rows(result: Result, scenario: str, told: Vehicle, how: Settings) -> list[Row]:
+    """Every number of a result."""
+    spec = json.dumps({"vehicle": told.to_dict(), "settings": how.as_dict()})
+    rows = []
+    for name, cost in result.cost.items():
+        measured: dict[str, tuple[float, ...]] = {"us_per_tick": (cost,)}
+        seeds = 1
+        if name in result.squares:
+            measured = {"rmse": result.rmse(name), "ratio": result.ratio(name)} | measured
+            seeds = len(result.squares[name])
+        for metric, (value, *around) in measured.items():
+            low, high = around or (math.nan, math.nan)
+            rows.append(
+                Row(
+                    suite="replay",
+                    scenario=scenario,
+                    estimator=name,
+                    metric=metric,
+                    value=value,
+                    low=low,
+                    high=high,
+                    n=seeds,
+                    salt=f"seed {how.seed}",
+                    env_version=f"replay {__version__}",
+                    spec=spec,
+                )
+            )
+    return rows
+
+
+def _error(result: Result, name: str) -> str:
+    return f"{DEGREES * result.rmse(name)[0]:.2f}" if name in result.squares else "-"
+
+
+def _table(result: Result, name: str, told: Vehicle, noises: int) -> Table:
+    """The estimators, best first; remarks in the note."""
+    note = "; ".join(f"`{label}` {remark}" for label, remark in result.remarks.items())
+    if not result.squares:
+        cells = [[label, f"{cost:.3f}"] for label, cost in result.cost.items()]
+        header: tuple[str, ...] = ("estimator", "us per tick")
+        return Table(f"{name}, told {told.name}: no truth, no score", header, cells, note)
+    header = ("estimator", "RMSE / deg", "least .. most", "of gyro only", "us per tick")
+    cells = []
+    for label in sorted(result.squares, key=lambda label: result.rmse(label)[0]):
+        value, low, high = (DEGREES * number for number in result.rmse(label))
+        ratio, cost = result.ratio(label)[0], result.cost[label]
+        among = f"{low:.3f} .. {high:.3f}"
+        cells.append([label, f"{value:.3f}", among, f"{ratio:.2f}", f"{cost:.3f}"])
+    title = f"{name}, told {told.name}: error of the sideslip angle (median of {noises} noises)"
+    return Table(title, header, cells, note)
+
+
+def _figures(result: Result, log: Log) -> list[tuple[str, Any, str]]:
+    """Bars, sideslip, errors and tracks of the first noise; nothing without plotly."""
+    try:
+        from .figures import bars_with_interval, error_series, time_series, track
+    except ModuleNotFoundError:
+        return []
+    truth = log.truth.get("beta")
+    traces = result.traces if truth is None else {"truth": truth} | result.traces
+    slips = {name: DEGREES * beta for name, beta in traces.items()}
+    label = "sideslip angle / deg"
+    most = log.time[np.nanargmax(np.abs(next(iter(slips.values()))))]
+    near = np.abs(log.time - most) <= WINDOW
+    close = {name: beta[near] for name, beta in slips.items()}
+    paths = {name: path(log, beta) for name, beta in traces.items()}
+    shown = [
+        (
+            f"{log.name}: the sideslip angle and its estimates",
+            _few(time_series("", log.time, slips, label), result),
+            HIDDEN,
+        ),
+        (
+            f"{log.name}: where the car slips most",
+            time_series("", log.time[near], close, label),
+            f"The {2 * WINDOW:g} s around the largest sideslip angle, all estimators.",
+        ),
+        (
+            f"{log.name}: the track",
+            _few(track(paths), result),
+            "Dead reckoning from wheel speed, the integral of the logged yaw rate and each "
+            f"sideslip angle: what a degree of sideslip is worth on the road. {HIDDEN}",
+        ),
+    ]
+    if truth is None:
+        return shown
+    errors = {name: DEGREES * (beta - truth) for name, beta in result.traces.items()}
+    figure = error_series("", log.time, errors, f"error of the {label}")
+    shown.insert(
+        2, (f"{log.name}: errors", _few(figure, result), f"Estimate minus truth. {HIDDEN}")
+    )
+    value, low, high = (DEGREES * np.array([result.rmse(name) for name in result.squares])).T
+    bars = bars_with_interval(list(result.squares), value, low, high, f"RMSE of the {label}")
+    text = f"Median over the noises; whiskers: least and most. {GYRO_ONLY} has no slow sensor."
+    return [(f"{log.name}: error of each estimator", bars, text), *shown]
+
+
+def _few(figure: Any, result: Result) -> Any:
+    """The figure with only truth, gyro-only and the best estimator in sight."""
+    best = min(result.squares, key=lambda name: result.rmse(name)[0], default="exact-kf")
+    for trace in figure.data:
+        if trace.name in result.traces and trace.name not in (GYRO_ONLY, best):
+            trace.visible = "legendonly"
+    return figure

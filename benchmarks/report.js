@@ -1,0 +1,123 @@
+"use strict";
+
+// A click on a header sorts its table up, then down, then as written. Blanks stay at the end.
+const NEXT = { none: "ascending", ascending: "descending", descending: "none" };
+const ORDER = new Intl.Collator("en", { numeric: true });
+
+function compare(a, b, isNumber, sign) {
+  const key = (cell) => (isNumber ? cell.dataset.value : cell.textContent.trim()) || "";
+  const [p, q] = [key(a), key(b)];
+  if (!p || !q) return Number(!p) - Number(!q);
+  return sign * (isNumber ? Math.sign(Number(p) - Number(q)) || 0 : ORDER.compare(p, q));
+}
+
+for (const table of document.querySelectorAll("table.sortable")) {
+  const body = table.tBodies[0];
+  const written = [...body.rows];
+  const heads = [...table.tHead.rows[0].cells];
+  heads.forEach((head, column) => {
+    head.querySelector("button").addEventListener("click", () => {
+      const next = NEXT[head.getAttribute("aria-sort")];
+      for (const other of heads) other.setAttribute("aria-sort", other === head ? next : "none");
+      const isNumber = head.classList.contains("number");
+      const sign = next === "descending" ? -1 : 1;
+      const rows = [...written];
+      if (next !== "none") {
+        rows.sort((a, b) => compare(a.cells[column], b.cells[column], isNumber, sign));
+      }
+      body.append(...rows);
+    });
+  });
+}
+
+// Figures take the page's colours, light or dark; black, the colour of facts, becomes its ink.
+const DARK = window.matchMedia("(prefers-color-scheme: dark)");
+const TOUCH = window.matchMedia("(hover: none)");
+const NARROW = window.matchMedia("(max-width: 40rem)");
+const CONFIG = {
+  responsive: true,
+  displaylogo: false,
+  showSendToCloud: false, // on by default: it would upload the figure
+  plotlyServerURL: "",
+  displayModeBar: TOUCH.matches ? false : "hover",
+  modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"],
+  toImageButtonOptions: { format: "svg", filename: "sideslip" },
+};
+
+function shade(name) {
+  return getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+}
+
+function template() {
+  const axis = {
+    gridcolor: shade("--grid"), linecolor: shade("--rule"), zerolinecolor: shade("--rule"),
+    tickcolor: shade("--rule"), ticks: "outside", showline: true, zeroline: false,
+    title: { standoff: 12, font: { size: 13 } },
+  };
+  const family = getComputedStyle(document.body).fontFamily;
+  return {
+    layout: {
+      font: { family, size: 12, color: shade("--text") },
+      paper_bgcolor: shade("--page"), plot_bgcolor: shade("--page"),
+      hoverlabel: { bgcolor: shade("--raised"), bordercolor: shade("--rule"), font: { family } },
+      modebar: {
+        orientation: "v", bgcolor: "rgba(0,0,0,0)",
+        color: shade("--quiet"), activecolor: shade("--link"),
+      },
+      xaxis: axis, yaxis: axis, margin: { l: 12, r: 12, t: 12, b: 12 },
+    },
+  };
+}
+
+function inked(colour) {
+  if (Array.isArray(colour)) return colour.map(inked);
+  return colour === "#000000" ? shade("--ink") : colour;
+}
+
+function broken(text) {
+  const lines = Math.ceil(text.length / 28);
+  const length = lines > 1 ? Math.ceil(text.length / lines) + 4 : text.length;
+  return text.replace(new RegExp(`(.{1,${length}})(?:\\s+|$)`, "g"), "$1<br>").slice(0, -4);
+}
+
+function draw(figure) {
+  const { data, layout } = JSON.parse(figure.querySelector("script").textContent);
+  for (const trace of data) {
+    for (const pen of [trace.line, trace.marker, trace.error_x]) {
+      if (pen?.color) pen.color = inked(pen.color);
+    }
+  }
+  if (NARROW.matches) {
+    // The legend becomes a column above the plot, long titles of axes become several lines.
+    if (layout.showlegend && layout.height) layout.height += 16 * data.length;
+    for (const title of [layout.xaxis?.title, layout.yaxis?.title]) {
+      if (title?.text) title.text = broken(title.text);
+    }
+  }
+  // A finger shall scroll the page, not zoom the figure it lands on.
+  const dragmode = TOUCH.matches ? false : "zoom";
+  const themed = { dragmode, ...layout, template: template() };
+  Plotly.react(figure.querySelector(".plot"), data, themed, CONFIG);
+}
+
+function drawAll() {
+  for (const figure of document.querySelectorAll("figure")) draw(figure);
+}
+
+// One figure a turn, so that the page can be read and scrolled from the start.
+function drawInTurn(figures) {
+  if (!figures.length) return;
+  setTimeout(drawInTurn, 0, figures.slice(1)); // first: a figure that fails stops no other
+  draw(figures[0]);
+}
+
+function setPrinting(printing) {
+  document.documentElement.classList.toggle("printing", printing);
+  if (DARK.matches) drawAll();
+}
+
+drawInTurn([...document.querySelectorAll("figure")]);
+DARK.addEventListener("change", drawAll);
+NARROW.addEventListener("change", drawAll);
+window.addEventListener("beforeprint", () => setPrinting(true));
+window.addEventListener("afterprint", () => setPrinting(false));

@@ -1,0 +1,333 @@
+"""The filter itself, compiled: fast rows and packets in, states out.
+
+Order of a tick: clones of what was captured at the last tick, prediction from the last tick to
+this one with the inputs of this row, the gyro, then the packets that arrive. A filter at the slow
+sensor's rate does the same once every `stride` ticks, with the mean input, and the packets that
+came meanwhile.
+"""
+
+from typing import Any
+
+from ..envs.backend import absolute, jit, maximum, minimum
+from ..envs.elementary import wrap
+from ..envs.record import FAST, GPS, PACKET, PACKET_WIDTH
+from .covariance import measure_clone, measure_state, predict_covariance
+from .delay import DIRECT, DROPPED, find, latch_due
+from .intersample import correct_between, correct_sample
+from .memory import COUNTERS, INPUTS, SEEN, SLOW, WAITING, WIDTH
+from .models import MOVED, SLOWEST, build
+
+ASTRAY = 0.2  # rad: the first course sets the heading where it is so far off
+
+
+@jit
+def _finite(value: Any) -> Any:
+    return value - value == 0.0
+
+
+@jit
+def begin(f: Any, first: int) -> None:
+    """A fresh filter whose first row is the tick `first`."""
+    f.start, f.tick, f.begun, f.at = first, first - 1, 0, 0
+    f.cell, f.wanted, f.cursor, f.waits, f.fixes, f.u_count = 0, -1, 0, 0, 0, 0
+    for i in range(WIDTH):
+        f.x[i], f.e[i], f.gain[i] = 0.0, 0.0, 0.0
+        for j in range(WIDTH):
+            f.P[i, j] = 0.0
+    for i in range(f.n):
+        for j in range(f.n):
+            f.P[i, j] = f.prior[i, j]
+    for i in range(INPUTS):
+        f.u[i], f.u_sum[i] = 0.0, 0.0
+    for s in range(SLOW):
+        f.stamp[s, :] = -1
+        for i in range(SEEN):
+            f.seen[s, i] = -1
+        if f.period[s] > 0:
+            late = maximum(first - f.phase[s], 0)
+            f.next[s] = f.phase[s] + (late + f.period[s] - 1) // f.period[s] * f.period[s]
+    for i in range(len(f.counts)):
+        f.counts[i] = 0
+    if f.measured == 1:
+        f.speed, f.model_speed = 0.0, 0.0
+    else:
+        build(f, f.speed)
+
+
+@jit
+def _measured_speed(f: Any, row: Any) -> Any:
+    """The low-passed mean of the front wheels' speeds, with this row."""
+    now = 0.5 * (row[FAST.wheel_left] + row[FAST.wheel_right])
+    if not _finite(now):
+        return f.speed
+    if f.model_speed == 0.0:
+        return now
+    return f.speed + f.smoothing * (now - f.speed)
+
+
+@jit
+def _moved(f: Any, speed: Any) -> Any:
+    """Whether the model has to be built anew for this speed."""
+    return absolute(maximum(speed, SLOWEST) - f.model_speed) > MOVED * f.model_speed
+
+
+@jit
+def _cell_of(f: Any, speed: Any) -> int:
+    """The table of gains nearest to a speed."""
+    if f.spacing == 0.0:
+        return 0
+    V = minimum(maximum(speed, f.low), f.high)
+    return int((V - f.low) / f.spacing + 0.5)
+
+
+@jit
+def _ready(f: Any, gains: Any, row: Any) -> Any:
+    """Whether the gains are there that this row will ask for; else `wanted` says which."""
+    cell = f.cell
+    if f.measured == 1:
+        speed = _measured_speed(f, row)
+        if _moved(f, speed):
+            cell = _cell_of(f, speed)
+    f.wanted = -1 if gains[cell, 0, 0] == 1.0 else cell
+    return f.wanted < 0
+
+
+@jit
+def _note_inputs(f: Any, row: Any) -> None:
+    """Keep this row's inputs (the last finite ones), and its speed; rebuild the model if needed."""
+    delta_f = row[FAST.steer]
+    N_z = f.moment_arm * (row[FAST.torque_right] - row[FAST.torque_left])
+    if _finite(delta_f) and _finite(N_z):
+        f.u[0], f.u[1] = delta_f, N_z
+    else:
+        f.counts[COUNTERS.invalid] += 1
+    if f.measured == 1:
+        f.speed = _measured_speed(f, row)
+        if _moved(f, f.speed):
+            build(f, f.speed)
+            f.cell = _cell_of(f, f.speed)
+
+
+@jit
+def _predict(f: Any, v: Any) -> None:
+    """v <- F v on the states."""
+    n, dense, G, T = f.n, f.dense, f.G, f.work[0, 0]
+    for i in range(dense):
+        total = 0.0
+        for k in range(n):
+            total += G[i, k] * v[k]
+        T[i] = total
+    for i in range(dense):
+        v[i] = T[i]
+    for i in range(dense, n):
+        v[i] *= f.decay[i]
+
+
+@jit
+def _advance_state(f: Any, u0: Any, u1: Any) -> None:
+    """x <- F x + H u, and P or e with it."""
+    _predict(f, f.x)
+    for i in range(f.dense):
+        f.x[i] += f.H[i, 0] * u0 + f.H[i, 1] * u1
+    if f.pseudo == 1:
+        _predict(f, f.e)
+    elif f.periodic == 0:
+        predict_covariance(f)
+
+
+@jit
+def _gyro(f: Any, table: Any, measured: Any) -> None:
+    residual = measured
+    for k in range(f.n):
+        residual -= f.gyro[k] * f.x[k]
+    if not _finite(residual):
+        f.counts[COUNTERS.invalid] += 1
+        residual = 0.0
+        if f.periodic == 0:
+            return
+    if f.pseudo == 1:
+        correct_between(f, table, 0 if f.period[0] > 0 else 1, residual)
+    elif f.periodic == 1:
+        gain = table[1 + f.at]
+        for i in range(f.total):
+            f.x[i] += gain[i] * residual
+    else:
+        measure_state(f, f.gyro, f.r_gyro, residual)
+
+
+@jit
+def _align(f: Any, residual: Any) -> None:
+    """Turn the heading, and all clones of courses, onto the first course."""
+    f.x[2] += residual
+    for i in range(f.frames[GPS]):
+        f.x[f.home[GPS] + i] += residual
+
+
+@jit
+def _use(f: Any, table: Any, s: int, packet: Any) -> None:
+    """Correct by one packet of sensor s whose values are sound."""
+    captured = int(packet[PACKET.captured])
+    first = find(f, s, captured)
+    if first == DROPPED:
+        return
+    if f.pseudo == 1:
+        correct_sample(f, table, s, packet[PACKET.value :])
+        return
+    frame = (captured - f.phase[s]) // f.period[s] % f.pattern
+    for i in range(f.rows[s]):
+        residual = packet[PACKET.value + i]
+        if first == DIRECT:
+            for k in range(f.n):
+                residual -= f.row[s, i, k] * f.x[k]
+        else:
+            residual -= f.x[first + i]
+        if f.angle[s, i] == 1:
+            residual = wrap(residual)
+        if s == GPS:
+            f.fixes += 1
+            if f.fixes == 1 and absolute(residual) > ASTRAY:
+                _align(f, residual)
+                residual = 0.0
+        if f.periodic == 1:
+            gain = table[1 + f.cycle + frame * f.rows[s] + i]
+            for j in range(f.total):
+                f.x[j] += gain[j] * residual
+        elif first == DIRECT:
+            measure_state(f, f.row[s, i], f.r[s, i], residual)
+        else:
+            measure_clone(f, first + i, f.r[s, i], residual)
+
+
+@jit
+def receive(f: Any, table: Any, packet: Any) -> None:
+    """Use a packet that is here now, keep it for the next step, or drop and count it."""
+    for i in range(PACKET.value):
+        if not _finite(packet[i]):
+            f.counts[COUNTERS.invalid] += 1
+            return
+    s = int(packet[PACKET.sensor])
+    if s < 0 or s >= SLOW:
+        f.counts[COUNTERS.unknown] += 1
+        return
+    if f.period[s] == 0:
+        return
+    for i in range(f.rows[s]):
+        if not _finite(packet[PACKET.value + i]):
+            f.counts[COUNTERS.invalid] += 1
+            return
+    if packet[PACKET.quality] <= 0.0:
+        f.counts[COUNTERS.poor] += 1
+        return
+    if f.stride > 1 and not (f.begun == 1 and (f.tick - f.origin) % f.stride == 0):
+        if f.waits == WAITING:
+            f.counts[COUNTERS.refused] += 1
+            return
+        for i in range(PACKET_WIDTH):
+            f.waiting[f.waits, i] = packet[i]
+        f.waits += 1
+        return
+    _use(f, table, s, packet)
+
+
+@jit
+def tick(f: Any, table: Any, row: Any) -> None:
+    """Take one fast row: from the last tick to this one."""
+    f.tick += 1
+    if f.stride > 1:
+        f.u_sum[0] += f.u[0]
+        f.u_sum[1] += f.u[1]
+        f.u_count += 1
+        if f.tick < f.origin or (f.tick - f.origin) % f.stride != 0:
+            return
+    if f.begun == 1:
+        latch_due(f, f.tick - f.stride)
+        if f.stride > 1:
+            _advance_state(f, f.u_sum[0] / f.u_count, f.u_sum[1] / f.u_count)
+        else:
+            _advance_state(f, f.u[0], f.u[1])
+        f.at = f.at + 1 if f.at + 1 < f.cycle else 0
+    else:
+        f.begun = 1
+        f.at = ((f.tick - f.origin) // f.stride) % f.cycle
+    _gyro(f, table, row[FAST.gyro])
+    if f.stride > 1:
+        f.u_sum[0], f.u_sum[1], f.u_count = 0.0, 0.0, 0
+        for i in range(f.waits):
+            _use(f, table, int(f.waiting[i, PACKET.sensor]), f.waiting[i])
+        f.waits = 0
+
+
+@jit
+def record_row(f: Any, table: Any, x: Any, std: Any) -> None:
+    """The states and their standard deviations now, (n,) each."""
+    n = f.n
+    at = f.total
+    for i in range(n):
+        x[i] = f.x[i]
+        variance = table[1 + f.at, at] if f.periodic == 1 else f.P[i, i]
+        std[i] = maximum(variance, 0.0) ** 0.5
+        at += n - i
+
+
+@jit
+def advance(
+    f: Any,
+    gains: Any,
+    fast: Any,
+    rows: int,
+    packets: Any,
+    count: int,
+    start: int,
+    X: Any,
+    S: Any,
+) -> int:
+    """Take the fast rows from `start` to `rows` and the first `count` packets.
+
+    gains: (cells, ..., ...). X, S: (rows, n) to be filled, or empty. Returns the rows done: fewer
+    than `rows` where gains are missing, `f.wanted` says which; call again from there.
+    """
+    at = 0 if start == 0 else f.cursor
+    for j in range(start, rows):
+        row = fast[j]
+        if f.periodic == 1 and not _ready(f, gains, row):
+            f.cursor = at
+            return j
+        _note_inputs(f, row)
+        table = gains[f.cell]
+        tick(f, table, row)
+        while at < count and not packets[at, PACKET.arrived] > f.tick:
+            receive(f, table, packets[at])
+            at += 1
+        if len(X) > 0:
+            record_row(f, table, X[j], S[j])
+    f.counts[COUNTERS.future] += count - at
+    return rows
+
+
+@jit
+def begin_filter(filters: Any, first: int) -> None:
+    """`begin` for the first filter of an array."""
+    begin(filters[0], first)
+
+
+@jit
+def receive_filter(filters: Any, gains: Any, packet: Any) -> None:
+    """`receive` for the first filter of an array."""
+    f = filters[0]
+    receive(f, gains[f.cell], packet)
+
+
+@jit
+def advance_filter(
+    filters: Any,
+    gains: Any,
+    fast: Any,
+    rows: int,
+    packets: Any,
+    count: int,
+    start: int,
+    X: Any,
+    S: Any,
+) -> int:
+    """`advance` for the first filter of an array."""
+    return advance(filters[0], gains, fast, rows, packets, count, start, X, S)

@@ -1,0 +1,112 @@
+"""The covariance and its gains in compiled code: `kalman.py`'s equations on a filter's record.
+
+Only the first n of `total` states move; the others are clones. Measurements come one scalar at a
+time, so that a gain is a division and not a matrix inverse.
+"""
+
+from typing import Any
+
+from ..envs.backend import jit
+
+
+@jit
+def predict_covariance(f: Any) -> None:
+    """P <- F P F^T + Q with F = [[G, 0], [0, diag(decay)]] on the states, I on the clones."""
+    n, dense, size = f.n, f.dense, f.total
+    G, P, T, decay = f.G, f.P, f.work[0], f.decay
+    for i in range(dense):  # T = F P on the states
+        for j in range(n):
+            T[i, j] = 0.0
+        for k in range(n):
+            g = G[i, k]
+            for j in range(n):
+                T[i, j] += g * P[k, j]
+    for i in range(dense):  # P = T F^T + Q
+        for j in range(i, dense):
+            total = f.Q[i, j]
+            for k in range(n):
+                total += T[i, k] * G[j, k]
+            P[i, j] = total
+            P[j, i] = total
+        for j in range(dense, n):
+            value = T[i, j] * decay[j] + f.Q[i, j]
+            P[i, j] = value
+            P[j, i] = value
+    for i in range(dense, n):
+        for j in range(i, n):
+            value = decay[i] * P[i, j] * decay[j] + f.Q[i, j]
+            P[i, j] = value
+            P[j, i] = value
+    for c in range(n, size):  # the clones' covariance with the states
+        for i in range(dense):
+            total = 0.0
+            for k in range(n):
+                total += G[i, k] * P[k, c]
+            f.ph[i] = total
+        for i in range(dense, n):
+            f.ph[i] = decay[i] * P[i, c]
+        for i in range(n):
+            P[i, c] = f.ph[i]
+            P[c, i] = f.ph[i]
+
+
+@jit
+def _condition(f: Any, variance: Any, residual: Any) -> None:
+    """Use one residual of the given variance whose covariance with the state is `f.ph`.
+
+    P <- P - K s K^T is Joseph's form for the optimal gain of a scalar; each half is written once
+    and mirrored, so P stays symmetric to the last bit.
+    """
+    size, x, P, ph, gain = f.total, f.x, f.P, f.ph, f.gain
+    per = 1.0 / variance
+    for i in range(size):
+        k = ph[i] * per
+        gain[i] = k
+        x[i] += k * residual
+        for j in range(i, size):
+            value = P[i, j] - k * ph[j]
+            P[i, j] = value
+            P[j, i] = value
+
+
+@jit
+def measure_state(f: Any, row: Any, r: Any, residual: Any) -> None:
+    """Use the residual of a measurement `row` (n,) of the states with noise variance r."""
+    n, size, P, ph = f.n, f.total, f.P, f.ph
+    for i in range(size):
+        ph[i] = 0.0
+    for k in range(n):
+        h = row[k]
+        if h != 0.0:
+            for i in range(size):
+                ph[i] += h * P[k, i]
+    s = r
+    for k in range(n):
+        s += row[k] * ph[k]
+    _condition(f, s, residual)
+
+
+@jit
+def measure_clone(f: Any, clone: int, r: Any, residual: Any) -> None:
+    """Use the residual of a measurement of one clone with noise variance r."""
+    for i in range(f.total):
+        f.ph[i] = f.P[clone, i]
+    _condition(f, f.ph[clone] + r, residual)
+
+
+@jit
+def clone_covariance(f: Any, row: Any, clone: int) -> None:
+    """Make a clone of the combination `row` of the states."""
+    n, size, P, ph = f.n, f.total, f.P, f.ph
+    for i in range(size):
+        total = 0.0
+        for k in range(n):
+            total += row[k] * P[k, i]
+        ph[i] = total
+    own = 0.0
+    for k in range(n):
+        own += row[k] * ph[k]
+    for i in range(size):
+        P[clone, i] = ph[i]
+        P[i, clone] = ph[i]
+    P[clone, clone] = own

@@ -1,0 +1,263 @@
+"""The estimator object: a filter's compiled memory behind a small face."""
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numba
+import numpy as np
+import numpy.typing as npt
+from numba.core.dispatcher import Dispatcher
+
+from ..envs.record import FAST_WIDTH, PACKET_WIDTH, SLOW_NAMES, Log, Record, SlowSensor
+from .core import advance_filter, begin_filter, receive_filter
+from .memory import FILTER, Counters
+from .periodic import design, table_shape
+from .schedule import Schedule, whole_ticks
+from .stability import MARGINAL, error_map, spectral_radius, unobservable
+
+Array = npt.NDArray[np.float64]
+
+CHECKED_SPEEDS = (3.0, 7.0, 14.0)  # m/s, where a filter without a fixed speed is checked
+
+
+class UnobservableWarning(UserWarning):
+    """A filter has a direction that its sensors cannot see."""
+
+
+@dataclass(frozen=True)
+class Estimates:
+    """What a filter said at every row of a record.
+
+    time: (K,) s. x, std: (K, n), states and standard deviations. names: of the n states.
+    """
+
+    time: Array
+    x: Array
+    std: Array
+    names: tuple[str, ...]
+
+    def __getitem__(self, name: str) -> Array:
+        """One state by name, (K,)."""
+        return self.x[:, self.names.index(name)]
+
+
+def entry(function: Any, *example: Any) -> Any:
+    """The compiled call of a function for arguments of the example's types.
+
+    numba finds out the types of the arguments at every call, which costs more than a filter's
+    step; this is the call without it, so arguments must have exactly these types and layouts.
+    """
+    if not isinstance(function, Dispatcher):
+        return function
+    return function.compile(tuple(map(numba.typeof, example)))
+
+
+_MATRIX = np.zeros((1, 1))
+
+
+@cache
+def entries() -> tuple[Any, Any]:
+    """(`advance_filter`, `receive_filter`) as plain calls."""
+    filters, gains = np.zeros(1, FILTER), np.zeros((1, 1, 1))
+    return (
+        entry(advance_filter, filters, gains, _MATRIX, 0, _MATRIX, 0, 0, _MATRIX, _MATRIX),
+        entry(receive_filter, filters, gains, _MATRIX[0]),
+    )
+
+
+class Estimator:
+    """A filter at work; built by `make_estimator`.
+
+    `names` and `units` of its states; `x` (n,) and `P` (n, n) at "now"; `tick`, the last fast row.
+    `unobservable`: directions that its sensors cannot see. `spectral_radius` of its error over a
+    cycle. `dt`: seconds of a tick. `needs`: the fast columns it reads.
+    Counters of what was skipped: `refused` (older than the filter's window), `duplicates`,
+    `future`, `invalid` (not finite), `poor` (quality 0), `unknown` (sensor or stamp).
+    """
+
+    def __init__(
+        self,
+        name: str,
+        names: tuple[str, ...],
+        units: tuple[str, ...],
+        dt: float,
+        filters: Any,
+        sensors: Mapping[str, SlowSensor],
+        schedules: tuple[Schedule, ...],
+        kind: str,
+        allow_unstable: bool,
+    ) -> None:
+        self.name, self.names, self.units, self.dt = name, names, units, dt
+        self.sensors = dict(sensors)
+        self._filters, self._schedules, self._kind = filters, schedules, kind
+        f = self._f
+        cells = round((f.high - f.low) / f.spacing) + 1 if f.spacing > 0.0 else 1
+        shape = (cells, *table_shape(f, schedules[-1])) if f.periodic else (1, 1, 1)
+        self._gains = np.zeros(shape)
+        self.spectral_radius = 0.0
+        self.unobservable: tuple[str, ...] = ()
+        self._check(allow_unstable)
+        self.reset()
+
+    @property
+    def _f(self) -> Any:
+        return self._filters[0]
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """The fast columns that a record must have."""
+        wheels = ("wheel_left",) if self._f.measured else ()
+        return ("gyro", "steer", *wheels)
+
+    def _check(self, allow_unstable: bool) -> None:
+        """Refuse a filter that diverges; name what it cannot see."""
+        f = self._f
+        for speed in CHECKED_SPEEDS if f.measured else (float(f.speed),):
+            for schedule in self._schedules:
+                table, G = design(f, schedule, speed, self._kind)
+                M = error_map(f, table, G, schedule)
+                radius = spectral_radius(M)
+                self.spectral_radius = max(radius, self.spectral_radius)
+                if radius > 1.0 + MARGINAL and not allow_unstable:
+                    raise ValueError(
+                        f"{self.name}: the error grows by {radius:.6g} over a cycle of the "
+                        f"schedule at {speed:g} m/s (allow_unstable=True builds it all the same)"
+                    )
+                if abs(radius - 1.0) <= MARGINAL and not self.unobservable:
+                    self.unobservable = unobservable(M, self.names)
+        if self.unobservable:
+            warnings.warn(
+                f"{self.name} cannot see: {'; '.join(self.unobservable)}",
+                UnobservableWarning,
+                stacklevel=4,
+            )
+
+    def _design(self, cell: int) -> None:
+        """Fill the table of gains of one cell."""
+        f = self._f
+        speed = float(f.low + cell * f.spacing) if f.measured else float(f.speed)
+        self._gains[cell] = design(f, self._schedules[-1], speed, self._kind)[0]
+
+    def reset(
+        self, sensors: Mapping[str, SlowSensor] | None = None, first: int = 0
+    ) -> None:
+        """Forget everything; the next fast row is the tick `first`.
+
+        sensors: slow sensors whose clocks have a new phase. Raises ValueError if anything but the
+        phase differs from what the filter was built for.
+        """
+        f = self._f
+        for name, sensor in self.sensors.items():
+            told = sensor if sensors is None else sensors.get(name)
+            if told is None or _clockless(told) != _clockless(sensor):
+                raise ValueError(
+                    f"{self.name} was built for the {name} {sensor}, the reset tells {told}"
+                )
+            s = SLOW_NAMES.index(name)
+            f.phase[s] = whole_ticks(told.phase or 0.0, self.dt, f"the {name}'s phase")
+            f.origin = f.phase[s]
+        begin_filter(self._filters, first)
+
+    def step(self, fast: Array, packets: Array, count: int | None = None) -> None:
+        """Take fast rows (k, FAST_WIDTH) and the first `count` packets (all if None).
+
+        Both C-contiguous float64 as in a `Record`; the rows follow the last ones taken.
+        """
+        rows = len(fast)
+        self._advance(fast, rows, packets, len(packets) if count is None else count)
+
+    def _advance(
+        self,
+        fast: Array,
+        rows: int,
+        packets: Array,
+        count: int,
+        X: Array = np.zeros((0, 1)),
+        S: Array = np.zeros((0, 1)),
+    ) -> None:
+        advance = entries()[0]
+        done = advance(self._filters, self._gains, fast, rows, packets, count, 0, X, S)
+        while done < rows:
+            self._design(int(self._f.wanted))
+            done = advance(self._filters, self._gains, fast, rows, packets, count, done, X, S)
+
+    def predict(self, fast_row: npt.ArrayLike) -> None:
+        """Take one fast row: from the last tick to this one, with the gyro."""
+        row = np.ascontiguousarray(fast_row, np.float64).reshape(1, -1)
+        if row.shape[1] != FAST_WIDTH:
+            raise ValueError(f"a fast row has {FAST_WIDTH} columns, got {row.shape[1]}")
+        self._advance(row, 1, np.empty((0, PACKET_WIDTH)), 0)
+
+    def update(self, packet: npt.ArrayLike) -> None:
+        """Take one packet that is here now, after the fast row of this tick."""
+        values = np.ascontiguousarray(packet, np.float64)
+        if values.shape != (PACKET_WIDTH,):
+            raise ValueError(f"a packet has shape ({PACKET_WIDTH},), got {values.shape}")
+        entries()[1](self._filters, self._gains, values)
+
+    def run(self, source: Log | Record) -> Estimates:
+        """Reset, then filter a whole record.
+
+        Raises ValueError if the record is empty, has another tick than `dt`, or lacks a column.
+        """
+        record = source.record if isinstance(source, Log) else source
+        if len(record.fast) == 0:
+            raise ValueError(f"{self.name}: the record is empty")
+        if abs(record.dt - self.dt) > 1e-9:
+            raise ValueError(
+                f"{self.name} was built for ticks of {self.dt:g} s, the record has {record.dt:g} s"
+            )
+        for column in self.needs:
+            if column not in record.present:
+                raise ValueError(f"{self.name} needs the column {column!r}, the log has none")
+        self.reset(source.slow if isinstance(source, Log) else None, record.first)
+        fast = np.ascontiguousarray(record.fast, np.float64)
+        packets = np.ascontiguousarray(record.packets, np.float64)
+        n = len(self.names)
+        X, S = np.empty((len(fast), n)), np.empty((len(fast), n))
+        self._advance(fast, len(fast), packets, len(packets), X, S)
+        return Estimates(record.ticks * record.dt, X, S, self.names)
+
+    @property
+    def x(self) -> Array:
+        """The states now, (n,)."""
+        return np.array(self._f.x[: len(self.names)])
+
+    @property
+    def P(self) -> Array:
+        """Their covariance now, (n, n); with periodic gains that of the schedule's settled cycle."""
+        f, n = self._f, len(self.names)
+        if not f.periodic:
+            return np.array(f.P[:n, :n])
+        if self._gains[f.cell, 0, 0] == 0.0:
+            self._design(int(f.cell))
+        P = np.zeros((n, n))
+        P[np.triu_indices(n)] = self._gains[f.cell, 1 + f.at, f.total :]
+        return P + np.triu(P, 1).T
+
+    @property
+    def tick(self) -> int:
+        """The tick of the last fast row; one before the first if there was none yet."""
+        return int(self._f.tick)
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """All counters by name."""
+        return dict(zip(Counters._fields, map(int, self._f.counts), strict=True))
+
+    def __getattr__(self, name: str) -> int:
+        if name in Counters._fields:
+            return self.counts[name]
+        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+
+    def __repr__(self) -> str:
+        return f"<{self.name}: {', '.join(self.names)} at tick {self.tick}>"
+
+
+def _clockless(sensor: SlowSensor) -> SlowSensor:
+    return SlowSensor(
+        sensor.period, sensor.delays, 0.0, sensor.jitter, sensor.loss, sensor.duplicate
+    )

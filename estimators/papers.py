@@ -1,0 +1,44 @@
+"""Every filter of the papers and its rivals: a row of a table.
+
+A filter is a model x a rule between slow samples x a rule for late ones x a tuning.
+"""
+
+from dataclasses import dataclass
+
+from .tunings import TUNINGS
+
+
+@dataclass(frozen=True)
+class Filter:
+    """One row.
+
+    slow: slow sensors it can use ("" for none at all). intersample: of `intersample.RULES`; gains:
+    "periodic" or "covariance" (what it does when not told). disturbances: of `models.DISTURBANCES`.
+    delay: of `delay.RULES`. sources: where it comes from.
+    """
+
+    slow: tuple[str, ...]
+    intersample: str
+    gains: str
+    disturbances: str
+    delay: str
+    source: str
+
+    def tuning(self, name: str, slow: str) -> dict[str, float]:
+        """Process noise per second, (unit of the state)^2 / s, by state."""
+        return dict(TUNINGS[name, slow])
+
+
+ANY = ("camera", "gps")
+
+FILTERS: dict[str, Filter] = {
+    "bicycle-kf": Filter((), "predict", "periodic", "none", "clone", "tie-vision VI.A"),
+    "single-rate-kf": Filter(ANY, "single-rate", "periodic", "none", "clone", "tie-vision (15)"),
+    "multirate-kf": Filter(ANY, "predict", "periodic", "none", "clone", "tie-vision (16)"),
+    "multirate-residual-kf": Filter(
+        ANY, "pseudo-residual", "periodic", "none", "clone", "tie-vision (19)-(22)"
+    ),
+    "course-kf": Filter(("gps",), "predict", "covariance", "none", "clone", "dakf-stability [10]"),
+    "dakf": Filter(("gps",), "predict", "covariance", "walk", "clone", "dakf-stability (5)-(20)"),
+    "exact-kf": Filter(ANY, "predict", "covariance", "forces", "clone", "PAPERS section 3"),
+}

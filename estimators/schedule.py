@@ -1,0 +1,61 @@
+"""The schedule of a slow sensor in steps of a filter: when frames are captured and arrive."""
+
+import math
+from dataclasses import dataclass
+
+from ..envs.record import SlowSensor
+
+
+def whole_ticks(seconds: float, dt: float, what: str) -> int:
+    """A time as a number of ticks; ValueError, naming it, where it is no whole number of them."""
+    count = round(seconds / dt)
+    if abs(seconds / dt - count) > 1e-6 * max(1.0, count):
+        raise ValueError(f"{what} of {seconds:g} s is no whole number of ticks of {dt:g} s")
+    return count
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Frame i is captured at the step i `period` and arrives lags[i] steps later, in a cycle.
+
+    A schedule without frames has one step.
+    """
+
+    period: int
+    lags: tuple[int, ...]
+
+    @property
+    def cycle(self) -> int:
+        """Steps after which everything repeats, the slots of the clones included."""
+        return self.period * max(1, len(self.lags))
+
+    def arriving(self, step: int) -> list[int]:
+        """The frames that arrive in a step of the cycle."""
+        due = ((i * self.period + lag) % self.cycle for i, lag in enumerate(self.lags))
+        return [i for i, at in enumerate(due) if at == step]
+
+
+NO_SENSOR = Schedule(1, ())
+
+
+def schedules(
+    name: str, sensor: SlowSensor, dt: float, stride: int, frames: int
+) -> tuple[Schedule, ...]:
+    """What the sensor's schedule can be: one where it repeats, else its two extremes.
+
+    stride: ticks of a filter's step; a filter at the sensor's rate uses a sample in the first step
+    at or after its arrival. frames: held clones, whose slots take turns; 0 for a filter that does
+    not look at the lag.
+    """
+    period = whole_ticks(sensor.period, dt, f"the {name}'s period") // stride
+    late = [whole_ticks(delay, dt, f"a delay of the {name}") for delay in sensor.delays]
+    jitter = whole_ticks(sensor.jitter, dt, f"the {name}'s jitter")
+
+    def lagging(extra: int) -> Schedule:
+        lags = [math.ceil((lag + extra) / stride) for lag in late]
+        if len(set(lags)) == 1:
+            lags = lags[:1]
+        return Schedule(period, tuple(lags * (math.lcm(len(lags), max(1, frames)) // len(lags))))
+
+    shortest, longest = lagging(0), lagging(jitter)
+    return (longest,) if shortest == longest else (shortest, longest)

@@ -1,0 +1,89 @@
+"""Two suites with made-up numbers and signals, and texts that would break a careless page."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sideslip.benchmarks.rows import Suite, Table
+
+HOSTILE = "</script><b>1 & 2</b>"
+COMMAND = "sideslip bench --html report.html --json results.json"
+VERSIONS = {"sideslip": "0.1.0", "Python": "3.11.2", "numpy": "2.3.4", "odd": HOSTILE}
+ESTIMATORS = {
+    "exact-kf": (1.31, 1.24, 1.38, 1.02, 0.412),
+    "multirate-kf": (1.74, 1.65, 1.83, 1.35, 0.098),
+    "single-rate-kf": (2.96, 2.81, 3.12, 2.30, 0.071),
+    "bicycle-kf": (10.2, 9.81, 10.6, 7.92, 0.052),
+}
+
+
+def estimation(figures: bool = True) -> Suite:
+    cells = [
+        [name, f"{rmse:.2f}", f"{low:.2f} .. {high:.2f}", f"{over:.2f}", f"{cost:.3f}"]
+        for name, (rmse, low, high, over, cost) in ESTIMATORS.items()
+    ]
+    cells.append(["the bound", "1.29", "", "1", ""])
+    header = ("estimator", "RMSE / mrad", "95 % interval", "over the bound", "us per tick")
+    suite = Suite(
+        "estimation",
+        "Which estimator comes closest to the sideslip angle",
+        "Root mean square error from 2 s on; `exact-kf` knows the delay.\n\nIntervals are 95 %.",
+        tables=[
+            Table("tie-vision Fig. 7 (100 seeds)", header, cells, "Sine steering at 25 km/h."),
+            Table("Odd texts", ("name", HOSTILE), [[HOSTILE, "a < b"]], HOSTILE),
+        ],
+    )
+    if figures:
+        suite.figures = drawn()
+    return suite
+
+
+def control() -> Suite:
+    cells = [
+        ["none", "12.41", "1", "0.0"],
+        ["feedforward", "6.52", "0.53", "1.3"],
+        ["single-rate", "5.04", "0.41", "96.0"],
+        ["multirate", "3.98", "0.32", "11.2"],
+    ]
+    header = ("controller", "RMS slip / mrad", "over none", "largest 1 ms step / N m")
+    table = Table("tie-vision Fig. 8, tyres as believed (20 seeds)", header, cells)
+    text = "A single lane change at 25 km/h."
+    return Suite("control", "Which controller keeps it small", text, tables=[table])
+
+
+def drawn() -> list[tuple[str, Any, str]]:
+    """Plausible signals: a sine of the sideslip angle, and estimates with their own errors."""
+    figures = pytest.importorskip("sideslip.benchmarks.figures")
+    rng = np.random.default_rng(0)
+    t = np.arange(0.0, 10.0, 1e-3)
+    beta = 12.0 * np.sin(2 * np.pi * 0.5 * t) * np.minimum(t, 1.0)
+    errors = {}
+    for name, (rmse, *_) in ESTIMATORS.items():
+        walk = np.cumsum(rng.normal(size=t.size)) * 1e-2
+        errors[name] = rmse * (0.4 * (walk - walk.mean()) + 0.5 * np.sin(3.1 * t + rmse))
+    errors["exact-kf, true model"] = 0.5 * errors["exact-kf"]
+    seen = np.where(np.arange(t.size) % 33 == 0, beta + rng.normal(size=t.size), np.nan)
+    lines = {name: beta + error for name, error in errors.items()}
+    label = "sideslip angle / mrad"
+    values, lows, highs = (np.array([v[i] for v in ESTIMATORS.values()]) for i in range(3))
+    names = [*ESTIMATORS, "the bound"]
+    bars = ([*values, 1.29], [*lows, 1.29], [*highs, 1.29], "RMSE of the sideslip angle / mrad")
+    x, y = 7.0 * t, 1.75 * (1 + np.tanh(t - 5.0))
+    paths = {"truth": (x, y), "multirate-kf": (x, y + 0.02 * t), "bicycle-kf": (x, y + 0.2 * t)}
+    course = {"truth": beta, "camera": seen} | lines
+    return [
+        ("Error of each estimator", figures.bars_with_interval(names, *bars), "Shorter is better."),
+        ("The same on a log axis", figures.bars_with_interval(names, *bars, log=True), ""),
+        (
+            "The sideslip angle",
+            figures.time_series("", t, course, label, dots=["camera"]),
+            f"The paper's figure, redrawn: {HOSTILE}",
+        ),
+        (
+            "Errors (seed 0)",
+            figures.error_series("", t, errors, f"error of the {label}", band=("bound", 2 + 0 * t)),
+            "Estimate minus truth; grey: twice the bound's standard deviation.",
+        ),
+        ("The track", figures.track(paths), "Dead reckoning with each estimate."),
+    ]

@@ -1,0 +1,88 @@
+"""Short cuts that several of these tests share."""
+
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+import gymnasium
+import numpy as np
+
+import sideslip
+from sideslip.envs import Record, StabilityEnv
+from sideslip.envs.sensors import Noise
+
+assert sideslip.__version__  # importing it registers the ids
+IDS = tuple(sorted(name for name in gymnasium.registry if name.startswith("sideslip/")))
+
+SILENT: dict[str, float] = dict.fromkeys(Noise._fields, 0.0)
+"""Sensors without noise."""
+
+LINEAR: dict[str, Any] = {
+    "base": "straight",
+    "mirror": False,
+    "speed": 25.0 / 3.6,
+    "friction": 0.9,
+    "front_stiffness": 1.0,
+    "rear_stiffness": 1.0,
+    "disturbance_force": 0.0,
+    "disturbance_moment": 0.0,
+    "small_angle": True,
+    "linear_tyres": True,
+    "lags": False,
+    "noise": SILENT,
+}
+"""The papers' plant: nothing drawn, nothing disturbed, sensors without noise."""
+
+FULL: dict[str, Any] = LINEAR | {"small_angle": False, "linear_tyres": False}
+"""The same with the full equations and Fiala tyres."""
+
+
+class Moment(NamedTuple):
+    """What one reset or step gave."""
+
+    obs: np.ndarray
+    reward: float
+    terminated: bool
+    truncated: bool
+    info: dict[str, Any]
+    record: Record
+
+
+def unwrapped(name: str, **changes: Any) -> StabilityEnv:
+    """The bare environment of an id."""
+    env = gymnasium.make(name, **changes).unwrapped
+    assert isinstance(env, StabilityEnv)
+    return env
+
+
+def play(env: StabilityEnv, actions: Iterable[Any]) -> list[Moment]:
+    """One Moment for each action, up to the end of the episode."""
+    moments = []
+    for action in actions:
+        moments.append(Moment(*env.step(np.atleast_1d(np.float32(action))), env.record))
+        if moments[-1].terminated or moments[-1].truncated:
+            break
+    return moments
+
+
+def fast_rows(moments: list[Moment]) -> np.ndarray:
+    """The fast rows of all moments."""
+    return np.concatenate([moment.record.fast for moment in moments])
+
+
+def packets(moments: list[Moment]) -> np.ndarray:
+    """The packets of all moments."""
+    return np.concatenate([moment.record.packets for moment in moments])
+
+
+def bits(value: Any) -> Any:
+    """A form in which two values are equal if and only if they have the same bits and shape."""
+    if isinstance(value, dict):
+        return {name: bits(each) for name, each in value.items()}
+    if isinstance(value, Record):
+        return bits((value.fast, value.packets, value.first))
+    if isinstance(value, tuple | list):
+        return tuple(bits(each) for each in value)
+    if isinstance(value, float | np.ndarray | np.generic):
+        array = np.asarray(value)
+        return array.dtype.str, array.shape, array.tobytes()
+    return value

@@ -1,0 +1,127 @@
+"""The cache of compiled kernels follows the sources, and its absence is no trouble."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from sideslip.envs import backend
+
+PACKAGE = backend._PACKAGE
+FOLDERS = ("envs", "estimators", "agents", "benchmarks")
+
+
+@pytest.fixture
+def copy(tmp_path: Path) -> Path:
+    """A copy of the package called `sideslip` in an empty folder."""
+    home = tmp_path / "copied" / "sideslip"
+    home.mkdir(parents=True)
+    for name in FOLDERS:
+        shutil.copytree(PACKAGE / name, home / name, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copy(PACKAGE / "__init__.py", home)
+    return home
+
+
+def run(code: str, home: Path, **variables: str) -> str:
+    """Run code on the package in `home` with every warning an error; returns what it prints."""
+    kept = {name: value for name, value in os.environ.items() if not name.startswith("NUMBA_")}
+    return subprocess.run(
+        [sys.executable, "-W", "error", "-c", code],
+        env=kept | {"PYTHONPATH": str(home.parent)} | variables,
+        cwd=home.parent,
+        check=True,
+        capture_output=True,
+        text=True,
+    ).stdout
+
+
+@pytest.mark.smoke
+def test_stamp_is_that_of_the_sources(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    stamp = backend.source_stamp()
+    monkeypatch.setattr(backend, "_PACKAGE", copy)
+    assert backend.source_stamp() == stamp
+    seen = {stamp}
+    for folder in FOLDERS:  # one more byte in any module of any folder
+        with open(copy / folder / "__init__.py", "a") as source:
+            source.write("\n")
+        seen.add(backend.source_stamp())
+    (copy / "envs" / "linear.py").rename(copy / "envs" / "linear_2.py")
+    seen.add(backend.source_stamp())
+    assert len(seen) == 6
+
+
+UNIFORM = "from sideslip.envs.noise import uniform; print(uniform(2**31 - 1))"
+
+
+def test_an_edit_in_a_callee_reaches_its_cached_callers(copy: Path, tmp_path: Path) -> None:
+    """Numba alone would answer from the stale kernel: `uniform` itself did not change."""
+    cache = tmp_path / "cache"
+    variables = {"XDG_CACHE_HOME": str(cache)}
+    exact = (2**31 - 0.5) / 2.0**32
+    assert float(run(UNIFORM, copy, **variables)) == exact
+    kernels = sorted(cache.rglob("noise.uniform*.nbc"))
+    assert len(kernels) == 1
+    assert float(run(UNIFORM, copy, **variables)) == exact
+    assert sorted(cache.rglob("noise.uniform*.nbc")) == kernels  # the second run compiled nothing
+    source = copy / "envs" / "backend.py"
+    text = source.read_text()
+    changed = text.replace("return a * 1.0", "return a * 3.0")
+    assert changed != text
+    source.write_text(changed)
+    tripled = (3.0 * (2**31 - 1) + 0.5) / 2.0**32
+    assert float(run(UNIFORM, copy, **variables)) == tripled
+
+
+@pytest.mark.parametrize("variable", ["XDG_CACHE_HOME", "NUMBA_CACHE_DIR"])
+def test_a_folder_that_cannot_be_written_costs_only_time(
+    variable: str, copy: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "file").write_text("not a folder")
+    printed = run(UNIFORM, copy, **{variable: str(tmp_path / "file")})
+    assert float(printed) == (2**31 - 0.5) / 2.0**32
+    assert (tmp_path / "file").read_text() == "not a folder"
+    assert not list(copy.rglob("*.nbc"))  # numba's own fallback would write beside the sources
+
+
+def test_old_versions_are_pruned_but_not_in_a_folder_of_the_users_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for variable in ("XDG_CACHE_HOME", "NUMBA_CACHE_DIR"):
+        monkeypatch.delenv(variable, raising=False)
+        base = tmp_path / variable
+        kernels = base / "sideslip" / "kernels" if variable == "XDG_CACHE_HOME" else base
+        for age in range(6):
+            old = kernels / f"version-{age}"
+            old.mkdir(parents=True)
+            os.utime(old, (1e9 - age, 1e9 - age))
+        monkeypatch.setenv(variable, str(base))
+        assert backend._cache_folder() == str(kernels / backend.source_stamp())
+        left = {path.name for path in kernels.iterdir()} - {backend.source_stamp()}
+        kept = 3 if variable == "XDG_CACHE_HOME" else 6
+        assert left == {f"version-{age}" for age in range(kept)}
+
+
+def test_compiling_leaves_numbas_own_settings_alone() -> None:
+    before = backend.config.CACHE_DIR
+    backend.jit(lambda x: x)
+    assert before == backend.config.CACHE_DIR
+
+
+def test_plain_replaces_every_callee_and_leaves_the_original_alone() -> None:
+    from sideslip.envs.dynamics import rk4
+
+    function = backend.plain(rk4)
+    seen, todo = set(), [function]
+    while todo:
+        each = todo.pop()
+        seen.add(each.__name__)
+        for name in each.__code__.co_names:
+            callee = each.__globals__.get(name)
+            assert not isinstance(callee, backend.Dispatcher), f"{each.__name__} calls {name}"
+            if hasattr(callee, "__code__") and callee.__name__ not in seen:
+                todo.append(callee)
+    assert {"rk4", "derivative", "slips", "sincos", "minimum", "floor"} <= seen
+    assert backend.plain(rk4) is not function

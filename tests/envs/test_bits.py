@@ -1,0 +1,129 @@
+"""Compiled code, plain Python and NumPy arrays give the same bits: no tolerance anywhere."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sideslip.envs import COMS, PASSENGER_CAR, dynamics, elementary, noise, programme, stability
+from sideslip.envs.backend import ARRAYS, plain
+from sideslip.envs.dynamics import Inputs, Motion, Push, Road
+from sideslip.envs.template import car_of
+
+from .helpers import FULL, IDS, LINEAR, bits, play, unwrapped
+
+pytestmark = pytest.mark.plain
+
+RNG = np.random.default_rng(7)
+N = 60
+CARS = {"coms": car_of(COMS), "passenger-car": car_of(PASSENGER_CAR)}
+ROAD, PUSH = Road(0.01, -5.0, 20.0), Push(50.0, -20.0)
+PLANTS = [(0, 0), (0, 1), (1, 0), (1, 1)]
+SPREAD = np.array([9.0, 2.0, 1.0, 2.0, 50.0, 50.0, 20.0, 3.0, 2.0])
+
+
+def motions() -> list[Motion]:
+    """Forwards, backwards, near standstill and at standstill."""
+    rows = RNG.normal(size=(N, len(Motion._fields))) * SPREAD
+    rows[::5, :3] *= 0.01
+    rows[0] = 0.0
+    return [Motion(*row) for row in rows.tolist()]
+
+
+def inputs() -> list[Inputs]:
+    return [Inputs(*row) for row in (RNG.normal(size=(N, 3)) * (0.2, 200.0, 200.0)).tolist()]
+
+
+def lanes(values: list[Any]) -> Any:
+    """The same numbers or tuples with an array of all values in each place."""
+    if isinstance(values[0], tuple):
+        return type(values[0])(*np.array(values).T)
+    return np.array(values)
+
+
+def agree(function: Any, lists: list[list[Any]], call: Callable[..., Any]) -> list[Any]:
+    """Assert that the three backends' bits are equal; returns the compiled values."""
+    compiled = [call(function, *each) for each in zip(*lists, strict=True)]
+    python = [call(plain(function), *each) for each in zip(*lists, strict=True)]
+    assert bits(python) == bits(compiled)
+    arrays = call(plain(function, ARRAYS), *map(lanes, lists))
+    if isinstance(arrays, tuple):
+        arrays = np.array([np.broadcast_to(column, len(compiled)) for column in arrays]).T
+    assert bits(arrays) == bits(np.array(compiled))
+    return compiled
+
+
+@pytest.mark.parametrize("car", CARS)
+@pytest.mark.parametrize(("small_angle", "law"), PLANTS)
+def test_plant(car: str, small_angle: int, law: int) -> None:
+    def load_of(function: Any, inputs: Any) -> Any:
+        return function(inputs, CARS[car], small_angle)
+
+    def derivative(function: Any, motion: Any, load: Any, frame: Any) -> Any:
+        return function(motion, load, PUSH, CARS[car], ROAD, frame, small_angle, law)
+
+    def rk4(function: Any, motion: Any, a: Any, b: Any, c: Any) -> Any:
+        return function(motion, (a, b, c), PUSH, CARS[car], ROAD, 1e-3, small_angle, law)
+
+    state = motions()
+    load = agree(dynamics.load_of, [inputs()], load_of)
+    frames = agree(dynamics.frame_of, [state], lambda function, motion: function(motion))
+    agree(dynamics.derivative, [state, load, frames], derivative)
+    agree(dynamics.rk4, [state, load, load[1:] + load[:1], load[2:] + load[:2]], rk4)
+
+
+@pytest.mark.parametrize("small_angle", [0, 1])
+def test_sideslip_angle(small_angle: int) -> None:
+    speeds = [list(column) for column in zip(*[m[:2] for m in motions()], strict=True)]
+    agree(dynamics.sideslip_angle, speeds, lambda f, v_x, v_y: f(v_x, v_y, small_angle))
+
+
+def test_steering() -> None:
+    numbers = RNG.uniform(0.01, 2.0, programme.STEERING_WIDTH)
+    numbers[3 : 5 * programme.SINES : 5] = 100.0, 0.0, 300.0, 40.0
+    numbers[4 : 5 * programme.SINES : 5] = 900.0, programme.FOREVER, 1200.0, 50.0
+    numbers[5 * programme.SINES + 2 :: 3] = 200.0
+    code = tuple(numbers.tolist())
+    ticks = [float(tick) for tick in range(0, 2000, 7)]
+    agree(programme.steering_at, [ticks], lambda f, tick: f(tick, code))
+
+
+@pytest.mark.parametrize("name", ["normals", "uniforms"])
+def test_noise(name: str) -> None:
+    words = [[2**32 - 3] * N, [2**31 + 11] * N, list(range(N)), [3] * N]
+    agree(getattr(noise, name), words, lambda f, *counter: f(*counter))
+
+
+@pytest.mark.parametrize("name", ["sin_kernel", "cos_kernel", "sincos", "atan", "wrap"])
+def test_elementary(name: str) -> None:
+    x = (RNG.normal(size=300) * 10.0).tolist()
+    agree(getattr(elementary, name), [x], lambda f, value: f(value))
+
+
+EPISODES: list[dict[str, Any]] = [
+    {},
+    {"scenario": "slalom", "fast": "all", "reference": "limited"},
+    {"scenario": "dakf-fig6", "reference": "model"},
+    {"scenario": LINEAR | {"curvature": 0.02, "curve_start": 0.0, "curve_ramp": 1.0}},
+    {"scenario": FULL | {"acceleration": 1.0, "speed": 0.0}, "control_period": 33},
+    {"vehicle": {"base": "passenger-car", "motor_lag": 0.0}, "scenario": "step-steer"},
+]
+
+
+@pytest.mark.parametrize("name", IDS)
+@pytest.mark.parametrize("arguments", EPISODES, ids=str)
+def test_whole_steps(name: str, arguments: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    def episode() -> Any:
+        env = unwrapped(name, **arguments)
+        start = env.reset(seed=11)
+        first = env.record
+        rng = np.random.default_rng(3)
+        moments = play(env, rng.uniform(-1.2, 1.2, 400 // env.control_period))
+        assert sum(len(moment.record.packets) for moment in moments) > 0
+        return bits((start, first, moments, env.get_state()["state"], env.get_state()["params"]))
+
+    compiled = episode()
+    monkeypatch.setattr(stability, "reset_vehicle", plain(stability.reset_vehicle))
+    monkeypatch.setattr(stability, "step_vehicle", plain(stability.step_vehicle))
+    assert episode() == compiled

@@ -1,0 +1,180 @@
+"""The plant: Newton's laws, symmetry, geometry, and the integrator's order."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sideslip.envs import COMS, PASSENGER_CAR
+from sideslip.envs.dynamics import (
+    FIALA,
+    LINEAR,
+    Car,
+    Inputs,
+    Motion,
+    Push,
+    Road,
+    derivative,
+    frame_of,
+    load_of,
+    rk4,
+)
+from sideslip.envs.template import car_of
+
+pytestmark = pytest.mark.plain
+
+CAR = car_of(COMS)
+STRAIGHT, CIRCLE = Road(0.0, 0.0, 1.0), Road(0.02, -1e6, 1.0)
+CALM = Push(0.0, 0.0)
+PLANTS = [(0, LINEAR), (0, FIALA), (1, LINEAR), (1, FIALA)]
+speeds = st.floats(-3.0, 3.0)
+
+
+def motion(**values: float) -> Motion:
+    return Motion(*[0.0] * 9)._replace(**values)
+
+
+def slope(
+    state: Motion, steer: float = 0.0, T: tuple[float, float] = (0.0, 0.0), **how: Any
+) -> Any:
+    plant = {"push": CALM, "car": CAR, "road": STRAIGHT, "small_angle": 0, "law": FIALA} | how
+    load = load_of(Inputs(steer, *T), plant["car"], plant["small_angle"])
+    return derivative(
+        state,
+        load,
+        plant["push"],
+        plant["car"],
+        plant["road"],
+        frame_of(state),
+        plant["small_angle"],
+        plant["law"],
+    )
+
+
+def drive(
+    state: Motion, seconds: float, h: float, steer: float = 0.0, car: Car = CAR, **how: Any
+) -> Motion:
+    load = load_of(Inputs(steer, 0.0, 0.0), car, 0)
+    road, law = how.get("road", STRAIGHT), how.get("law", FIALA)
+    for _ in range(round(seconds / h)):
+        state = rk4(state, (load, load, load), CALM, car, road, h, 0, law)
+    return state
+
+
+@pytest.mark.smoke
+@pytest.mark.parametrize(("small_angle", "law"), PLANTS)
+def test_straight_on_is_exactly_straight(small_angle: int, law: int) -> None:
+    rate = slope(motion(v_x=10.0), T=(30.0, 30.0), small_angle=small_angle, law=law)
+    assert rate.v_x == pytest.approx(2.0 * 30.0 / CAR.r / CAR.m, rel=1e-15)  # Newton, one rounding
+    assert rate._replace(v_x=0.0) == motion(X=10.0, s=10.0)
+
+
+@pytest.mark.parametrize(("small_angle", "law"), PLANTS)
+def test_standing_still_stays_so(small_angle: int, law: int) -> None:
+    assert slope(motion(), steer=0.5, small_angle=small_angle, law=law) == motion()
+
+
+@pytest.mark.parametrize(("small_angle", "law"), PLANTS)
+def test_pushes_and_moments_act_as_newton_says(small_angle: int, law: int) -> None:
+    how = {"small_angle": small_angle, "law": law}
+    rate = slope(motion(v_x=10.0), push=Push(190.0, 40.0), T=(-11.0, 11.0), **how)
+    assert rate.v_y == pytest.approx(190.0 / CAR.m, rel=1e-15)
+    # the motors' moment: two forces of 11 N m / r at half a track from the middle
+    assert rate.gamma == pytest.approx((40.0 + 11.0 / CAR.r * CAR.d_r) / CAR.I, rel=1e-15)
+    assert rate.v_x == 0.0
+
+
+@given(speeds, speeds, st.floats(-0.5, 0.5), st.floats(-20.0, 20.0), st.sampled_from([0, 1]))
+def test_rolling_tyres_never_add_energy(
+    v_y: float, gamma: float, steer: float, v_x: float, law: int
+) -> None:
+    rate = slope(motion(v_x=v_x, v_y=v_y, gamma=gamma), steer, law=law)
+    power = CAR.m * (v_x * rate.v_x + v_y * rate.v_y) + CAR.I * gamma * rate.gamma
+    size = CAR.m * (abs(v_x * rate.v_x) + abs(v_y * rate.v_y)) + CAR.I * abs(gamma * rate.gamma)
+    # the terms cancel where the wheels roll freely: some roundings of them, and of the forces
+    assert power <= 1e-14 * size + 1e-9
+
+
+def test_without_forces_the_ground_sees_uniform_motion() -> None:
+    free = CAR._replace(C_f=0.0, C_r=0.0)
+    start = motion(v_x=8.0, v_y=1.0, gamma=1.5, psi=0.3)
+    end = drive(start, 1.0, 1e-3, car=free, law=LINEAR)
+    for state in (start, end):
+        s, c = math.sin(state.psi), math.cos(state.psi)
+        ground = (c * state.v_x - s * state.v_y, s * state.v_x + c * state.v_y)
+        expected = (c0 := math.cos(0.3)) * 8.0 - (s0 := math.sin(0.3)), s0 * 8.0 + c0
+        # Runge-Kutta's error on a rotation: (gamma h)^5 / 120 a step, 1000 steps, 8 m/s: 5e-13
+        assert ground == pytest.approx(expected, abs=1e-12)
+    assert (end.gamma, end.psi) == (1.5, pytest.approx(1.8, abs=1e-12))
+    # straight on the ground, from the origin, for one second
+    assert pytest.approx(expected, abs=1e-12) == (end.X, end.Y)
+
+
+@given(speeds, speeds, st.floats(-0.5, 0.5), speeds, st.sampled_from(PLANTS))
+def test_mirrored_car_moves_as_the_mirror_image(
+    v_y: float, gamma: float, steer: float, psi: float, plant: tuple[int, int]
+) -> None:
+    how = {"small_angle": plant[0], "law": plant[1]}
+    left = motion(v_x=7.0, v_y=v_y, gamma=gamma, psi=psi, y=2.0)
+    right = motion(v_x=7.0, v_y=-v_y, gamma=-gamma, psi=-psi, y=-2.0)
+    one = slope(left, steer, (20.0, -5.0), push=Push(30.0, 4.0), **how)
+    other = slope(right, -steer, (-5.0, 20.0), push=Push(-30.0, -4.0), **how)
+    assert other == one._replace(
+        v_y=-one.v_y, gamma=-one.gamma, psi=-one.psi, Y=-one.Y, y=-one.y, theta=-one.theta
+    )
+
+
+@given(st.floats(-10.0, 10.0), st.floats(-10.0, 10.0), speeds, st.floats(-10.0, 10.0))
+def test_place_follows_heading_and_road(v_x: float, v_y: float, theta: float, psi: float) -> None:
+    rate = slope(motion(v_x=v_x, v_y=v_y, psi=psi, theta=theta, y=3.0), road=CIRCLE)
+    turn = psi - theta
+    along = v_x * math.cos(turn) - v_y * math.sin(turn)
+    # products of numbers up to 10 with sines of angles up to 13, each within its stated error
+    close = {"abs": 1e-13}
+    assert pytest.approx(v_x * math.cos(psi) - v_y * math.sin(psi), **close) == rate.X
+    assert pytest.approx(v_x * math.sin(psi) + v_y * math.cos(psi), **close) == rate.Y
+    assert pytest.approx(v_x * math.sin(turn) + v_y * math.cos(turn), **close) == rate.y
+    assert pytest.approx(along / (1.0 - 0.02 * 3.0), **close) == rate.s
+    assert rate.theta == 0.02 * rate.s
+
+
+def test_road_coordinates_and_ground_agree_after_a_long_bend() -> None:
+    start = motion(v_x=10.0, v_y=0.1, gamma=0.2)  # 50 m from the centre at (0, 50)
+    end = drive(start, 20.0, 1e-3, steer=0.025, road=CIRCLE)
+    assert end.theta > 1.0
+    assert end.y > 5.0
+    place = np.array([end.X, end.Y])
+    radius = 1.0 / 0.02 - end.y
+    expected = [radius * math.sin(end.theta), 50.0 - radius * math.cos(end.theta)]
+    # 20 000 roundings of distances up to 250 m (1.4e-14 each), were they all on the same side
+    assert np.max(np.abs(place - expected)) < 3e-10
+    assert end.theta == pytest.approx(0.02 * end.s, abs=1e-11)  # as many, up to 5 rad
+
+
+@pytest.mark.parametrize("car", [CAR, car_of(PASSENGER_CAR)])
+@pytest.mark.parametrize("law", [LINEAR, FIALA])
+def test_integrator_is_of_fourth_order(car: Car, law: int) -> None:
+    """Slip angles keep their signs here: at zero Fiala's curve has a jump in its second slope."""
+    start = motion(v_x=12.0, v_y=-0.2, gamma=0.3)
+    steps = [0.008, 0.004, 0.002]
+    exact = np.array(drive(start, 0.8, 0.00025, 0.06, car, law=law))
+    errors = [np.abs(drive(start, 0.8, h, 0.06, car, law=law) - exact).max() for h in steps]
+    orders = np.log2(np.array(errors[:-1]) / errors[1:])
+    # the next term of the error is h times smaller: the estimate tends to 4 as h
+    assert abs(orders[1] - 4.0) < 0.8 * abs(orders[0] - 4.0) < 0.05
+
+
+@pytest.mark.parametrize("speed", [0.0, 0.3, -2.0, 5.0])
+@pytest.mark.parametrize("mu", [1e-9, 0.9])
+def test_any_speed_and_hardly_any_friction_stay_finite(speed: float, mu: float) -> None:
+    car = CAR._replace(mu=mu)
+    load = load_of(Inputs(0.4, -100.0, 100.0), car, 0)
+    state = motion(v_x=speed)
+    for _ in range(3000):
+        state = rk4(state, (load, load, load), CALM, car, CIRCLE, 1e-3, 0, FIALA)
+    assert np.all(np.isfinite(state))
+    if mu == 1e-9:  # ice: the car goes on as it went
+        assert math.hypot(state.v_x, state.v_y) == pytest.approx(abs(speed), abs=1e-6)

@@ -1,0 +1,199 @@
+"""The linear models are the plant: their matrices equal its numerical Jacobian."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.signal import cont2discrete
+
+from sideslip.envs import COMS, PASSENGER_CAR, Vehicle, critical_speed
+from sideslip.envs.dynamics import (
+    LINEAR,
+    Inputs,
+    Motion,
+    Push,
+    Road,
+    derivative,
+    frame_of,
+    load_of,
+    sideslip_angle,
+)
+from sideslip.envs.linear import LinearModel, bicycle, course, vision
+from sideslip.envs.reference import target_of
+from sideslip.envs.sensors import Noise, camera_sample, gps_sample
+from sideslip.envs.template import car_of
+
+pytestmark = pytest.mark.plain
+
+KMH = 1.0 / 3.6
+SPEEDS = [v * KMH for v in range(5, 46, 5)]
+VEHICLES = [COMS, COMS.scaled(0.7, 1.3), PASSENGER_CAR]
+MODELS: dict[str, Callable[[Vehicle, float], LinearModel]] = {
+    "bicycle": bicycle,
+    "vision": vision,
+    "course": course,
+}
+SILENT = Noise()._replace(gyro=0.0, camera_psi=0.0, camera_y=0.0, course=0.0)
+
+
+def seen(
+    model: str, x: Any, u: Any, vehicle: Vehicle, v: float, small_angle: int
+) -> tuple[Any, Any]:
+    """(dx/dt, y) of the model's states and outputs, from the plant's own equations.
+
+    x: beta, gamma, psi, y_l as far as the model has them; u: delta_f, N_z, kappa.
+    """
+    beta, gamma, psi, y_l = [*x, *[0.0] * (4 - len(x))]
+    delta_f, N_z, kappa = [*u, *[0.0] * (3 - len(u))]
+    car, l_pre = car_of(vehicle), vehicle.preview
+    road = Road(kappa, -1e3, 1.0)
+    bend = 0.5 * kappa * l_pre**2
+    v_x, v_y = (v, v * beta) if small_angle else (v * math.cos(beta), v * math.sin(beta))
+    state = Motion(v_x, v_y, gamma, psi, 0.0, 0.0, 0.0, y_l - l_pre * psi + bend, 0.0)
+    T = 0.5 * N_z * car.r / (0.5 * car.d_r)
+    load = load_of(Inputs(delta_f, -T, T), car, small_angle)
+    rate = derivative(state, load, Push(0.0, 0.0), car, road, frame_of(state), small_angle, LINEAR)
+    if small_angle:  # the held speed: tie-vision (1)
+        dbeta = rate.v_y / v
+    else:
+        dbeta = (v_x * rate.v_y - v_y * rate.v_x) / (v_x**2 + v_y**2)
+    dpsi = rate.psi - rate.theta
+    dx = [dbeta, rate.gamma, dpsi, rate.y + l_pre * dpsi]
+    psi_seen, y_seen = camera_sample(state, road, l_pre, SILENT, (0.0, 0.0))
+    angle = sideslip_angle(v_x, v_y, small_angle)
+    course_seen = gps_sample(state, angle, SILENT, (0.0, 0.0, 0.0, 0.0))[0]
+    outputs = {"gamma": gamma, "psi": psi_seen, "y_l": y_seen, "course": course_seen}
+    names = MODELS[model](vehicle, v).outputs
+    return np.array(dx[: len(x)]), np.array([outputs[name] for name in names])
+
+
+@pytest.mark.smoke
+@pytest.mark.parametrize("vehicle", VEHICLES, ids=lambda each: each.name)
+@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("small_angle", [1, 0])
+@pytest.mark.parametrize("v", SPEEDS)
+def test_matrices_are_the_plants_jacobian(
+    name: str, v: float, small_angle: int, vehicle: Vehicle
+) -> None:
+    model = MODELS[name](vehicle, v)
+    n, m = model.B.shape
+    # a typical size of each state and input: all columns are compared on one scale
+    size = np.array([0.01, 0.05, 0.01, 0.1][:n] + [0.01, 10.0, 0.001][:m])
+    exact = np.vstack(
+        [np.hstack([model.A, model.B]), np.hstack([model.C, np.zeros((len(model.C), m))])]
+    )
+    # The small-angle plant is linear: a step of any length gives the matrix up to roundings of
+    # the intermediate sums. The full plant is odd about straight driving, so that a central
+    # difference errs by the third derivative times the step squared, some (1e-4 x 0.01)^2, and
+    # by roundings divided by the step.
+    step, error = (1.0, 1e-13) if small_angle else (1e-4, 1e-10)
+    columns = []
+    for j in range(n + m):
+        ahead, behind = np.zeros((2, n + m))
+        ahead[j], behind[j] = step * size[j], -step * size[j]
+        rise = [
+            up - down
+            for up, down in zip(
+                seen(name, ahead[:n], ahead[n:], vehicle, v, small_angle),
+                seen(name, behind[:n], behind[n:], vehicle, v, small_angle),
+                strict=True,
+            )
+        ]
+        columns.append(np.concatenate(rise) / (2.0 * step))
+    difference = np.array(columns).T - exact * size
+    assert np.abs(difference[:n]).max() <= error * np.abs(exact[:n] * size).max()
+    assert np.abs(difference[n:]).max() <= error * np.abs(exact[n:] * size).max()
+
+
+@pytest.mark.parametrize("V_x", SPEEDS)
+def test_vision_is_tie_vision_8_letter_by_letter(V_x: float) -> None:
+    m, I, l_f, l_r, C_f, C_r, l_pre = 380.0, 136.08, 0.8, 0.6, 6000.0, 6000.0, 5.135  # noqa: E741
+    A = np.array(
+        [
+            [-2 * (C_f + C_r) / (m * V_x), -1 - 2 * (C_f * l_f - C_r * l_r) / (m * V_x**2), 0, 0],
+            [
+                -2 * (C_f * l_f - C_r * l_r) / I,
+                -2 * (C_f * l_f**2 + C_r * l_r**2) / (I * V_x),
+                0,
+                0,
+            ],
+            [0, 1, 0, 0],
+            [V_x, l_pre, V_x, 0],
+        ]
+    )
+    B = np.array([[2 * C_f / (m * V_x), 2 * C_f * l_f / I, 0, 0], [0, 1 / I, 0, 0]]).T
+    C = np.array([[0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    model = vision(COMS, V_x)
+    # the same operations in another order: a few roundings
+    np.testing.assert_allclose(model.A, A, rtol=1e-15, atol=0.0)
+    np.testing.assert_allclose(model.B[:, :2], B, rtol=1e-15, atol=0.0)
+    np.testing.assert_array_equal(model.C, C)
+    np.testing.assert_array_equal(model.B[:, 2], [0.0, 0.0, -V_x, -V_x * l_pre])
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_the_models_agree_where_they_overlap(name: str) -> None:
+    small, large = bicycle(COMS, 7.0), MODELS[name](COMS, 7.0)
+    np.testing.assert_array_equal(large.A[:2, :2], small.A)
+    np.testing.assert_array_equal(large.B[:2, :2], small.B)
+    assert large.states[:2] == small.states
+    assert large.inputs[:2] == small.inputs
+
+
+@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("dt", [0.001, 0.033, 0.2])
+def test_discrete_is_the_exact_zero_order_hold(name: str, dt: float) -> None:
+    model = MODELS[name](COMS, 25.0 * KMH)
+    G, H = model.discrete(dt)
+    D = np.zeros((len(model.outputs), len(model.inputs)))
+    expected = cont2discrete((model.A, model.B, model.C, D), dt)  # zero-order hold
+    # two calls of one matrix exponential, whose own error is some roundings of its largest entry
+    assert np.abs(G - expected[0]).max() <= 1e-14 * np.abs(G).max()
+    assert np.abs(H - expected[1]).max() <= 1e-14 * np.abs(H).max()
+    twice_G, twice_H = model.discrete(2.0 * dt)
+    assert np.abs(G @ G - twice_G).max() <= 1e-14 * np.abs(twice_G).max()
+    assert np.abs(G @ H + H - twice_H).max() <= 1e-14 * np.abs(twice_H).max()
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_to_control_keeps_matrices_and_names(name: str) -> None:
+    pytest.importorskip("control")
+    model = MODELS[name](COMS, 25.0 * KMH)
+    system = model.to_control()
+    for letter in "ABC":
+        np.testing.assert_array_equal(getattr(system, letter), getattr(model, letter))
+    assert not system.D.any()
+    assert tuple(system.state_labels) == model.states
+    assert tuple(system.input_labels) == model.inputs
+    assert tuple(system.output_labels) == model.outputs
+    assert system.isctime()
+
+
+@pytest.mark.parametrize("vehicle", VEHICLES, ids=lambda each: each.name)
+@pytest.mark.parametrize("v", SPEEDS)
+def test_references_are_the_models_steady_state(vehicle: Vehicle, v: float) -> None:
+    model, target = bicycle(vehicle, v), target_of(vehicle)
+    beta, gamma = np.linalg.solve(model.A, -model.B[:, 0])
+    # a 2 x 2 system, ill-conditioned as the speed nears the critical one
+    error = 1e-15 * float(np.linalg.cond(model.A))
+    assert gamma == pytest.approx(v * target.per_l / (1.0 + target.G * v * v), rel=error)
+    expected = (1.0 - target.b_1 * v * v) * target.b_0 / (1.0 + target.G * v * v)
+    assert beta == pytest.approx(expected, abs=error)
+
+
+def test_poles_cross_the_axis_at_the_critical_speed() -> None:
+    v = critical_speed(COMS)
+    assert np.linalg.eigvals(bicycle(COMS, 0.999 * v).A).real.max() < 0.0
+    assert np.linalg.eigvals(bicycle(COMS, 1.001 * v).A).real.max() > 0.0
+    A = bicycle(COMS, v).A
+    determinant = A[0, 0] * A[1, 1] - A[0, 1] * A[1, 0]
+    assert abs(determinant) < 1e-14 * abs(A[0, 0] * A[1, 1])  # roundings of the two products
+
+
+@pytest.mark.parametrize("v", [0.0, -1.0, math.nan])
+def test_a_speed_that_is_not_positive_is_refused(v: float) -> None:
+    for build in MODELS.values():
+        with pytest.raises(ValueError, match="positive speed, got"):
+            build(COMS, v)
