@@ -48,13 +48,13 @@ def list_names() -> None:
 
     from ..agents import AGENTS
     from ..envs import SCENARIOS, VEHICLES
-    from ..estimators import ESTIMATORS
+    from ..estimators import FILTERS
 
     for title, names in {
         "environments": [name for name in gym.registry if name.startswith("sideslip/")],
         "scenarios": list(SCENARIOS),
         "vehicles": list(VEHICLES),
-        "estimators": list(ESTIMATORS),
+        "estimators": list(FILTERS),
         "agents": list(AGENTS),
         "suites": list(SUITES),
     }.items():

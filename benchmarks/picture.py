@@ -4,9 +4,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from .colours import INK, colour
 from .rows import Row, Suite
-
-_BAR, _BEST, _LINE = "#56B4E9", "#0072B2", "#D55E00"
 
 
 def write_picture(path: str | Path, suites: Sequence[Suite]) -> None:
@@ -47,12 +46,12 @@ def write_picture(path: str | Path, suites: Sequence[Suite]) -> None:
         ]
         if bounds:
             value = next(r.value for r in mine if r.estimator == bounds[0].estimator)
-            axis.axvline(1e3 * value / bounds[0].value, color=_LINE, linewidth=1.5)
+            axis.axvline(1e3 * value / bounds[0].value, color=INK, linewidth=1.5)
             axis.annotate(
                 "bound",
                 (1e3 * value / bounds[0].value, 1.0),
                 xycoords=("data", "axes fraction"),
-                color=_LINE,
+                color=INK,
                 fontsize=7,
                 ha="right",
                 va="bottom",
@@ -70,7 +69,7 @@ def _bars(axis: Any, rows: Sequence[Row], title: str, label: str) -> None:
     ordered = sorted(rows, key=lambda row: -row.value)
     names = [row.estimator if row.metric == "rmse" else _contestant(row) for row in ordered]
     values = [1e3 * row.value for row in ordered]
-    colours = [_BAR] * (len(ordered) - 1) + [_BEST]
+    colours = [colour(name) for name in names]
     errors = [
         [1e3 * (row.value - row.low) for row in ordered],
         [1e3 * (row.high - row.value) for row in ordered],

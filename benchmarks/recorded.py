@@ -138,7 +138,7 @@ def run_estimators(drives: Sequence[Log], told: Vehicle, how: Settings) -> Resul
         except ValueError as error:
             if name == GYRO_ONLY:
                 raise
-            result.remarks[name] = f"left out: {error}"
+            result.remarks[name] = f"left out: {str(error).removeprefix(f'{name}: ')}"
             continue
         if estimator.unobservable:
             result.remarks[name] = f"cannot see {'; '.join(estimator.unobservable)}"

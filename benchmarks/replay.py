@@ -64,22 +64,17 @@ def corners(log: Log, vehicle: Vehicle, **settings: Any) -> Suite:
         raise ValueError(f"{log.name}: corners are scored against sideslip truth; there is none")
     drives = drives_of(log, how)
     suite = Suite("replay", f"A recorded drive: {log.name}", "")
-    names = [name for name in ESTIMATORS if how.estimators is None or name in how.estimators]
-    lines = []
+    results = {}
     for front, rear in CORNERS:
         told = vehicle.scaled(how.stiffness_factor).scaled(front, rear)
-        label = f"front x {front}, rear x {rear}"
-        result = run_estimators(drives, told, how)
-        suite.rows += _rows(result, f"{log.name}: {vehicle.name}, {label}", told, how)
-        lines.append([label, *(_error(result, name) for name in names)])
-    suite.tables = [
-        Table(
-            f"{log.name}, estimators told {vehicle.name} with wrong tyres: RMSE / deg",
-            ("told stiffness", *names),
-            lines,
-            "The same process noise in all corners; medians over the noises.",
-        )
-    ]
+        result = results[f"{front} / {rear}"] = run_estimators(drives, told, how)
+        scenario = f"{log.name}: {vehicle.name}, front x {front}, rear x {rear}"
+        suite.rows += _rows(result, scenario, told, how)
+    names = [name for name in ESTIMATORS if any(name in r.squares for r in results.values())]
+    title = f"{log.name}, told {vehicle.name} with front / rear stiffness x ...: RMSE / deg"
+    cells = [[name, *(_error(result, name) for result in results.values())] for name in names]
+    note = "The same process noise in all corners; medians over the noises."
+    suite.tables = [Table(title, ("estimator", *results), cells, note)]
     return suite
 
 

@@ -40,7 +40,7 @@ _SLOW = {  # the values of a packet, as in SLOW_VALUES; the first tells where th
 }
 _GAPS = {"sideslip", "speed_y", *_SLOW["camera"], *_SLOW["gps"]}
 _GAP = 1.5  # steps of time
-_STILL = 1e-3
+_STILL = 1e-3  # of a step of time
 _DRIFT = 1e-4  # of the log's length
 _STANDING = 0.5  # m/s; below it the sideslip angle is 0
 
@@ -53,13 +53,13 @@ def read_log(path: str | Path, mapping: Mapping[str, str] | None = None) -> Log:
     `parse_mapping` makes it from texts.
 
     The record's dt is the mean step of time, its first tick that of the first row (0 where time
-    starts below 0: ticks are never negative). A logged input
-    (steering, torque, command) acts from its own row to the next, so it stands one row later in
-    the record. Without both wheel speeds both wheels turn at speed_x. Slow sensors (course,
-    camera_psi) are NaN between their samples; a sample is captured and arrives in its row, and the
-    sensor's period is the longest that has every sample on its clock.
-    truth["beta"] is the sideslip angle, or atan2(speed_y, speed_x) where only that is logged; NaN
-    where unknown, left out where the log has neither. name is the file's with its folder's.
+    starts below 0: ticks are never negative). A logged input (steering, torque, command) acts from
+    its own row to the next, so it stands one row later in the record. Without both wheel speeds
+    both wheels turn at speed_x. Slow sensors (course, camera_psi) are NaN between their samples; a
+    sample is captured and arrives in its row, and the sensor's period is the longest that has every
+    sample on its clock. truth["beta"] is the sideslip angle, or atan2(speed_y, speed_x) where only
+    that is logged; 0 at 0.5 m/s and below, NaN where unknown, left out where the log has neither.
+    name is the file's with its folder's.
 
     Raises ModuleNotFoundError without the extra, FileNotFoundError, and ValueError, with the path,
     for a file that is no table, a missing column, a value that is no number, fewer than two rows,
@@ -167,12 +167,13 @@ def _slow(values: dict[str, Array], first: int, dt: float) -> tuple[Array, dict[
 
 
 def _truth(values: dict[str, Array]) -> dict[str, Array]:
-    """The sideslip angle where the log knows it."""
+    """The sideslip angle where the log knows it; 0 at a standstill."""
+    v_x, v_y = values["speed_x"], values.get("speed_y")
     if "sideslip" in values:
-        return {"beta": values["sideslip"]}
-    if "speed_y" in values:
-        v_x, v_y = values["speed_x"], values["speed_y"]
-        moving = np.hypot(v_x, v_y) > _STANDING
-        beta = np.where(moving, np.arctan2(v_y, v_x), 0.0)
-        return {"beta": np.where(np.isnan(v_y), np.nan, beta)}
-    return {}
+        beta = values["sideslip"]
+    elif v_y is not None:
+        beta = np.arctan2(v_y, v_x)
+    else:
+        return {}
+    standing = np.hypot(v_x, 0.0 if v_y is None else np.nan_to_num(v_y)) <= _STANDING
+    return {"beta": np.where(standing, 0.0, beta)}

@@ -146,4 +146,4 @@ class Log:
     @property
     def time(self) -> Array:
         """Seconds of each row."""
-        return self.record.ticks * self.record.dt
+        return np.asarray(self.record.ticks * self.record.dt, np.float64)

@@ -129,6 +129,14 @@ PASSENGER_CAR = Vehicle(  # a compact electric car with two 700 N m in-wheel mot
 
 VEHICLES: dict[str, Vehicle] = {"coms": COMS, "passenger-car": PASSENGER_CAR}
 
+_LATERAL = (
+    "mass",
+    "yaw_inertia",
+    "front_arm",
+    "rear_arm",
+    "front_stiffness",
+    "rear_stiffness",
+)
 _STIFFNESS_KEYS = {
     f"{axle}_stiffness{suffix}": (f"{axle}_stiffness", factor)
     for axle in ("front", "rear")
@@ -163,10 +171,12 @@ def vehicle_from_file_values(values: Mapping[str, Any], where: str) -> Vehicle:
     """A vehicle from a file's keys, where the stiffness keys must name their convention.
 
     `front_stiffness_per_tyre` or `front_stiffness_axle` (two tyres together), and so for the
-    rear. Parameters that a file leaves out (tracks, wheel radius, ...) come from the preset under
-    `base`, by default the passenger car.
+    rear. A file may start from a preset under `base`; without one it must give what the lateral
+    motion depends on (mass, inertia, arms, stiffnesses), and the rest (tracks, wheel radius, ...)
+    is the passenger car's.
 
-    Raises ValueError if a stiffness has no convention, TypeError for an unknown key.
+    Raises ValueError if a stiffness has no convention or a needed key is missing, TypeError for
+    an unknown key.
     """
     read: dict[str, Any] = {"base": "passenger-car"}
     for key, value in values.items():
@@ -182,6 +192,10 @@ def vehicle_from_file_values(values: Mapping[str, Any], where: str) -> Vehicle:
         else:
             read[key] = value
     try:
-        return vehicle_from(read)
+        vehicle = vehicle_from(read)
     except (TypeError, ValueError) as error:
         raise type(error)(f"{where}: {error}") from None
+    missing = [name for name in _LATERAL if name not in read]
+    if missing and "base" not in values:
+        raise ValueError(f"{where}: missing {', '.join(missing)} (or name a preset under 'base')")
+    return vehicle

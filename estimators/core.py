@@ -8,7 +8,7 @@ came meanwhile.
 
 from typing import Any
 
-from ..envs.backend import absolute, jit, maximum, minimum
+from ..envs.backend import absolute, jit, maximum, minimum, sqrt
 from ..envs.elementary import wrap
 from ..envs.record import FAST, GPS, PACKET, PACKET_WIDTH
 from .covariance import measure_clone, measure_state, predict_covariance
@@ -55,9 +55,8 @@ def begin(f: Any, first: int) -> None:
 
 
 @jit
-def _measured_speed(f: Any, row: Any) -> Any:
-    """The low-passed mean of the front wheels' speeds, with this row."""
-    now = 0.5 * (row[FAST.wheel_left] + row[FAST.wheel_right])
+def _measured_speed(f: Any, now: Any) -> Any:
+    """The low-passed mean of the front wheels' speeds, with this sample of it."""
     if not _finite(now):
         return f.speed
     if f.model_speed == 0.0:
@@ -81,28 +80,24 @@ def _cell_of(f: Any, speed: Any) -> int:
 
 
 @jit
-def _ready(f: Any, gains: Any, row: Any) -> Any:
-    """Whether the gains are there that this row will ask for; else `wanted` says which."""
-    cell = f.cell
+def _next_cell(f: Any, now: Any) -> int:
+    """The table of gains that a row with this sample of the speed will ask for."""
     if f.measured == 1:
-        speed = _measured_speed(f, row)
+        speed = _measured_speed(f, now)
         if _moved(f, speed):
-            cell = _cell_of(f, speed)
-    f.wanted = -1 if gains[cell, 0, 0] == 1.0 else cell
-    return f.wanted < 0
+            return _cell_of(f, speed)
+    return f.cell
 
 
 @jit
-def _note_inputs(f: Any, row: Any) -> None:
-    """Keep this row's inputs (the last finite ones), and its speed; rebuild the model if needed."""
-    delta_f = row[FAST.steer]
-    N_z = f.moment_arm * (row[FAST.torque_right] - row[FAST.torque_left])
+def _note_inputs(f: Any, delta_f: Any, N_z: Any, now: Any) -> None:
+    """Keep a row's inputs (the last finite ones), and its speed; rebuild the model if needed."""
     if _finite(delta_f) and _finite(N_z):
         f.u[0], f.u[1] = delta_f, N_z
     else:
         f.counts[COUNTERS.invalid] += 1
     if f.measured == 1:
-        f.speed = _measured_speed(f, row)
+        f.speed = _measured_speed(f, now)
         if _moved(f, f.speed):
             build(f, f.speed)
             f.cell = _cell_of(f, f.speed)
@@ -136,7 +131,7 @@ def _advance_state(f: Any, u0: Any, u1: Any) -> None:
 
 
 @jit
-def _gyro(f: Any, table: Any, measured: Any) -> None:
+def _gyro(f: Any, gains: Any, measured: Any) -> None:
     residual = measured
     for k in range(f.n):
         residual -= f.gyro[k] * f.x[k]
@@ -146,11 +141,10 @@ def _gyro(f: Any, table: Any, measured: Any) -> None:
         if f.periodic == 0:
             return
     if f.pseudo == 1:
-        correct_between(f, table, 0 if f.period[0] > 0 else 1, residual)
+        correct_between(f, gains, 0 if f.period[0] > 0 else 1, residual)
     elif f.periodic == 1:
-        gain = table[1 + f.at]
         for i in range(f.total):
-            f.x[i] += gain[i] * residual
+            f.x[i] += gains[f.cell, 1 + f.at, i] * residual
     else:
         measure_state(f, f.gyro, f.r_gyro, residual)
 
@@ -164,14 +158,14 @@ def _align(f: Any, residual: Any) -> None:
 
 
 @jit
-def _use(f: Any, table: Any, s: int, packet: Any) -> None:
+def _use(f: Any, gains: Any, s: int, packet: Any) -> None:
     """Correct by one packet of sensor s whose values are sound."""
     captured = int(packet[PACKET.captured])
     first = find(f, s, captured)
     if first == DROPPED:
         return
     if f.pseudo == 1:
-        correct_sample(f, table, s, packet[PACKET.value :])
+        correct_sample(f, gains, s, packet[PACKET.value :])
         return
     frame = (captured - f.phase[s]) // f.period[s] % f.pattern
     for i in range(f.rows[s]):
@@ -189,9 +183,9 @@ def _use(f: Any, table: Any, s: int, packet: Any) -> None:
                 _align(f, residual)
                 residual = 0.0
         if f.periodic == 1:
-            gain = table[1 + f.cycle + frame * f.rows[s] + i]
+            at = 1 + f.cycle + frame * f.rows[s] + i
             for j in range(f.total):
-                f.x[j] += gain[j] * residual
+                f.x[j] += gains[f.cell, at, j] * residual
         elif first == DIRECT:
             measure_state(f, f.row[s, i], f.r[s, i], residual)
         else:
@@ -199,7 +193,7 @@ def _use(f: Any, table: Any, s: int, packet: Any) -> None:
 
 
 @jit
-def receive(f: Any, table: Any, packet: Any) -> None:
+def receive(f: Any, gains: Any, packet: Any) -> None:
     """Use a packet that is here now, keep it for the next step, or drop and count it."""
     for i in range(PACKET.value):
         if not _finite(packet[i]):
@@ -226,12 +220,12 @@ def receive(f: Any, table: Any, packet: Any) -> None:
             f.waiting[f.waits, i] = packet[i]
         f.waits += 1
         return
-    _use(f, table, s, packet)
+    _use(f, gains, s, packet)
 
 
 @jit
-def tick(f: Any, table: Any, row: Any) -> None:
-    """Take one fast row: from the last tick to this one."""
+def tick(f: Any, gains: Any, gyro: Any) -> None:
+    """Take the gyro and the noted inputs of one fast row: from the last tick to this one."""
     f.tick += 1
     if f.stride > 1:
         f.u_sum[0] += f.u[0]
@@ -249,23 +243,22 @@ def tick(f: Any, table: Any, row: Any) -> None:
     else:
         f.begun = 1
         f.at = ((f.tick - f.origin) // f.stride) % f.cycle
-    _gyro(f, table, row[FAST.gyro])
+    _gyro(f, gains, gyro)
     if f.stride > 1:
         f.u_sum[0], f.u_sum[1], f.u_count = 0.0, 0.0, 0
         for i in range(f.waits):
-            _use(f, table, int(f.waiting[i, PACKET.sensor]), f.waiting[i])
+            _use(f, gains, int(f.waiting[i, PACKET.sensor]), f.waiting[i])
         f.waits = 0
 
 
 @jit
-def record_row(f: Any, table: Any, x: Any, std: Any) -> None:
-    """The states and their standard deviations now, (n,) each."""
-    n = f.n
-    at = f.total
+def record_row(f: Any, gains: Any, X: Any, S: Any, j: int) -> None:
+    """Write the states and their standard deviations now into row j of X and S."""
+    n, at = f.n, f.total
     for i in range(n):
-        x[i] = f.x[i]
-        variance = table[1 + f.at, at] if f.periodic == 1 else f.P[i, i]
-        std[i] = maximum(variance, 0.0) ** 0.5
+        X[j, i] = f.x[i]
+        variance = gains[f.cell, 1 + f.at, at] if f.periodic == 1 else f.P[i, i]
+        S[j, i] = sqrt(maximum(variance, 0.0))
         at += n - i
 
 
@@ -288,18 +281,20 @@ def advance(
     """
     at = 0 if start == 0 else f.cursor
     for j in range(start, rows):
-        row = fast[j]
-        if f.periodic == 1 and not _ready(f, gains, row):
-            f.cursor = at
-            return j
-        _note_inputs(f, row)
-        table = gains[f.cell]
-        tick(f, table, row)
+        now = 0.5 * (fast[j, FAST.wheel_left] + fast[j, FAST.wheel_right])
+        if f.periodic == 1:
+            cell = _next_cell(f, now)
+            if gains[cell, 0, 0] == 0.0:
+                f.wanted, f.cursor = cell, at
+                return j
+        N_z = f.moment_arm * (fast[j, FAST.torque_right] - fast[j, FAST.torque_left])
+        _note_inputs(f, fast[j, FAST.steer], N_z, now)
+        tick(f, gains, fast[j, FAST.gyro])
         while at < count and not packets[at, PACKET.arrived] > f.tick:
-            receive(f, table, packets[at])
+            receive(f, gains, packets[at])
             at += 1
         if len(X) > 0:
-            record_row(f, table, X[j], S[j])
+            record_row(f, gains, X, S, j)
     f.counts[COUNTERS.future] += count - at
     return rows
 
@@ -313,8 +308,7 @@ def begin_filter(filters: Any, first: int) -> None:
 @jit
 def receive_filter(filters: Any, gains: Any, packet: Any) -> None:
     """`receive` for the first filter of an array."""
-    f = filters[0]
-    receive(f, gains[f.cell], packet)
+    receive(filters[0], gains, packet)
 
 
 @jit

@@ -1,6 +1,6 @@
 """The covariance and its gains in compiled code: `kalman.py`'s equations on a filter's record.
 
-Only the first n of `total` states move; the others are clones. Measurements come one scalar at a
+Only the first n of N = `total` states move; the others are clones. Measurements come one scalar at a
 time, so that a gain is a division and not a matrix inverse.
 """
 
@@ -12,7 +12,7 @@ from ..envs.backend import jit
 @jit
 def predict_covariance(f: Any) -> None:
     """P <- F P F^T + Q with F = [[G, 0], [0, diag(decay)]] on the states, I on the clones."""
-    n, dense, size = f.n, f.dense, f.total
+    n, dense, N = f.n, f.dense, f.total
     G, P, T, decay = f.G, f.P, f.work[0], f.decay
     for i in range(dense):  # T = F P on the states
         for j in range(n):
@@ -37,7 +37,7 @@ def predict_covariance(f: Any) -> None:
             value = decay[i] * P[i, j] * decay[j] + f.Q[i, j]
             P[i, j] = value
             P[j, i] = value
-    for c in range(n, size):  # the clones' covariance with the states
+    for c in range(n, N):  # the clones' covariance with the states
         for i in range(dense):
             total = 0.0
             for k in range(n):
@@ -54,31 +54,29 @@ def predict_covariance(f: Any) -> None:
 def _condition(f: Any, variance: Any, residual: Any) -> None:
     """Use one residual of the given variance whose covariance with the state is `f.ph`.
 
-    P <- P - K s K^T is Joseph's form for the optimal gain of a scalar; each half is written once
-    and mirrored, so P stays symmetric to the last bit.
+    P <- P - K s K^T, to which Joseph's form comes down for the optimal gain of a scalar. With
+    products of two entries of P C^T it is symmetric to the last bit.
     """
-    size, x, P, ph, gain = f.total, f.x, f.P, f.ph, f.gain
+    N, x, P, ph, gain = f.total, f.x, f.P, f.ph, f.gain
     per = 1.0 / variance
-    for i in range(size):
-        k = ph[i] * per
-        gain[i] = k
-        x[i] += k * residual
-        for j in range(i, size):
-            value = P[i, j] - k * ph[j]
-            P[i, j] = value
-            P[j, i] = value
+    for i in range(N):
+        gain[i] = ph[i] * per
+        x[i] += gain[i] * residual
+    for i in range(N):
+        for j in range(N):
+            P[i, j] -= per * (ph[i] * ph[j])
 
 
 @jit
 def measure_state(f: Any, row: Any, r: Any, residual: Any) -> None:
     """Use the residual of a measurement `row` (n,) of the states with noise variance r."""
-    n, size, P, ph = f.n, f.total, f.P, f.ph
-    for i in range(size):
+    n, N, P, ph = f.n, f.total, f.P, f.ph
+    for i in range(N):
         ph[i] = 0.0
     for k in range(n):
         h = row[k]
         if h != 0.0:
-            for i in range(size):
+            for i in range(N):
                 ph[i] += h * P[k, i]
     s = r
     for k in range(n):
@@ -97,8 +95,8 @@ def measure_clone(f: Any, clone: int, r: Any, residual: Any) -> None:
 @jit
 def clone_covariance(f: Any, row: Any, clone: int) -> None:
     """Make a clone of the combination `row` of the states."""
-    n, size, P, ph = f.n, f.total, f.P, f.ph
-    for i in range(size):
+    n, N, P, ph = f.n, f.total, f.P, f.ph
+    for i in range(N):
         total = 0.0
         for k in range(n):
             total += row[k] * P[k, i]
@@ -106,7 +104,7 @@ def clone_covariance(f: Any, row: Any, clone: int) -> None:
     own = 0.0
     for k in range(n):
         own += row[k] * ph[k]
-    for i in range(size):
+    for i in range(N):
         P[clone, i] = ph[i]
         P[i, clone] = ph[i]
     P[clone, clone] = own

@@ -57,10 +57,11 @@ def _slow_row(f: Any, s: int, i: int, v: Any) -> Any:
 
 
 @jit
-def correct_between(f: Any, table: Any, s: int, residual: Any) -> None:
+def correct_between(f: Any, gains: Any, s: int, residual: Any) -> None:
     """Correct x and e, both already predicted, by the gyro's and the pseudo-residuals.
 
-    table: rows of K^T then of the inverse's transpose, from the row 1 + cycle + 2 pattern on.
+    gains: in the present table, rows of K^T and then of the inverse's transpose stand behind those
+    of the steps and frames.
     """
     size, x, e = f.total, f.x, f.e
     first = 1 + f.cycle + f.rows[s] * f.pattern
@@ -72,17 +73,17 @@ def correct_between(f: Any, table: Any, s: int, residual: Any) -> None:
         f.expected[i] = _slow_row(f, s, i, x)
         f.eps[1 + i] = _slow_row(f, s, i, e)  # tie-vision (22): C G e
     for j in range(size):
-        x[j] += table[first, j] * residual
-        e[j] -= table[first, j] * ahead  # (21): (I - K C) G e
+        x[j] += gains[f.cell, first, j] * residual
+        e[j] -= gains[f.cell, first, j] * ahead  # (21): (I - K C) G e
     for i in range(f.rows[s]):
         for j in range(size):
-            step = table[first + 1 + i, j] * f.eps[1 + i]
+            step = gains[f.cell, first + 1 + i, j] * f.eps[1 + i]
             x[j] += step
             e[j] -= step
 
 
 @jit
-def correct_sample(f: Any, table: Any, s: int, values: Any) -> None:
+def correct_sample(f: Any, gains: Any, s: int, values: Any) -> None:
     """A sample has come in this tick: real residuals replace the pseudo ones, and e starts anew."""
     size, rows = f.total, f.rows[s]
     first = 1 + f.cycle + rows * f.pattern
@@ -91,10 +92,10 @@ def correct_sample(f: Any, table: Any, s: int, values: Any) -> None:
         if f.angle[s, i] == 1:
             real = wrap(real)
         for j in range(size):
-            f.x[j] += table[first + 1 + i, j] * (real - f.eps[1 + i])
+            f.x[j] += gains[f.cell, first + 1 + i, j] * (real - f.eps[1 + i])
         f.eps[1 + i] = real
     for j in range(size):  # (20): e = (C^+ - K) eps
         total = 0.0
         for i in range(1 + rows):
-            total += (table[first + 1 + rows + i, j] - table[first + i, j]) * f.eps[i]
+            total += (gains[f.cell, first + 1 + rows + i, j] - gains[f.cell, first + i, j]) * f.eps[i]
         f.e[j] = total

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..envs.backend import absolute, jit, maximum
-from ..envs.record import FAST_WIDTH, SLOW_NAMES
+from ..envs.record import SLOW_NAMES
 from .core import begin_filter, tick
 from .covariance import measure_clone, measure_state
 from .delay import DIRECT, DROPPED, find
@@ -27,17 +27,18 @@ LONGEST = 600.0  # s of the recursion
 
 
 @jit
-def settle(f: Any, s: int, lags: Any, cycles: int, table: Any, blank: Any, row: Any) -> int:
+def settle(f: Any, s: int, lags: Any, cycles: int, table: Any, before: Any, gains: Any) -> int:
     """Run the covariance filter over its schedule and write its gains; returns cycles used.
 
     f: a filter in covariance mode whose ticks are steps. s: its slow sensor, -1 for none. lags:
-    (pattern,) steps. blank, row: a table and a fast row of zeros.
+    (pattern,) steps. before: (total, total), to hold the covariance before the last frame. gains:
+    what a filter with periodic gains would read.
     """
     n, size, cycle = f.n, f.total, f.cycle
     for done in range(cycles):
         change = 0.0
         for at in range(cycle):
-            tick(f, blank, row)
+            tick(f, gains, 0.0)
             change = maximum(change, _copy(f.gain, table[1 + at], size))
             for frame in range(len(lags)):
                 captured = f.tick - lags[frame]
@@ -46,6 +47,7 @@ def settle(f: Any, s: int, lags: Any, cycles: int, table: Any, blank: Any, row: 
                 first = find(f, s, captured)
                 if first == DROPPED:
                     continue
+                before[:, :] = f.P[:size, :size]
                 for i in range(f.rows[s]):
                     if first == DIRECT:
                         measure_state(f, f.row[s, i], f.r[s, i], 0.0)
@@ -98,24 +100,19 @@ def design(f: Any, schedule: Schedule, speed: float, kind: str) -> tuple[Array, 
     s = int(np.argmax(used)) if used.any() else -1
     begin_filter(twins, 0)
     table = np.zeros(table_shape(f, schedule))
-    step = float(twin.step)
-    settle_filter(
-        twins,
-        s,
-        np.array(schedule.lags, np.int64),
-        max(2, int(LONGEST / step) // schedule.cycle),
-        table,
-    )
+    cycles = max(2, int(LONGEST / float(twin.step)) // schedule.cycle)
+    before = np.zeros((int(f.total), int(f.total)))
+    settle_filter(twins, s, np.array(schedule.lags, np.int64), cycles, table, before)
     if f.pseudo:
-        _pseudo_gains(twin, s, schedule, table, kind)
+        _pseudo_gains(twin, s, schedule, table, inverse(kind, measured_rows(f, s, 0), before))
     table[0, 0] = 1.0
     return table, twin.G[: twin.dense, : twin.n].copy()
 
 
 @jit
-def settle_filter(filters: Any, s: int, lags: Any, cycles: int, table: Any) -> None:
+def settle_filter(filters: Any, s: int, lags: Any, cycles: int, table: Any, before: Any) -> None:
     """`settle` for the first filter of an array."""
-    settle(filters[0], s, lags, cycles, table, np.zeros((1, 1)), np.zeros(FAST_WIDTH))
+    settle(filters[0], s, lags, cycles, table, before, np.zeros((1, 1, 1)))
 
 
 def measured_rows(f: Any, s: int, frame: int, lag: int = 1) -> Array:
@@ -134,17 +131,14 @@ def measured_rows(f: Any, s: int, frame: int, lag: int = 1) -> Array:
     return C
 
 
-def _pseudo_gains(twin: Any, s: int, schedule: Schedule, table: Array, kind: str) -> None:
+def _pseudo_gains(f: Any, s: int, schedule: Schedule, table: Array, inverse: Array) -> None:
     """Append the constant gain and the generalised inverse of the pseudo-residual rule."""
-    p, size, cycle = int(twin.rows[s]), int(twin.total), schedule.cycle
-    C = measured_rows(twin, s, 0)
-    slow = table[1 + cycle : 1 + cycle + p * len(schedule.lags), :size]
-    mean = slow.reshape(len(schedule.lags), p, size).mean(0)
-    first = 1 + cycle + p * len(schedule.lags)
-    K = constant_gain(table[1 : 1 + cycle, :size], mean, schedule.period)
-    table[first : first + 1 + p, :size] = K.T
-    P = twin.P[:size, :size]
-    table[first + 1 + p :, :size] = inverse(kind, C, P).T
+    p, total, cycle, frames = int(f.rows[s]), int(f.total), schedule.cycle, len(schedule.lags)
+    first = 1 + cycle + p * frames
+    slow = table[1 + cycle : first, :total].reshape(frames, p, total).mean(0)
+    K = constant_gain(table[1 : 1 + cycle, :total], slow, schedule.period)
+    table[first : first + 1 + p, :total] = K.T
+    table[first + 1 + p :, :total] = inverse.T
 
 
 def slow_index(f: Any) -> int:

@@ -103,10 +103,10 @@ def test_yaw_moment_limit_is_that_of_two_full_motors() -> None:
 @given(st.floats(1e-4, 10.0), st.floats(-100.0, 100.0), st.floats(-100.0, 100.0))
 def test_lag_is_the_exact_exponential(tau: float, command: float, value: float) -> None:
     lag = lag_of(tau, TICK)
-    close = {"abs": 1e-13}  # roundings of numbers up to 200
+    error = 1e-13  # roundings of numbers up to 200
     for rest, time in ((lag.start, 0.0), (lag.middle, 0.5 * TICK), (lag.end, TICK)):
         exact = command + (value - command) * math.exp(-time / tau)
-        assert lagged(command, value, rest) == pytest.approx(exact, **close)
+        assert lagged(command, value, rest) == pytest.approx(exact, abs=error)
     assert lag.mean == pytest.approx((1.0 + 4.0 * lag.middle + lag.end) / 6.0, rel=1e-15)
     # Simpson's error on exp(-t/tau) over a tick: (TICK / tau)^4 / 2880
     exact = tau / TICK * -math.expm1(-TICK / tau)

@@ -5,8 +5,10 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
+from numba.core.dispatcher import Dispatcher
 
 from sideslip.envs import backend
 
@@ -114,13 +116,14 @@ def test_plain_replaces_every_callee_and_leaves_the_original_alone() -> None:
     from sideslip.envs.dynamics import rk4
 
     function = backend.plain(rk4)
-    seen, todo = set(), [function]
+    seen: set[str] = set()
+    todo: list[Any] = [function]
     while todo:
         each = todo.pop()
         seen.add(each.__name__)
         for name in each.__code__.co_names:
             callee = each.__globals__.get(name)
-            assert not isinstance(callee, backend.Dispatcher), f"{each.__name__} calls {name}"
+            assert not isinstance(callee, Dispatcher), f"{each.__name__} calls {name}"
             if hasattr(callee, "__code__") and callee.__name__ not in seen:
                 todo.append(callee)
     assert {"rk4", "derivative", "slips", "sincos", "minimum", "floor"} <= seen

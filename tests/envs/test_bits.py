@@ -6,7 +6,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.envs import COMS, PASSENGER_CAR, dynamics, elementary, noise, programme, stability
+from sideslip.envs import (
+    COMS,
+    PASSENGER_CAR,
+    dynamics,
+    elementary,
+    kernel,
+    noise,
+    programme,
+    stability,
+)
 from sideslip.envs.backend import ARRAYS, plain
 from sideslip.envs.dynamics import Inputs, Motion, Push, Road
 from sideslip.envs.template import car_of
@@ -124,6 +133,6 @@ def test_whole_steps(name: str, arguments: dict[str, Any], monkeypatch: pytest.M
         return bits((start, first, moments, env.get_state()["state"], env.get_state()["params"]))
 
     compiled = episode()
-    monkeypatch.setattr(stability, "reset_vehicle", plain(stability.reset_vehicle))
-    monkeypatch.setattr(stability, "step_vehicle", plain(stability.step_vehicle))
+    monkeypatch.setattr(stability, "reset_vehicle", plain(kernel.reset_vehicle))
+    monkeypatch.setattr(stability, "step_vehicle", plain(kernel.step_vehicle))
     assert episode() == compiled

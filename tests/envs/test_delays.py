@@ -36,7 +36,7 @@ def received(sensors: str = "vision", ticks: int = 2000, seed: int = 0, **change
 
 
 def delays(found: np.ndarray) -> list[float]:
-    return (found[:, ARRIVED] - found[:, CAPTURED]).tolist()
+    return list(map(float, found[:, ARRIVED] - found[:, CAPTURED]))
 
 
 @pytest.mark.plain

@@ -37,21 +37,12 @@ def motion(**values: float) -> Motion:
     return Motion(*[0.0] * 9)._replace(**values)
 
 
-def slope(
-    state: Motion, steer: float = 0.0, T: tuple[float, float] = (0.0, 0.0), **how: Any
-) -> Any:
-    plant = {"push": CALM, "car": CAR, "road": STRAIGHT, "small_angle": 0, "law": FIALA} | how
-    load = load_of(Inputs(steer, *T), plant["car"], plant["small_angle"])
-    return derivative(
-        state,
-        load,
-        plant["push"],
-        plant["car"],
-        plant["road"],
-        frame_of(state),
-        plant["small_angle"],
-        plant["law"],
-    )
+def slope(state: Motion, steer: float = 0.0, T: Any = (0.0, 0.0), **how: Any) -> Any:
+    """The derivative of a state; `how` changes push, car, road, small_angle or law."""
+    push, car, road = how.get("push", CALM), how.get("car", CAR), how.get("road", STRAIGHT)
+    small_angle, law = how.get("small_angle", 0), how.get("law", FIALA)
+    load = load_of(Inputs(steer, *T), car, small_angle)
+    return derivative(state, load, push, car, road, frame_of(state), small_angle, law)
 
 
 def drive(
@@ -133,11 +124,11 @@ def test_place_follows_heading_and_road(v_x: float, v_y: float, theta: float, ps
     turn = psi - theta
     along = v_x * math.cos(turn) - v_y * math.sin(turn)
     # products of numbers up to 10 with sines of angles up to 13, each within its stated error
-    close = {"abs": 1e-13}
-    assert pytest.approx(v_x * math.cos(psi) - v_y * math.sin(psi), **close) == rate.X
-    assert pytest.approx(v_x * math.sin(psi) + v_y * math.cos(psi), **close) == rate.Y
-    assert pytest.approx(v_x * math.sin(turn) + v_y * math.cos(turn), **close) == rate.y
-    assert pytest.approx(along / (1.0 - 0.02 * 3.0), **close) == rate.s
+    error = 1e-13
+    assert pytest.approx(v_x * math.cos(psi) - v_y * math.sin(psi), abs=error) == rate.X
+    assert pytest.approx(v_x * math.sin(psi) + v_y * math.cos(psi), abs=error) == rate.Y
+    assert pytest.approx(v_x * math.sin(turn) + v_y * math.cos(turn), abs=error) == rate.y
+    assert pytest.approx(along / (1.0 - 0.02 * 3.0), abs=error) == rate.s
     assert rate.theta == 0.02 * rate.s
 
 

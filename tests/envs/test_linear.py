@@ -45,8 +45,8 @@ def seen(
 
     x: beta, gamma, psi, y_l as far as the model has them; u: delta_f, N_z, kappa.
     """
-    beta, gamma, psi, y_l = [*x, *[0.0] * (4 - len(x))]
-    delta_f, N_z, kappa = [*u, *[0.0] * (3 - len(u))]
+    beta, gamma, psi, y_l = np.append(x, [0.0] * (4 - len(x))).tolist()
+    delta_f, N_z, kappa = np.append(u, [0.0] * (3 - len(u))).tolist()
     car, l_pre = car_of(vehicle), vehicle.preview
     road = Road(kappa, -1e3, 1.0)
     bend = 0.5 * kappa * l_pre**2
@@ -110,15 +110,11 @@ def test_matrices_are_the_plants_jacobian(
 @pytest.mark.parametrize("V_x", SPEEDS)
 def test_vision_is_tie_vision_8_letter_by_letter(V_x: float) -> None:
     m, I, l_f, l_r, C_f, C_r, l_pre = 380.0, 136.08, 0.8, 0.6, 6000.0, 6000.0, 5.135  # noqa: E741
+    D = C_f * l_f**2 + C_r * l_r**2
     A = np.array(
         [
             [-2 * (C_f + C_r) / (m * V_x), -1 - 2 * (C_f * l_f - C_r * l_r) / (m * V_x**2), 0, 0],
-            [
-                -2 * (C_f * l_f - C_r * l_r) / I,
-                -2 * (C_f * l_f**2 + C_r * l_r**2) / (I * V_x),
-                0,
-                0,
-            ],
+            [-2 * (C_f * l_f - C_r * l_r) / I, -2 * D / (I * V_x), 0, 0],
             [0, 1, 0, 0],
             [V_x, l_pre, V_x, 0],
         ]

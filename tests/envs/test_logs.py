@@ -1,8 +1,5 @@
-"""A log read from disk is the record that the car would have written; anything else is refused."""
+"""A log read from disk is the record that the car would have written."""
 
-import subprocess
-import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -12,30 +9,10 @@ import pytest
 from sideslip.envs.logs import COLUMNS, column_name, parse_mapping, read_log
 from sideslip.envs.record import FAST, GPS, PACKET
 
+from .drives import drive, saved
+
 STANFORD = Path(__file__).parents[3] / "shared" / "data" / "stanford_250lm" / "log.csv"
 DEG = np.pi / 180.0
-
-
-def drive(rows: int = 50, dt: float = 0.01, start: float = 3.0) -> pd.DataFrame:
-    t = start + dt * np.arange(rows)
-    return pd.DataFrame(
-        {
-            "time_s": t,
-            "speed_x_mps": 20.0 + np.sin(t),
-            "speed_y_mps": 0.3 * np.cos(t),
-            "yaw_rate_radps": 0.1 * np.sin(2.0 * t),
-            "accel_x_mps2": np.cos(t),
-            "accel_y_mps2": 2.0 * np.sin(2.0 * t),
-            "steer_rad": 0.02 * np.sin(2.0 * t + 0.3),
-            "sideslip_rad": 0.01 * np.cos(2.0 * t),
-        }
-    )
-
-
-def saved(table: pd.DataFrame, folder: Path, name: str = "drive.csv", sep: str = ",") -> Path:
-    path = folder / name
-    table.to_csv(path, index=False, sep=sep)
-    return path
 
 
 def test_columns_become_the_record(tmp_path: Path) -> None:
@@ -120,23 +97,6 @@ def test_a_mapping_renames_and_says_the_unit(tmp_path: Path) -> None:
         read_log(path, {"yaw_rate_degps": "GyroZ", "yaw_rate_radps": "GyroZ"})
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("steer_rad", "expected NAME=COLUMN"),
-        ("steer_rad=", "expected NAME=COLUMN"),
-        ("steer=Delta", "expected one of steer_rad, steer_deg"),
-        ("steer_furlongs=Delta", "expected one of steer_rad, steer_deg"),
-        ("wheel=Delta", "unknown column name 'wheel'"),
-    ],
-)
-def test_a_bad_mapping_is_refused(text: str, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        parse_mapping([text])
-    with pytest.raises(ValueError, match="steer_rad is mapped twice"):
-        parse_mapping(["steer_rad=a", "steer_rad=b"])
-
-
 def test_logged_slow_sensors_become_packets(tmp_path: Path) -> None:
     table = drive(100)
     table["course_deg"] = np.nan
@@ -173,6 +133,13 @@ def test_truth_is_optional_and_may_have_gaps(tmp_path: Path) -> None:
     assert read_log(saved(table, tmp_path)).truth == {}
 
 
+def test_the_sideslip_of_a_standing_car_is_zero(tmp_path: Path) -> None:
+    table = drive().assign(sideslip_rad=3.0)
+    table.loc[:9, ["speed_x_mps", "speed_y_mps"]] = 0.3
+    beta = read_log(saved(table, tmp_path)).truth["beta"]
+    np.testing.assert_array_equal(beta, np.where(np.arange(50) < 10, 0.0, 3.0))
+
+
 def test_a_small_jitter_is_an_even_clock(tmp_path: Path) -> None:
     table = drive(500)
     table["time_s"] += np.random.default_rng(1).uniform(-4e-4, 4e-4, 500)
@@ -183,107 +150,6 @@ def test_a_small_jitter_is_an_even_clock(tmp_path: Path) -> None:
 
 def test_time_from_below_zero_counts_from_the_first_row(tmp_path: Path) -> None:
     assert read_log(saved(drive(start=-1.0), tmp_path)).record.first == 0
-
-
-Spoiler = Callable[[pd.DataFrame], pd.DataFrame]
-
-
-def holding(column: str, rows: list[int], value: object) -> Spoiler:
-    """A table whose column holds the value in these rows."""
-
-    def spoil(table: pd.DataFrame) -> pd.DataFrame:
-        values = table[column].astype(object)
-        values.iloc[rows] = value
-        return table.assign(**{column: values})
-
-    return spoil
-
-
-def later(by: float, since: int = 20) -> Spoiler:
-    """A table whose time is later by so many seconds from a row on."""
-    return lambda table: table.assign(time_s=table["time_s"] + by * (np.arange(50) >= since))
-
-
-def uneven(table: pd.DataFrame) -> pd.DataFrame:
-    return table.assign(time_s=np.cumsum(np.where(np.arange(50) < 25, 0.01, 0.014)))
-
-
-@pytest.mark.parametrize(
-    ("spoil", "message"),
-    [
-        (
-            lambda table: table.drop(columns="yaw_rate_radps"),
-            r"no column yaw_rate_radps; the log has time_s, .*sideslip_rad",
-        ),
-        (
-            holding("yaw_rate_radps", [11, 30], np.nan),
-            r"column 'yaw_rate_radps' has no value \(NaN\) in row 12",
-        ),
-        (later(-0.05), r"time runs backward at row 21: 3\.15 s after 3\.19 s"),
-        (later(-0.01), r"time stands still at row 21"),
-        (later(0.02), r"time jumps \(a step is 0\.01 s\) at row 21: 3\.22 s after 3\.19 s"),
-        (uneven, r"time is uneven: row \d+ is"),
-        (
-            holding("steer_rad", [4], "left"),
-            r"column 'steer_rad', row 5: expected a number, got 'left'",
-        ),
-        (
-            holding("speed_x_mps", [4], np.inf),
-            r"column 'speed_x_mps', row 5: expected a number, got 'inf'",
-        ),
-        (
-            lambda table: table.assign(steer_deg=0.0),
-            r"steer is given twice, as steer_rad and steer_deg",
-        ),
-        (lambda table: table.iloc[:1], r"the log has one row; a drive needs two or more"),
-        (lambda table: table.iloc[:0], r"the log has no rows"),
-    ],
-)
-def test_a_bad_table_gets_one_clear_error(tmp_path: Path, spoil: Spoiler, message: str) -> None:
-    path = saved(spoil(drive()), tmp_path)
-    with pytest.raises(ValueError, match=message) as caught:
-        read_log(path)
-    assert str(caught.value).startswith(f"{path}: ")
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (b"", "the file is empty"),
-        (b" \n\n", "the file is empty"),
-        (bytes(range(256)) * 8, "it is a binary file"),
-        (b"\x89PNG\r\n\x1a\n" + b"\xfe\xfd" * 99, "it is not text"),
-        (b"PAR1 but not for long", "expected CSV or Parquet"),
-        (b"time_s,steer_rad\n1,2\n1,2,3,4\n", "expected CSV or Parquet"),
-    ],
-)
-def test_a_file_that_is_no_table(tmp_path: Path, content: bytes, message: str) -> None:
-    path = tmp_path / "drive.csv"
-    path.write_bytes(content)
-    with pytest.raises(ValueError, match=message) as caught:
-        read_log(path)
-    assert str(path) in str(caught.value)
-    assert "\n" not in str(caught.value)
-
-
-def test_nothing_and_a_folder(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match=r"nowhere\.csv: there is no such file"):
-        read_log(tmp_path / "nowhere.csv")
-    with pytest.raises(ValueError, match="found a folder"):
-        read_log(tmp_path)
-
-
-def test_pandas_is_loaded_late_and_its_extra_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    code = "import sys, sideslip.envs.logs; sys.exit('pandas' in sys.modules)"
-    env_path = {"PYTHONPATH": ":".join(sys.path)}
-    subprocess.run([sys.executable, "-c", code], check=True, env=env_path)
-    path = saved(drive(), tmp_path)
-    monkeypatch.setitem(sys.modules, "pandas", None)
-    with pytest.raises(ModuleNotFoundError, match=r"pip install 'sideslip\[report\]'"):
-        read_log(path)
 
 
 def test_every_column_has_a_name_of_its_own() -> None:

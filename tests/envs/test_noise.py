@@ -1,6 +1,8 @@
 """Random numbers: the generator's published answers, and what the numbers are distributed as."""
 
 import itertools
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -30,6 +32,10 @@ KNOWN = [
 ]
 
 
+def on_arrays(function: Callable[..., Any]) -> Callable[..., Any]:
+    return plain(function, ARRAYS)
+
+
 def words(text: str) -> list[int]:
     return [int(word, 16) for word in text.split()]
 
@@ -39,16 +45,16 @@ def words(text: str) -> list[int]:
 def test_philox_gives_the_published_answers(counter: str, key: str, answer: str) -> None:
     assert list(philox(*words(key), *words(counter))) == words(answer)
     assert list(plain(philox)(*words(key), *words(counter))) == words(answer)
-    lanes = [np.full(3, word, np.int64) for word in words(key) + words(counter)]
-    for lane, word in zip(plain(philox, ARRAYS)(*lanes), words(answer), strict=True):
+    lanes: list[Any] = [np.full(3, word, np.int64) for word in words(key) + words(counter)]
+    for lane, word in zip(on_arrays(philox)(*lanes), words(answer), strict=True):
         assert lane.tolist() == [word] * 3
 
 
 def sample(block: int, count: int = N) -> np.ndarray:
     """(4, count) normals of a block at ticks 0, 1, 2, ..."""
     ticks = np.arange(count, dtype=np.int64)
-    key = [np.int64(word) for word in KEY]
-    return np.stack(plain(normals, ARRAYS)(*key, ticks, np.int64(block)))
+    key: Any = [np.full(count, word, np.int64) for word in KEY]
+    return np.stack(on_arrays(normals)(*key, ticks, np.full(count, block, np.int64)))
 
 
 def test_uniforms_lie_strictly_inside_the_unit_interval() -> None:
@@ -67,7 +73,7 @@ def test_log_errs_less_than_stated() -> None:
     ends = np.arange(1000)
     word = np.concatenate([rng.integers(0, 2**32, N), ends, 2**32 - 1 - ends])
     exact = np.log((word.astype(np.longdouble) + 0.5) / 2**32)
-    assert float(np.max(np.abs(plain(noise._log_uniform, ARRAYS)(word) - exact))) < 1e-13
+    assert float(np.max(np.abs(on_arrays(noise._log_uniform)(word) - exact))) < 1e-13
 
 
 @pytest.mark.parametrize("block", [CHANNELS.inertial, CHANNELS.gps])

@@ -66,11 +66,9 @@ def test_cost_is_designs_formula(e_beta: float, e_gamma: float, share: float, st
     rest = (e_beta / 0.02) ** 2 + 0.01 * share**2 + 0.01 * (steer / 0.05) ** 2
     whole = rest + (e_gamma / 0.1) ** 2
     # roundings of sums up to 700
-    close = {"abs": 1e-12}
     for kind, c in ((ZERO_SLIP, rest), (MODEL, whole), (LIMITED, whole)):
-        assert cost_rate(e_beta, e_gamma, share, steer, kind) == pytest.approx(
-            min(c, 100.0), **close
-        )
+        capped = pytest.approx(min(c, 100.0), abs=1e-12)
+        assert cost_rate(e_beta, e_gamma, share, steer, kind) == capped
 
 
 def test_cost_is_capped_whatever_comes() -> None:

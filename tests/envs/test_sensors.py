@@ -9,7 +9,7 @@ from scipy import stats
 
 from sideslip.envs import COMS, StabilityEnv
 from sideslip.envs.dynamics import Motion, Road
-from sideslip.envs.record import FAST, PACKET, TICK
+from sideslip.envs.record import FAST, PACKET
 from sideslip.envs.sensors import Noise, camera_sample, gps_sample
 
 from .helpers import FULL, LINEAR, SILENT, fast_rows, packets, play
@@ -26,7 +26,8 @@ SWERVING: dict[str, Any] = {
 
 def drive(sensors: str = "vision", ticks: int = 2000, seed: int = 0, **changes: Any) -> Any:
     """(infos by tick, fast rows, packets) of an uncontrolled drive, the reset included."""
-    env = StabilityEnv(sensors, **({"scenario": FULL | SWERVING, "control_period": 1} | changes))
+    arguments: dict[str, Any] = {"scenario": FULL | SWERVING, "control_period": 1}
+    env = StabilityEnv(sensors, **(arguments | changes))
     _, info = env.reset(seed=seed)
     start = env.record
     moments = play(env, [0.0] * ticks)
@@ -49,7 +50,8 @@ def test_fast_rows_hold_the_state_at_their_tick() -> None:
 
 @pytest.mark.plain
 def test_camera_and_gps_hold_the_state_at_their_capture() -> None:
-    for scenario in (FULL | SWERVING, LINEAR | SWERVING):
+    full, linear = FULL | SWERVING, LINEAR | SWERVING
+    for scenario in (full, linear):
         infos, _, found = drive(ticks=500, scenario=scenario)
         assert len(found) > 10
         for packet in found:
@@ -59,12 +61,12 @@ def test_camera_and_gps_hold_the_state_at_their_capture() -> None:
         infos, fast, found = drive("gps", ticks=500, scenario=scenario)
         for packet in found:
             tick = int(packet[PACKET.captured])
-            course, speed, X, _ = packet[PACKET.value :]
-            expected = infos[tick]["psi"] + infos[tick]["beta"]
-            assert course == pytest.approx(expected, abs=1e-15)
+            course, speed = packet[PACKET.value : PACKET.value + 2]
+            beta = infos[tick]["beta"]
+            assert course == pytest.approx(infos[tick]["psi"] + beta, abs=1e-15)
             v_x = fast[tick, [FAST.wheel_left, FAST.wheel_right]].mean()
-            assert speed == pytest.approx(v_x / math.cos(infos[tick]["beta"]), rel=1e-3)
-            assert X == pytest.approx(25.0 / 3.6 * tick * TICK, rel=1e-2)
+            stretch = 1.0 / math.cos(beta) if scenario is full else math.sqrt(1.0 + beta**2)
+            assert speed == pytest.approx(v_x * stretch, rel=1e-14)  # some roundings
 
 
 @pytest.mark.plain

@@ -103,7 +103,7 @@ def test_a_file_names_its_stiffness_convention() -> None:
     axle = {"front_stiffness_axle": 4e4, "rear_stiffness_axle": 6e4}
     expected = PASSENGER_CAR.scaled(2e4 / 55000.0, 3e4 / 60000.0)
     for values in (per_tyre, axle):
-        read = vehicle_from_file_values(values, "car.json")
+        read = vehicle_from_file_values({"base": "passenger-car", **values}, "car.json")
         assert read.front_stiffness == pytest.approx(expected.front_stiffness, rel=1e-15)
         assert read.rear_stiffness == pytest.approx(expected.rear_stiffness, rel=1e-15)
         assert read.mass == PASSENGER_CAR.mass
@@ -114,6 +114,12 @@ def test_bad_vehicle_files_are_refused_with_their_name() -> None:
     for key in ("front_stiffness", "rear_stiffness"):
         with pytest.raises(ValueError, match=rf"car\.json: '{key}' must say {key}_per_tyre or"):
             vehicle_from_file_values({key: 4e4}, "car.json")
+    with pytest.raises(
+        ValueError, match=r"car\.json: missing mass, yaw_inertia, front_arm, rear_arm"
+    ):
+        vehicle_from_file_values(
+            {"front_stiffness_axle": 4e4, "rear_stiffness_axle": 5e4}, "car.json"
+        )
     twice = {"front_stiffness_axle": 4e4, "front_stiffness_per_tyre": 2e4}
     with pytest.raises(ValueError, match=r"car\.json: front_stiffness is given twice"):
         vehicle_from_file_values(twice, "car.json")

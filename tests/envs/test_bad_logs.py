@@ -1,0 +1,132 @@
+"""What is no log is refused with one clear error that names the thing."""
+
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from sideslip.envs.logs import parse_mapping, read_log
+
+from .drives import drive, saved
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("steer_rad", "expected NAME=COLUMN"),
+        ("steer_rad=", "expected NAME=COLUMN"),
+        ("steer=Delta", "expected one of steer_rad, steer_deg"),
+        ("steer_furlongs=Delta", "expected one of steer_rad, steer_deg"),
+        ("wheel=Delta", "unknown column name 'wheel'"),
+    ],
+)
+def test_a_bad_mapping_is_refused(text: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        parse_mapping([text])
+    with pytest.raises(ValueError, match="steer_rad is mapped twice"):
+        parse_mapping(["steer_rad=a", "steer_rad=b"])
+
+
+Spoiler = Callable[[pd.DataFrame], pd.DataFrame]
+
+
+def holding(column: str, rows: list[int], value: object) -> Spoiler:
+    """A table whose column holds the value in these rows."""
+
+    def spoil(table: pd.DataFrame) -> pd.DataFrame:
+        values = table[column].astype(object)
+        values.iloc[rows] = value
+        return table.assign(**{column: values})
+
+    return spoil
+
+
+def later(by: float, since: int = 20) -> Spoiler:
+    """A table whose time is later by so many seconds from a row on."""
+    return lambda table: table.assign(time_s=table["time_s"] + by * (np.arange(50) >= since))
+
+
+def uneven(table: pd.DataFrame) -> pd.DataFrame:
+    return table.assign(time_s=np.cumsum(np.where(np.arange(50) < 25, 0.01, 0.014)))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (
+            lambda table: table.drop(columns="yaw_rate_radps"),
+            r"no column yaw_rate_radps; the log has time_s, .*sideslip_rad",
+        ),
+        (
+            holding("yaw_rate_radps", [11, 30], np.nan),
+            r"column 'yaw_rate_radps' has no value \(NaN\) in row 12",
+        ),
+        (later(-0.05), r"time runs backward at row 21: 3\.15 s after 3\.19 s"),
+        (later(-0.01), r"time stands still at row 21"),
+        (later(0.02), r"time jumps \(a step is 0\.01 s\) at row 21: 3\.22 s after 3\.19 s"),
+        (uneven, r"time is uneven: row \d+ is"),
+        (
+            holding("steer_rad", [4], "left"),
+            r"column 'steer_rad', row 5: expected a number, got 'left'",
+        ),
+        (
+            holding("speed_x_mps", [4], np.inf),
+            r"column 'speed_x_mps', row 5: expected a number, got 'inf'",
+        ),
+        (
+            lambda table: table.assign(steer_deg=0.0),
+            r"steer is given twice, as steer_rad and steer_deg",
+        ),
+        (lambda table: table.iloc[:1], r"the log has one row; a drive needs two or more"),
+        (lambda table: table.iloc[:0], r"the log has no rows"),
+    ],
+)
+def test_a_bad_table_gets_one_clear_error(tmp_path: Path, spoil: Spoiler, message: str) -> None:
+    path = saved(spoil(drive()), tmp_path)
+    with pytest.raises(ValueError, match=message) as caught:
+        read_log(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "the file is empty"),
+        (b" \n\n", "the file is empty"),
+        (bytes(range(256)) * 8, "it is a binary file"),
+        (b"\x89PNG\r\n\x1a\n" + b"\xfe\xfd" * 99, "it is not text"),
+        (b"PAR1 but not for long", "expected CSV or Parquet"),
+        (b"time_s,steer_rad\n1,2\n1,2,3,4\n", "expected CSV or Parquet"),
+    ],
+)
+def test_a_file_that_is_no_table(tmp_path: Path, content: bytes, message: str) -> None:
+    path = tmp_path / "drive.csv"
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=message) as caught:
+        read_log(path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_nothing_and_a_folder(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"nowhere\.csv: there is no such file"):
+        read_log(tmp_path / "nowhere.csv")
+    with pytest.raises(ValueError, match="found a folder"):
+        read_log(tmp_path)
+
+
+def test_pandas_is_loaded_late_and_its_extra_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    code = "import sys, sideslip.envs.logs; sys.exit('pandas' in sys.modules)"
+    env_path = {"PYTHONPATH": ":".join(sys.path)}
+    subprocess.run([sys.executable, "-c", code], check=True, env=env_path)
+    path = saved(drive(), tmp_path)
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(ModuleNotFoundError, match=r"pip install 'sideslip\[report\]'"):
+        read_log(path)

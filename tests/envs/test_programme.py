@@ -1,0 +1,205 @@
+"""Manoeuvres over time: shapes of the steering, zero net heading, wind, and the held speed."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sideslip.envs import COMS, SCENARIOS, StabilityEnv
+from sideslip.envs.linear import bicycle
+from sideslip.envs.programme import (
+    DRAWS_WIDTH,
+    FOREVER,
+    STEERING_KINDS,
+    STEERING_WIDTH,
+    Draws,
+    Pace,
+    Wind,
+    acceleration_command,
+    stable,
+    steering_at,
+    wind_at,
+    write_steering,
+)
+from sideslip.envs.record import FAST, TICK
+from sideslip.envs.template import car_of
+
+from .helpers import FULL, LINEAR, fast_rows, play
+
+pytestmark = pytest.mark.plain
+
+DRAWN = Draws(*[0.0] * DRAWS_WIDTH)._replace(
+    speed=25.0 / 3.6,
+    onset=0.5,
+    amplitude=0.1,
+    amplitude_2=0.03,
+    frequency=0.4,
+    frequency_2=0.5,
+    frequency_3=0.2,
+    frequency_4=0.8,
+    hold=1.5,
+    front_stiffness=1.0,
+    rear_stiffness=1.0,
+    side=1.0,
+)
+
+
+def steering(kind: str, seconds: float = 10.0, **changes: float) -> np.ndarray:
+    """The steering angle at every tick."""
+    programme = np.zeros(STEERING_WIDTH)
+    write_steering(STEERING_KINDS.index(kind), DRAWN._replace(**changes), programme)
+    code = tuple(programme.tolist())
+    return np.array([steering_at(float(tick), code) for tick in range(round(seconds / TICK))])
+
+
+def sine(start: float, hertz: float, t: np.ndarray) -> np.ndarray:
+    return np.where(t >= start, np.sin(2.0 * np.pi * hertz * (t - start)), 0.0)
+
+
+def test_each_kind_is_what_its_name_says() -> None:
+    t = np.arange(10_000) * TICK
+    smooth = np.clip(np.subtract.outer([0.5, 2.0, 3.5], -t).clip(0.0) * 0.0, 0.0, 1.0)
+    for i, start in enumerate((0.5, 2.0, 3.5)):
+        x = np.clip((t - start) / 0.2, 0.0, 1.0)
+        smooth[i] = 3.0 * x**2 - 2.0 * x**3
+    one = sine(0.5, 0.4, t)
+    expected = {
+        "straight": 0.0 * t,
+        "sine": 0.1 * one,
+        "lane-change": np.where(t < 0.5 + 2.5, 0.1 * one, 0.0),
+        # half a wave of half the size, then the sine with the opposite sign
+        "slalom": np.where(t < 0.5 + 1.25, 0.05 * one, -0.1 * sine(1.75, 0.4, t)),
+        "step": 0.1 * (smooth[0] - 2.0 * smooth[1] + smooth[2]),
+        "random": 0.1 * one
+        - 0.1 * 0.5 / 0.4 * sine(0.5, 0.5, t)
+        + 0.03 * sine(0.5, 0.2, t)
+        - 0.03 * 0.8 / 0.2 * sine(0.5, 0.8, t),
+    }
+    assert set(expected) == set(STEERING_KINDS)
+    for kind, angle in expected.items():
+        # the sine's stated error, and the phase's rounding, on angles up to 0.3 rad
+        np.testing.assert_allclose(steering(kind), angle, rtol=0.0, atol=1e-14)
+
+
+@pytest.mark.parametrize("kind", STEERING_KINDS)
+def test_side_mirrors_the_steering(kind: str) -> None:
+    np.testing.assert_array_equal(steering(kind, 5.0, side=0.49), -steering(kind, 5.0, side=0.5))
+
+
+@pytest.mark.parametrize("kind", ["slalom", "random"])
+def test_slalom_and_random_swing_about_the_old_heading(kind: str) -> None:
+    """The heading follows the integral of the steering: over whole periods its mean is zero."""
+    heading = np.cumsum(steering(kind, 30.5 if kind == "random" else 15.5)) * TICK
+    whole = heading[500:] if kind == "random" else heading[1750:14_250]  # 10 s = all periods; 5
+    # the left-hand sum errs by half a tick of the largest angle
+    assert abs(whole.mean()) < 0.5 * TICK * 0.3
+    assert np.abs(whole).max() > 0.02
+
+
+@pytest.mark.parametrize("kind", ["lane-change", "step"])
+def test_lane_change_and_step_end_on_the_old_heading(kind: str) -> None:
+    angle = steering(kind)
+    assert np.abs(angle[-1]) < 1e-15
+    # both are odd about their middle: the sum of the samples cancels to roundings of 500 rad
+    assert abs(angle.sum()) < 1e-10
+    assert angle.max() == pytest.approx(-angle.min(), rel=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["lane-change", "step"])
+def test_so_the_linear_car_does_too(kind: str) -> None:
+    turning = LINEAR | {"steering": kind, "onset": 0.5, "amplitude": 0.05, "duration": 12.0}
+    env = StabilityEnv(scenario=turning)
+    env.reset(seed=0)
+    moments = play(env, [0.0] * 1200)
+    psi = np.array([moment.info["psi"] for moment in moments])
+    assert np.abs(psi).max() > 0.05
+    # psi integrates what the plant makes of a signal whose integral is zero; exp(-6 x 7 s) is left
+    assert abs(psi[-1]) < 1e-12
+
+
+@given(st.floats(0.1, 3.0), st.floats(0.3, 3.0), st.floats(1.0, 40.0))
+def test_unstable_draws_are_those_with_a_positive_eigenvalue(
+    front: float, rear: float, v: float
+) -> None:
+    """With 5 % of speed to spare, and away from the boundary's last bits."""
+    drawn = DRAWN._replace(front_stiffness=front, rear_stiffness=rear, speed=v)
+    A = bicycle(COMS.scaled(front, rear), 1.05 * v).A
+    largest = np.linalg.eigvals(A).real.max()
+    if abs(largest) > 1e-9 * np.abs(A).max():
+        assert stable(drawn, car_of(COMS)) == (largest < 0.0)
+
+
+def test_wind_blows_from_its_start_up_to_its_end_at_its_arm() -> None:
+    wind = Wind(200.0, 0.2, 4000.0, 8000.0)
+    for tick, force in ((3999.0, 0.0), (4000.0, 200.0), (7999.0, 200.0), (8000.0, 0.0)):
+        assert wind_at(tick, wind) == (force, pytest.approx(0.2 * force, rel=1e-15))
+
+
+def pace(**changes: float) -> Pace:
+    return Pace(7.0, 1.0, 0.0, 0.0, FOREVER, 2.0, 0.5)._replace(**changes)
+
+
+def test_pi_holds_the_integral_while_the_motors_are_at_their_limit() -> None:
+    assert acceleration_command(0.0, 7.0, 0.0, pace(), 2.0) == (0.0, 0.0)
+    a_x, integral = acceleration_command(0.0, 6.9, 0.1, pace(), 2.0)
+    assert (a_x, integral) == (pytest.approx(0.3, rel=1e-14), pytest.approx(0.10005, rel=1e-14))
+    assert acceleration_command(0.0, 0.0, 0.1, pace(), 2.0) == (2.0, 0.1)
+    assert acceleration_command(0.0, 20.0, 0.1, pace(), 2.0) == (-2.0, 0.1)
+    given_a_x = pace(hold=0.0, acceleration=0.7, start=10.0, end=20.0)
+    for tick, expected in ((9.0, 0.0), (10.0, 0.7), (19.0, 0.7), (20.0, 0.0)):
+        assert acceleration_command(tick, 3.0, 0.0, given_a_x, 2.0)[0] == expected
+
+
+def test_speed_is_held_against_the_drag_of_a_turn() -> None:
+    turning = FULL | {"steering": "step", "amplitude": 0.05, "hold": 100.0, "duration": 40.0}
+    env = StabilityEnv(scenario=turning)
+    env.reset(seed=0)
+    rows = fast_rows(play(env, [0.0] * 4000))
+    v = 0.5 * (rows[:, FAST.wheel_left] + rows[:, FAST.wheel_right])
+    assert v.min() < 25.0 / 3.6 - 0.01
+    # the PI's slow pole, 0.29 / s, leaves exp(-11) of some 0.05 m/s
+    assert v[-1] == pytest.approx(25.0 / 3.6, abs=1e-5)
+
+
+@pytest.mark.parametrize("lags", [False, True])
+def test_a_car_starts_from_standstill(lags: bool) -> None:
+    start = FULL | {"speed": 0.0, "acceleration": 1.0, "lags": lags}
+    env = StabilityEnv("gps", scenario=start)
+    obs, info = env.reset(seed=0)
+    assert np.all(np.isfinite(obs))
+    moments = play(env, [0.0] * 1000)
+    v = moments[-1].record.fast[-1, FAST.wheel_left]
+    late = 0.005 if lags else 0.0  # the motors' lag
+    assert v == pytest.approx(10.0 - late, abs=1e-9)  # roundings of 10 000 sums up to 10 m/s
+    slow = [moment.record.packets[:, 3] for moment in moments[:99]]
+    assert not np.concatenate(slow).any()  # below 1 m/s a course has quality 0
+    assert info["beta"] == moments[-1].info["beta"] == 0.0
+
+
+def test_a_car_driven_backwards_is_taken_for_a_spun_one_and_stays_finite() -> None:
+    env = StabilityEnv(scenario=FULL | {"speed": 1.0, "acceleration": -2.0})
+    env.reset(seed=0)
+    moments = play(env, [0.1] * 1000)
+    assert moments[-1].terminated
+    assert moments[-1].info["beta"] == pytest.approx(-math.pi, abs=1e-2) or (
+        moments[-1].info["beta"] == pytest.approx(math.pi, abs=1e-2)
+    )
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+@pytest.mark.parametrize("sensors", ["vision", "gps"])
+def test_every_scenario_stays_finite_under_hard_switching(name: str, sensors: str) -> None:
+    env: Any = StabilityEnv(sensors, scenario=name, control_period=100, reference="limited")
+    for seed in range(3):
+        obs, info = env.reset(seed=seed)
+        rng = np.random.default_rng(seed)
+        moments = play(env, rng.choice([-1.0, 1.0], 200))
+        for each in [obs, *[moment.obs for moment in moments]]:
+            assert env.observation_space.contains(each)
+        for each in [info, *[moment.info for moment in moments]]:
+            assert all(math.isfinite(value) for value in each.values())
+        assert np.all(np.isfinite(fast_rows(moments)))
+        assert moments[-1].terminated or moments[-1].truncated
