@@ -18,7 +18,7 @@ from ..envs.vehicle import COMS, Vehicle
 from .controller import Array, Controller
 
 SPEEDS = np.arange(2.0, 61.0, 0.5)  # m/s
-POLE = 2.0 * math.pi * 2.0  # rad/s: Table II of tie-vision places a pole at -2 Hz
+POLE = 2.0 * math.pi * 2.0  # rad/s: Table II of tie-vision places poles at 2 Hz
 CAMERA_PERIOD = 0.033  # s
 
 
@@ -48,12 +48,13 @@ class PI:
 
 
 def design_pi(vehicle: Vehicle, speed: float, pole: float = POLE) -> PI:
-    """A PI whose zero lies on the plant's slow pole, with a closed-loop pole at -`pole` rad/s.
+    """A PI whose zero lies on the plant's slow pole, with closed-loop poles at `pole` rad/s.
 
     With G = k / ((s + p_1)(s + p_2)), p_1 < p_2, and C = k_p (s + p_1) / s the closed loop is
-    s^2 + p_2 s + k k_p: two poles whose sum is p_2. One goes to -pole, but not beyond -0.8 p_2,
-    or the other would be slower than a quarter of it. Gains are capped at the full yaw moment
-    for 0.02 rad (near the speed where the yaw moment does not move beta, k is nearly zero).
+    s^2 + p_2 s + k k_p: k k_p = pole^2 puts both poles on the circle of that radius. They are
+    kept at a damping of a half at least, which a slow plant reaches at a smaller radius, and are
+    real where p_2 > 2 pole. Gains are capped at the full yaw moment for 0.01 rad (near the speed
+    where the yaw moment does not move beta, k is nearly zero).
 
     Raises ModuleNotFoundError without python-control (the extra `design`).
     """
@@ -65,13 +66,13 @@ def design_pi(vehicle: Vehicle, speed: float, pole: float = POLE) -> PI:
     k = float(transfer.num[0][0][-1] / transfer.den[0][0][0])
     slow_first = sorted(-float(p.real) for p in plant.poles())
     p_1, p_2 = max(slow_first[0], 0.0), slow_first[1]
-    fast = min(pole, 0.8 * p_2)
-    most = vehicle.yaw_moment_limit / 0.02
-    k_p = np.clip(fast * (p_2 - fast) / k, -most, most) if k != 0.0 else 0.0
+    radius = min(pole, p_2)
+    most = vehicle.yaw_moment_limit / 0.01
+    k_p = np.clip(radius * radius / k, -most, most) if k != 0.0 else 0.0
     return PI(float(k_p), float(k_p) * p_1)
 
 
-COMS_PI = PI(-4756.977, -28925.54)
+COMS_PI = PI(-19000.506, -115535.531)
 """What `design_pi` gives for the COMS at 25 km/h: used where python-control is not installed."""
 
 

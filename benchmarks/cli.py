@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from rich import box
 from rich.console import Console
 from rich.table import Table as RichTable
 
@@ -159,6 +160,8 @@ def _give(
 ) -> None:
     """Print the tables and write what was asked for."""
     for suite in suites:
+        console.rule(f"[bold]{suite.title}")
+        console.print(suite.text + "\n", highlight=False)
         for table in suite.tables:
             console.print(_screen(table.title, table.header, table.cells))
             if table.note:
@@ -193,9 +196,9 @@ def environment() -> dict[str, str]:
 
 
 def _screen(title: str, header: Sequence[str], cells: Sequence[Sequence[str]]) -> RichTable:
-    table = RichTable(title=title, title_justify="left")
+    table = RichTable(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
     for i, name in enumerate(header):
-        table.add_column(name, justify="left" if i == 0 else "right")
+        table.add_column(name, justify="left" if i == 0 else "right", no_wrap=i == 0)
     for row in cells:
         table.add_row(*row)
     return table

@@ -476,8 +476,9 @@ def step_vehicle(
         c = cost_rate(beta - refs[0], motion.gamma - refs[1], delivered / task.yaw_scale, 0.0, kind)
         cost = cost + c * TICK
         done = j + 1
-        finite = motion.v_x + motion.v_y + motion.gamma + motion.psi + motion.Y
-        if finite - finite != 0.0:
+        v_x, v_y, gamma = motion.v_x, motion.v_y, motion.gamma
+        finite = v_x * v_x + v_y * v_y + gamma * gamma + motion.psi + motion.Y
+        if finite - finite != 0.0:  # squares: the references take them too
             failure = NOT_FINITE
             motion, beta, refs = before, 0.0, (0.0, 0.0)  # the last that is fit for `info`
         elif absolute(beta) > task.spin:

@@ -6,9 +6,11 @@
 from .estimator import Estimates, Estimator, UnobservableWarning
 from .make import make_estimator
 from .papers import FILTERS
+from .wrappers import EstimateObservation
 
 __all__ = [
     "FILTERS",
+    "EstimateObservation",
     "Estimates",
     "Estimator",
     "UnobservableWarning",

@@ -17,7 +17,7 @@ from .intersample import correct_between, correct_sample
 from .memory import COUNTERS, INPUTS, SEEN, SLOW, WAITING, WIDTH
 from .models import MOVED, SLOWEST, build
 
-ASTRAY = 0.2  # rad: the first course sets the heading where it is so far off
+ASTRAY = 0.5  # rad: the first course sets the heading where it is so far off
 
 
 @jit
@@ -143,8 +143,9 @@ def _gyro(f: Any, gains: Any, measured: Any) -> None:
     if f.pseudo == 1:
         correct_between(f, gains, 0 if f.period[0] > 0 else 1, residual)
     elif f.periodic == 1:
+        x, cell, at = f.x, f.cell, 1 + f.at
         for i in range(f.total):
-            f.x[i] += gains[f.cell, 1 + f.at, i] * residual
+            x[i] += gains[cell, at, i] * residual
     else:
         measure_state(f, f.gyro, f.r_gyro, residual)
 
@@ -183,9 +184,9 @@ def _use(f: Any, gains: Any, s: int, packet: Any) -> None:
                 _align(f, residual)
                 residual = 0.0
         if f.periodic == 1:
-            at = 1 + f.cycle + frame * f.rows[s] + i
+            x, cell, at = f.x, f.cell, 1 + f.cycle + frame * f.rows[s] + i
             for j in range(f.total):
-                f.x[j] += gains[f.cell, at, j] * residual
+                x[j] += gains[cell, at, j] * residual
         elif first == DIRECT:
             measure_state(f, f.row[s, i], f.r[s, i], residual)
         else:
@@ -252,14 +253,17 @@ def tick(f: Any, gains: Any, gyro: Any) -> None:
 
 
 @jit
-def record_row(f: Any, gains: Any, X: Any, S: Any, j: int) -> None:
-    """Write the states and their standard deviations now into row j of X and S."""
-    n, at = f.n, f.total
-    for i in range(n):
-        X[j, i] = f.x[i]
-        variance = gains[f.cell, 1 + f.at, at] if f.periodic == 1 else f.P[i, i]
-        S[j, i] = sqrt(maximum(variance, 0.0))
-        at += n - i
+def covariance_of(f: Any, gains: Any, i: int, j: int) -> Any:
+    """P[i, j] of two states, i <= j, now; with periodic gains that of the settled cycle."""
+    if f.periodic == 1:
+        return gains[f.cell, 1 + f.at, f.total + i * f.n - i * (i - 1) // 2 + j - i]
+    return f.P[i, j]
+
+
+@jit
+def deviation(f: Any, gains: Any, i: int) -> Any:
+    """The standard deviation of a state now."""
+    return sqrt(maximum(covariance_of(f, gains, i, i), 0.0))
 
 
 @jit
@@ -294,7 +298,9 @@ def advance(
             receive(f, gains, packets[at])
             at += 1
         if len(X) > 0:
-            record_row(f, gains, X, S, j)
+            for i in range(f.n):
+                X[j, i] = f.x[i]
+                S[j, i] = deviation(f, gains, i)
     f.counts[COUNTERS.future] += count - at
     return rows
 

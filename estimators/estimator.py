@@ -1,5 +1,6 @@
 """The estimator object: a filter's compiled memory behind a small face."""
 
+import itertools
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ from numba.core.dispatcher import Dispatcher
 from ..envs.record import FAST_WIDTH, PACKET_WIDTH, SLOW_NAMES, Log, Record, SlowSensor
 from .core import advance_filter, begin_filter, receive_filter
 from .memory import FILTER, Counters
+from .models import UNITS
 from .periodic import design, table_shape
 from .schedule import Schedule, whole_ticks
 from .stability import MARGINAL, error_map, spectral_radius, unobservable
@@ -55,7 +57,8 @@ def entry(function: Any, *example: Any) -> Any:
     return function.compile(tuple(map(numba.typeof, example)))
 
 
-_MATRIX = np.zeros((1, 1))
+_NOTHING = np.zeros((0, 0))
+_NO_PACKETS = np.zeros((0, PACKET_WIDTH))
 
 
 @cache
@@ -63,8 +66,8 @@ def entries() -> tuple[Any, Any]:
     """(`advance_filter`, `receive_filter`) as plain calls."""
     filters, gains = np.zeros(1, FILTER), np.zeros((1, 1, 1))
     return (
-        entry(advance_filter, filters, gains, _MATRIX, 0, _MATRIX, 0, 0, _MATRIX, _MATRIX),
-        entry(receive_filter, filters, gains, _MATRIX[0]),
+        entry(advance_filter, filters, gains, _NOTHING, 0, _NOTHING, 0, 0, _NOTHING, _NOTHING),
+        entry(receive_filter, filters, gains, np.zeros(PACKET_WIDTH)),
     )
 
 
@@ -73,7 +76,8 @@ class Estimator:
 
     `names` and `units` of its states; `x` (n,) and `P` (n, n) at "now"; `tick`, the last fast row.
     `unobservable`: directions that its sensors cannot see. `spectral_radius` of its error over a
-    cycle. `dt`: seconds of a tick. `needs`: the fast columns it reads.
+    cycle. `dt`: seconds of a tick. `needs`: the fast columns it reads. `filters`, `gains`: its whole
+    memory and its tables, as compiled code takes them.
     Counters of what was skipped: `refused` (older than the filter's window), `duplicates`,
     `future`, `invalid` (not finite), `poor` (quality 0), `unknown` (sensor or stamp).
     """
@@ -82,7 +86,6 @@ class Estimator:
         self,
         name: str,
         names: tuple[str, ...],
-        units: tuple[str, ...],
         dt: float,
         filters: Any,
         sensors: Mapping[str, SlowSensor],
@@ -90,21 +93,22 @@ class Estimator:
         kind: str,
         allow_unstable: bool,
     ) -> None:
-        self.name, self.names, self.units, self.dt = name, names, units, dt
+        self.allow_unstable = allow_unstable
+        self.name, self.names, self.dt = name, names, dt
+        self.units = tuple(UNITS[state] for state in names)
         self.sensors = dict(sensors)
-        self._filters, self._schedules, self._kind = filters, schedules, kind
+        self.filters, self._schedules, self._kind = filters, schedules, kind
         f = self._f
         cells = round((f.high - f.low) / f.spacing) + 1 if f.spacing > 0.0 else 1
         shape = (cells, *table_shape(f, schedules[-1])) if f.periodic else (1, 1, 1)
-        self._gains = np.zeros(shape)
+        self.gains = np.zeros(shape)
         self.spectral_radius = 0.0
         self.unobservable: tuple[str, ...] = ()
-        self._check(allow_unstable)
         self.reset()
 
     @property
     def _f(self) -> Any:
-        return self._filters[0]
+        return self.filters[0]
 
     @property
     def needs(self) -> tuple[str, ...]:
@@ -112,34 +116,46 @@ class Estimator:
         wheels = ("wheel_left",) if self._f.measured else ()
         return ("gyro", "steer", *wheels)
 
-    def _check(self, allow_unstable: bool) -> None:
-        """Refuse a filter that diverges; name what it cannot see."""
-        f = self._f
-        for speed in CHECKED_SPEEDS if f.measured else (float(f.speed),):
-            for schedule in self._schedules:
-                table, G = design(f, schedule, speed, self._kind)
-                M = error_map(f, table, G, schedule)
-                radius = spectral_radius(M)
-                self.spectral_radius = max(radius, self.spectral_radius)
-                if radius > 1.0 + MARGINAL and not allow_unstable:
-                    raise ValueError(
-                        f"{self.name}: the error grows by {radius:.6g} over a cycle of the "
-                        f"schedule at {speed:g} m/s (allow_unstable=True builds it all the same)"
-                    )
-                if abs(radius - 1.0) <= MARGINAL and not self.unobservable:
-                    self.unobservable = unobservable(M, self.names)
+    def check(self, f: Any) -> None:
+        """Refuse a filter that diverges; name what it cannot see.
+
+        f: the filter's record, or that of the same filter with its first slow sensor alone.
+        """
+        speeds = CHECKED_SPEEDS if f.measured else (float(f.speed),)
+        for speed, schedule in itertools.product(speeds, self._schedules):
+            M = self._designed(f, schedule, speed)[1]
+            radius = spectral_radius(M)
+            self.spectral_radius = max(radius, self.spectral_radius)
+            if abs(radius - 1.0) <= MARGINAL and not self.unobservable:
+                self.unobservable = unobservable(M, self.names)
         if self.unobservable:
             warnings.warn(
                 f"{self.name} cannot see: {'; '.join(self.unobservable)}",
                 UnobservableWarning,
-                stacklevel=4,
+                stacklevel=3,
             )
+
+    def _designed(self, f: Any, schedule: Schedule, speed: float) -> tuple[Array, Array]:
+        """The table of gains at a speed and the map of the error; ValueError if that grows."""
+        table, G = design(f, schedule, speed, self._kind)
+        M = error_map(f, table, G, schedule)
+        radius = spectral_radius(M)
+        if radius > 1.0 + MARGINAL and not self.allow_unstable:
+            raise ValueError(
+                f"{self.name}: its error grows by a factor of {radius:.6g} over a cycle of the "
+                f"schedule at {speed:g} m/s (allow_unstable=True builds it all the same)"
+            )
+        return table, M
+
+    def design_missing(self) -> None:
+        """Make the table of gains that compiled code has just asked for."""
+        self._design(int(self._f.wanted))
 
     def _design(self, cell: int) -> None:
         """Fill the table of gains of one cell."""
         f = self._f
         speed = float(f.low + cell * f.spacing) if f.measured else float(f.speed)
-        self._gains[cell] = design(f, self._schedules[-1], speed, self._kind)[0]
+        self.gains[cell] = self._designed(f, self._schedules[-1], speed)[0]
 
     def reset(
         self, sensors: Mapping[str, SlowSensor] | None = None, first: int = 0
@@ -159,44 +175,48 @@ class Estimator:
             s = SLOW_NAMES.index(name)
             f.phase[s] = whole_ticks(told.phase or 0.0, self.dt, f"the {name}'s phase")
             f.origin = f.phase[s]
-        begin_filter(self._filters, first)
+        begin_filter(self.filters, first)
 
     def step(self, fast: Array, packets: Array, count: int | None = None) -> None:
         """Take fast rows (k, FAST_WIDTH) and the first `count` packets (all if None).
 
-        Both C-contiguous float64 as in a `Record`; the rows follow the last ones taken.
+        The rows follow the last ones taken; the packets are ordered as in a `Record`.
         """
-        rows = len(fast)
-        self._advance(fast, rows, packets, len(packets) if count is None else count)
+        fast = np.ascontiguousarray(fast, np.float64)
+        packets = np.ascontiguousarray(packets, np.float64)
+        _check_shape("fast rows", fast, FAST_WIDTH)
+        _check_shape("packets", packets, PACKET_WIDTH)
+        self.take(fast, len(fast), packets, len(packets) if count is None else count)
 
-    def _advance(
+    def take(
         self,
         fast: Array,
         rows: int,
         packets: Array,
         count: int,
-        X: Array = np.zeros((0, 1)),
-        S: Array = np.zeros((0, 1)),
+        X: Array = _NOTHING,
+        S: Array = _NOTHING,
     ) -> None:
+        """`step` without any checks: the first rows and packets of C-contiguous float64 arrays.
+
+        X, S: (rows, n), to be filled with states and standard deviations, or empty.
+        """
         advance = entries()[0]
-        done = advance(self._filters, self._gains, fast, rows, packets, count, 0, X, S)
+        done = advance(self.filters, self.gains, fast, rows, packets, count, 0, X, S)
         while done < rows:
-            self._design(int(self._f.wanted))
-            done = advance(self._filters, self._gains, fast, rows, packets, count, done, X, S)
+            self.design_missing()
+            done = advance(self.filters, self.gains, fast, rows, packets, count, done, X, S)
 
     def predict(self, fast_row: npt.ArrayLike) -> None:
         """Take one fast row: from the last tick to this one, with the gyro."""
-        row = np.ascontiguousarray(fast_row, np.float64).reshape(1, -1)
-        if row.shape[1] != FAST_WIDTH:
-            raise ValueError(f"a fast row has {FAST_WIDTH} columns, got {row.shape[1]}")
-        self._advance(row, 1, np.empty((0, PACKET_WIDTH)), 0)
+        self.step(np.atleast_2d(np.asarray(fast_row, np.float64)), _NO_PACKETS)
 
     def update(self, packet: npt.ArrayLike) -> None:
         """Take one packet that is here now, after the fast row of this tick."""
         values = np.ascontiguousarray(packet, np.float64)
         if values.shape != (PACKET_WIDTH,):
             raise ValueError(f"a packet has shape ({PACKET_WIDTH},), got {values.shape}")
-        entries()[1](self._filters, self._gains, values)
+        entries()[1](self.filters, self.gains, values)
 
     def run(self, source: Log | Record) -> Estimates:
         """Reset, then filter a whole record.
@@ -218,8 +238,16 @@ class Estimator:
         packets = np.ascontiguousarray(record.packets, np.float64)
         n = len(self.names)
         X, S = np.empty((len(fast), n)), np.empty((len(fast), n))
-        self._advance(fast, len(fast), packets, len(packets), X, S)
+        self.take(fast, len(fast), packets, len(packets), X, S)
         return Estimates(record.ticks * record.dt, X, S, self.names)
+
+    def get_state(self) -> Any:
+        """A snapshot that `set_state` continues from, bit for bit."""
+        return self.filters.copy()
+
+    def set_state(self, snapshot: Any) -> None:
+        """Go back to a snapshot of this estimator or of one built with the same arguments."""
+        self.filters[:] = snapshot
 
     @property
     def x(self) -> Array:
@@ -232,10 +260,10 @@ class Estimator:
         f, n = self._f, len(self.names)
         if not f.periodic:
             return np.array(f.P[:n, :n])
-        if self._gains[f.cell, 0, 0] == 0.0:
+        if self.gains[f.cell, 0, 0] == 0.0:
             self._design(int(f.cell))
         P = np.zeros((n, n))
-        P[np.triu_indices(n)] = self._gains[f.cell, 1 + f.at, f.total :]
+        P[np.triu_indices(n)] = self.gains[f.cell, 1 + f.at, f.total :]
         return P + np.triu(P, 1).T
 
     @property
@@ -255,6 +283,11 @@ class Estimator:
 
     def __repr__(self) -> str:
         return f"<{self.name}: {', '.join(self.names)} at tick {self.tick}>"
+
+
+def _check_shape(what: str, array: Array, width: int) -> None:
+    if array.ndim != 2 or array.shape[1] != width:
+        raise ValueError(f"{what} have shape (k, {width}), got {array.shape}")
 
 
 def _clockless(sensor: SlowSensor) -> SlowSensor:

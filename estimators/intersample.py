@@ -36,9 +36,9 @@ def inverse(kind: str, C: Array, P: Array) -> Array:
 
 
 def constant_gain(K_fast: Array, K_slow: Array, steps: int) -> Array:
-    """One gain for every tick from the multirate filter's gains over a period, (size, 1 + p).
+    """One gain for every tick from the multirate filter's gains over a period, (N, 1 + p).
 
-    K_fast: (steps, size) gyro gains. K_slow: (p, size), gains of the slow rows at a sample. Every
+    K_fast: (steps, N) gyro gains. K_slow: (p, N), gains of the slow rows at a sample. Every
     tick of the frame corrects by a pseudo-residual, so each takes its even share of the gain that
     the multirate filter applies at once.
     """
@@ -63,39 +63,42 @@ def correct_between(f: Any, gains: Any, s: int, residual: Any) -> None:
     gains: in the present table, rows of K^T and then of the inverse's transpose stand behind those
     of the steps and frames.
     """
-    size, x, e = f.total, f.x, f.e
-    first = 1 + f.cycle + f.rows[s] * f.pattern
+    x, e, N, cell = f.x, f.e, f.total, f.cell
+    first, rows = 1 + f.cycle + f.rows[s] * f.pattern, f.rows[s]
     f.eps[0] = residual
     ahead = 0.0
     for k in range(f.n):
         ahead += f.gyro[k] * e[k]
-    for i in range(f.rows[s]):
+    for i in range(rows):
         f.expected[i] = _slow_row(f, s, i, x)
         f.eps[1 + i] = _slow_row(f, s, i, e)  # tie-vision (22): C G e
-    for j in range(size):
-        x[j] += gains[f.cell, first, j] * residual
-        e[j] -= gains[f.cell, first, j] * ahead  # (21): (I - K C) G e
-    for i in range(f.rows[s]):
-        for j in range(size):
-            step = gains[f.cell, first + 1 + i, j] * f.eps[1 + i]
-            x[j] += step
-            e[j] -= step
+    for j in range(N):
+        K = gains[cell, first, j]
+        x[j] += K * residual
+        e[j] -= K * ahead  # (21): (I - K C) G e
+    for i in range(rows):
+        eps = f.eps[1 + i]
+        for j in range(N):
+            K = gains[cell, first + 1 + i, j]
+            x[j] += K * eps
+            e[j] -= K * eps
 
 
 @jit
 def correct_sample(f: Any, gains: Any, s: int, values: Any) -> None:
     """A sample has come in this tick: real residuals replace the pseudo ones, and e starts anew."""
-    size, rows = f.total, f.rows[s]
+    N, rows, cell = f.total, f.rows[s], f.cell
     first = 1 + f.cycle + rows * f.pattern
     for i in range(rows):
         real = values[i] - f.expected[i]  # tie-vision (19)
         if f.angle[s, i] == 1:
             real = wrap(real)
-        for j in range(size):
-            f.x[j] += gains[f.cell, first + 1 + i, j] * (real - f.eps[1 + i])
+        for j in range(N):
+            f.x[j] += gains[cell, first + 1 + i, j] * (real - f.eps[1 + i])
         f.eps[1 + i] = real
-    for j in range(size):  # (20): e = (C^+ - K) eps
+    for j in range(N):  # (20): e = (C^+ - K) eps
         total = 0.0
         for i in range(1 + rows):
-            total += (gains[f.cell, first + 1 + rows + i, j] - gains[f.cell, first + i, j]) * f.eps[i]
+            inverse, K = gains[cell, first + 1 + rows + i, j], gains[cell, first + i, j]
+            total += (inverse - K) * f.eps[i]
         f.e[j] = total

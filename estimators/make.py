@@ -14,9 +14,10 @@ from . import intersample
 from .delay import RULES, place_clones
 from .estimator import Estimator
 from .memory import FILTER
-from .models import SLOWEST, SMOOTHING_TIME, UNITS, Model, states_for, write_model
+from .models import SLOWEST, SMOOTHING_TIME, Model, states_for, write_model
 from .papers import FILTERS, Filter
-from .schedule import NO_SENSOR, schedules, whole_ticks
+from .schedule import NO_SENSOR, Schedule, schedules, whole_ticks
+from .tunings import TUNINGS
 
 Array = npt.NDArray[np.float64]
 
@@ -72,40 +73,54 @@ def make_estimator(
         hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(FILTERS)}"
         raise ValueError(f"unknown estimator {name!r}; {hint}")
     row, there = FILTERS[name], dict(sensors or {})
-    told = _Options(name, options)
-    used = _slow_sensors(name, row, there, told.take("slow", None))
-    model = Model(states_for(tuple(used)), row.disturbances)
     if not dt > 0.0:
         raise ValueError(f"{name}: a tick of {dt!r} s")
-    single = row.intersample == "single-rate"
+    told = _Options(name, options)
+    used = _slow_sensors(name, row, there, told.take("slow", None))
+    model = Model(states_for(used), row.disturbances)
     rule = told.one_of("delay", row.delay, RULES)
     kind = told.one_of("inverse", intersample.INVERSES[0], intersample.INVERSES)
     wish = told.one_of("gains", "", ("", "periodic", "covariance"))
-    filters = np.zeros(1, FILTER).view(np.recarray)
-    f = filters[0]
-    for sensor in used:
-        f.period[SLOW_NAMES.index(sensor)] = whole_ticks(
-            there[sensor].period, dt, f"{name}: the {sensor}'s period"
-        )
-    f.stride = int(f.period.max()) if single else 1
-    tuning = row.tuning(name, ",".join(used)) if row.disturbances != "forces" else {}
+    tuning = TUNINGS.get((name, ",".join(used)), {})
     Q = _process_noise(name, model, tuning, told)
-    noise = _noise(name, told)
-    write_model(f, model, vehicle_from(vehicle), f.stride * dt, noise, Q)
-    place_clones(f, {sensor: there[sensor] for sensor in used}, rule, name)
-    _prior(name, f, model, noise, told.take("prior", {}))
-    _speed(name, f, speed, dt)
-    plans = _plans(name, f, used, there, dt)
-    f.cycle, f.pattern = plans[-1].cycle, max(1, len(plans[-1].lags))
-    f.pseudo = int(row.intersample == "pseudo-residual")
-    f.periodic = int(_periodic(name, f, row, wish, used, len(plans)))
-    if f.measured and f.periodic:
-        f.low, f.high, f.spacing = SLOWEST, FASTEST, SPACING
+    noise = _noise(name, row, told)
+    prior = _prior(name, model, noise, told.take("prior", {}))
     unstable = bool(told.take("allow_unstable", False))
     told.done()
-    units = tuple(UNITS[state] for state in model.names)
-    slow = {sensor: there[sensor] for sensor in used}
-    return Estimator(name, model.names, units, dt, filters, slow, plans, kind, unstable)
+    car = vehicle_from(vehicle)
+
+    def memory(sensors_used: tuple[str, ...]) -> tuple[Any, tuple[Schedule, ...]]:
+        """The filter's record with some of its slow sensors, and their schedules."""
+        filters = np.zeros(1, FILTER).view(np.recarray)
+        f = filters[0]
+        slow = {sensor: there[sensor] for sensor in sensors_used}
+        _clocks(name, f, row, slow, dt)
+        write_model(f, model, car, f.stride * dt, noise, Q)
+        f.prior[: len(prior), : len(prior)] = np.diag(prior)
+        place_clones(f, slow, rule, name)
+        _speed(name, f, speed, dt)
+        plans = _plans(f, slow, dt)
+        f.cycle, f.pattern = plans[-1].cycle, max(1, len(plans[-1].lags))
+        f.pseudo = int(row.intersample == "pseudo-residual")
+        f.periodic = int(_periodic(name, f, row, wish, len(used), len(plans)))
+        if f.measured and f.periodic:
+            f.low, f.high, f.spacing = SLOWEST, FASTEST, SPACING
+        return filters, plans
+
+    filters, plans = memory(used)
+    checked, _ = (filters, plans) if len(used) < 2 else memory(used[:1])
+    estimator = Estimator(
+        name,
+        model.names,
+        dt,
+        filters,
+        {sensor: there[sensor] for sensor in used},
+        plans,
+        kind,
+        unstable,
+    )
+    estimator.check(checked[0])
+    return estimator
 
 
 class _Options:
@@ -113,6 +128,9 @@ class _Options:
 
     def __init__(self, name: str, options: Mapping[str, Any]) -> None:
         self.name, self._left, self._known = name, dict(options), list[str]()
+
+    def has(self, key: str) -> bool:
+        return key in self._left
 
     def take(self, key: str, default: Any) -> Any:
         self._known.append(key)
@@ -196,29 +214,23 @@ def _covariance(what: str, M: Array) -> None:
         raise ValueError(f"{what} is indefinite: its least eigenvalue is {least:.3g}")
 
 
-def _noise(name: str, told: _Options) -> dict[str, float]:
+def _noise(name: str, row: Filter, told: _Options) -> dict[str, float]:
     """Standard deviations as `write_model` takes them."""
-    course = told.take("course_noise", None)
-    noise = {
-        key.removesuffix("_noise"): told.positive(key, default)
-        for key, default in NOISE.items()
-        if key != "course_noise"
-    }
-    noise["course"] = NOISE["course_noise"]
-    if course is not None:
-        noise["course_fixed"] = _Options(name, {"course_noise": course}).positive(
-            "course_noise", 0.0
-        )
-    if FILTERS[name].disturbances == "forces":
+    noise = {}
+    for key, default in NOISE.items():
+        if key == "course_noise" and told.has(key):
+            noise["course_fixed"] = told.positive(key, default)
+        noise[key.removesuffix("_noise")] = told.positive(key, default)
+    if row.disturbances == "forces":
         keys = zip(("force", "moment", "time"), DISTURBANCE.items(), strict=True)
         noise |= {short: told.positive(key, default) for short, (key, default) in keys}
     return noise
 
 
 def _prior(
-    name: str, f: Any, model: Model, noise: Mapping[str, float], prior: Mapping[str, float]
-) -> None:
-    """The states' covariance at the start."""
+    name: str, model: Model, noise: Mapping[str, float], prior: Mapping[str, float]
+) -> list[float]:
+    """The states' variances at the start."""
     sd = PRIOR | {"F_d": noise.get("force", 0.0), "N_d": noise.get("moment", 0.0)}
     for state, value in prior.items():
         if state not in model.names:
@@ -226,8 +238,16 @@ def _prior(
         if not (float(value) >= 0.0 and math.isfinite(value)):
             raise ValueError(f"{name}: the prior of {state} is a standard deviation, got {value!r}")
         sd[state] = float(value)
-    for i, state in enumerate(model.names):
-        f.prior[i, i] = sd[state] ** 2
+    return [sd[state] ** 2 for state in model.names]
+
+
+def _clocks(
+    name: str, f: Any, row: Filter, slow: Mapping[str, SlowSensor], dt: float
+) -> None:
+    for sensor, link in slow.items():
+        what = f"{name}: the {sensor}'s period"
+        f.period[SLOW_NAMES.index(sensor)] = whole_ticks(link.period, dt, what)
+    f.stride = int(f.period.max()) if row.intersample == "single-rate" else 1
 
 
 def _speed(name: str, f: Any, speed: float | None, dt: float) -> None:
@@ -238,19 +258,16 @@ def _speed(name: str, f: Any, speed: float | None, dt: float) -> None:
     f.smoothing = 1.0 - math.exp(-dt / SMOOTHING_TIME)
 
 
-def _plans(
-    name: str, f: Any, used: tuple[str, ...], there: Mapping[str, SlowSensor], dt: float
-) -> Any:
+def _plans(f: Any, slow: Mapping[str, SlowSensor], dt: float) -> tuple[Schedule, ...]:
     """The schedules of the first slow sensor: one, or two extremes where delays are random."""
-    if not used:
+    if not slow:
         return (NO_SENSOR,)
-    frames = int(f.frames[SLOW_NAMES.index(used[0])])
-    return schedules(used[0], there[used[0]], dt, int(f.stride), frames)
+    name, sensor = next(iter(slow.items()))
+    frames = int(f.frames[SLOW_NAMES.index(name)])
+    return schedules(name, sensor, dt, int(f.stride), frames)
 
 
-def _periodic(
-    name: str, f: Any, row: Filter, wish: str, used: tuple[str, ...], plans: int
-) -> bool:
+def _periodic(name: str, f: Any, row: Filter, wish: str, used: int, plans: int) -> bool:
     """Whether the gains are precomputed; ValueError where that was asked for and cannot be."""
     if f.pseudo:
         if wish == "covariance":
@@ -258,9 +275,9 @@ def _periodic(
         if f.frames.max() > 1:
             raise ValueError(f"{name}: a sample must arrive before the next one is captured")
         return True
-    if len(used) > 1 or plans > 1:
+    if used > 1 or plans > 1:
         if wish == "periodic":
-            why = "two slow sensors" if len(used) > 1 else "random delay"
+            why = "two slow sensors" if used > 1 else "random delay"
             raise ValueError(f"{name}: no periodic gains with {why}; use gains='covariance'")
         return False
     return (wish or row.gains) == "periodic"

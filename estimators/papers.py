@@ -1,11 +1,10 @@
 """Every filter of the papers and its rivals: a row of a table.
 
-A filter is a model x a rule between slow samples x a rule for late ones x a tuning.
+A filter is a model x a rule between slow samples x a rule for late ones x a tuning. The model has
+the states that the gyro and the slow sensor measure, the tuning stands in `tunings.py`.
 """
 
 from dataclasses import dataclass
-
-from .tunings import TUNINGS
 
 
 @dataclass(frozen=True)
@@ -23,10 +22,6 @@ class Filter:
     disturbances: str
     delay: str
     source: str
-
-    def tuning(self, name: str, slow: str) -> dict[str, float]:
-        """Process noise per second, (unit of the state)^2 / s, by state."""
-        return dict(TUNINGS[name, slow])
 
 
 ANY = ("camera", "gps")

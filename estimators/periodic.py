@@ -17,7 +17,6 @@ from .covariance import measure_clone, measure_state
 from .delay import DIRECT, DROPPED, find
 from .intersample import constant_gain, inverse
 from .memory import Filters
-from .models import build
 from .schedule import Schedule
 
 Array = npt.NDArray[np.float64]

@@ -5,10 +5,9 @@ error of beta (Nelder-Mead on the logarithms, from several starts, at least 1e-8
 seeds (1000 to 1011, apart from the test seeds) of linear simulations: tie-vision-fig7 for the
 filters of the camera and `bicycle-kf`, dakf-fig6 for those of the course. The minima are flat: half
 or double a number changes the error by a few per cent. Not from there: psi of the course filters
-(1e-8 would be 1 % better, but turn a gyro bias of 0.05 deg/s into an error of beta of 0.02 instead
-of 0.003 rad); `single-rate-kf` with the course, which at 5 Hz holds its estimate for so long that
-the optimum ignores the sensor; `exact-kf`, which knows its model, so that only the disturbances
-drive it.
+(as good as 1e-8 there, and a gyro bias turns beta less), `single-rate-kf` with the course (at 5 Hz
+it holds its estimate for so long that the optimum ignores the sensor) and `exact-kf` (it knows its
+model, so that only the disturbances drive it).
 """
 
 TUNINGS: dict[tuple[str, str], dict[str, float]] = {
@@ -21,9 +20,9 @@ TUNINGS: dict[tuple[str, str], dict[str, float]] = {
         "psi": 1.9e-4,
         "y_l": 6.7e-5,
     },
-    ("single-rate-kf", "gps"): {"beta": 1e-3, "gamma": 1e-2, "psi": 2e-6},
-    ("multirate-kf", "gps"): {"beta": 9.8e-3, "gamma": 6.9e-3, "psi": 2e-6},
-    ("multirate-residual-kf", "gps"): {"beta": 1.8e-2, "gamma": 1.4e-2, "psi": 2e-6},
-    ("course-kf", "gps"): {"beta": 9.8e-3, "gamma": 6.9e-3, "psi": 2e-6},
+    ("single-rate-kf", "gps"): {"beta": 1e-3, "gamma": 1e-2, "psi": 5e-8},
+    ("multirate-kf", "gps"): {"beta": 9.8e-3, "gamma": 6.9e-3, "psi": 5e-8},
+    ("multirate-residual-kf", "gps"): {"beta": 1.8e-2, "gamma": 1.4e-2, "psi": 5e-8},
+    ("course-kf", "gps"): {"beta": 9.8e-3, "gamma": 6.9e-3, "psi": 5e-8},
     ("dakf", "gps"): {"beta": 3.7e-4, "gamma": 4.2e-4, "psi": 1.2e-8, "d1": 3.3e-2, "d2": 0.21},
 }

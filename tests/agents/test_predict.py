@@ -41,7 +41,10 @@ def test_single_and_batch_agree_and_memory_is_outside(name: str, env: gym.Env[An
 
 def test_episode_start_clears_the_memory(env: gym.Env[Any, Any]) -> None:
     agent = make_agent("two-dof", env)
-    obs = np.full((2, env.observation_space.shape[0]), 0.01, np.float32)  # type: ignore[index]
+    obs = np.zeros((2, env.observation_space.shape[0]), np.float32)  # type: ignore[index]
+    names = [entry.name for entry in env.get_wrapper_attr("layout")]
+    obs[:, names.index("wheel_left")] = obs[:, names.index("wheel_right")] = 7.0
+    obs[:, names.index("beta_hat")] = 0.001
     _, state = agent.predict(obs)
     _, state = agent.predict(obs, state)
     fresh, _ = agent.predict(obs)

@@ -64,9 +64,7 @@ def test_summary_is_last_mean_newest_age_and_fresh(name: str, n: int) -> None:
     assert seen
 
 
-def test_late_and_doubled_packets_are_neither_new_nor_fresh(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_late_and_doubled_packets_are_not_fresh(monkeypatch: pytest.MonkeyPatch) -> None:
     camera = SlowSensor(period=0.010, delays=(0.0,), jitter=0.019, duplicate=0.5, phase=0.004)
     monkeypatch.setitem(SENSOR_SETS, "both", {"camera": camera, "gps": SlowSensor(period=0.05)})
     for n in (1, 4):

@@ -1,14 +1,11 @@
 """Manoeuvres over time: shapes of the steering, zero net heading, wind, and the held speed."""
 
-import math
-from typing import Any
-
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sideslip.envs import COMS, SCENARIOS, StabilityEnv
+from sideslip.envs import COMS, FAILURES, StabilityEnv
 from sideslip.envs.linear import bicycle
 from sideslip.envs.programme import (
     DRAWS_WIDTH,
@@ -24,10 +21,10 @@ from sideslip.envs.programme import (
     wind_at,
     write_steering,
 )
-from sideslip.envs.record import FAST, TICK
+from sideslip.envs.record import FAST, PACKET, TICK
 from sideslip.envs.template import car_of
 
-from .helpers import FULL, LINEAR, fast_rows, play
+from .helpers import FULL, LINEAR, fast_rows, packets, play
 
 pytestmark = pytest.mark.plain
 
@@ -61,10 +58,8 @@ def sine(start: float, hertz: float, t: np.ndarray) -> np.ndarray:
 
 def test_each_kind_is_what_its_name_says() -> None:
     t = np.arange(10_000) * TICK
-    smooth = np.clip(np.subtract.outer([0.5, 2.0, 3.5], -t).clip(0.0) * 0.0, 0.0, 1.0)
-    for i, start in enumerate((0.5, 2.0, 3.5)):
-        x = np.clip((t - start) / 0.2, 0.0, 1.0)
-        smooth[i] = 3.0 * x**2 - 2.0 * x**3
+    x = np.clip((t - [[0.5], [2.0], [3.5]]) / 0.2, 0.0, 1.0)
+    steps = 3.0 * x**2 - 2.0 * x**3
     one = sine(0.5, 0.4, t)
     expected = {
         "straight": 0.0 * t,
@@ -72,7 +67,7 @@ def test_each_kind_is_what_its_name_says() -> None:
         "lane-change": np.where(t < 0.5 + 2.5, 0.1 * one, 0.0),
         # half a wave of half the size, then the sine with the opposite sign
         "slalom": np.where(t < 0.5 + 1.25, 0.05 * one, -0.1 * sine(1.75, 0.4, t)),
-        "step": 0.1 * (smooth[0] - 2.0 * smooth[1] + smooth[2]),
+        "step": 0.1 * (steps[0] - 2.0 * steps[1] + steps[2]),
         "random": 0.1 * one
         - 0.1 * 0.5 / 0.4 * sine(0.5, 0.5, t)
         + 0.03 * sine(0.5, 0.2, t)
@@ -172,10 +167,12 @@ def test_a_car_starts_from_standstill(lags: bool) -> None:
     assert np.all(np.isfinite(obs))
     moments = play(env, [0.0] * 1000)
     v = moments[-1].record.fast[-1, FAST.wheel_left]
-    late = 0.005 if lags else 0.0  # the motors' lag
-    assert v == pytest.approx(10.0 - late, abs=1e-9)  # roundings of 10 000 sums up to 10 m/s
-    slow = [moment.record.packets[:, 3] for moment in moments[:99]]
-    assert not np.concatenate(slow).any()  # below 1 m/s a course has quality 0
+    late = 0.005 if lags else 0.0  # m/s, the motors' lag
+    # Simpson's error, (1/5)^4 / 2880 of what the lag costs; roundings are below 1e-11
+    assert v == pytest.approx(10.0 - late, abs=3e-9)
+    slow = packets(moments[:99])
+    assert len(slow) > 3
+    assert not slow[:, PACKET.quality].any()  # below 1 m/s
     assert info["beta"] == moments[-1].info["beta"] == 0.0
 
 
@@ -184,22 +181,5 @@ def test_a_car_driven_backwards_is_taken_for_a_spun_one_and_stays_finite() -> No
     env.reset(seed=0)
     moments = play(env, [0.1] * 1000)
     assert moments[-1].terminated
-    assert moments[-1].info["beta"] == pytest.approx(-math.pi, abs=1e-2) or (
-        moments[-1].info["beta"] == pytest.approx(math.pi, abs=1e-2)
-    )
-
-
-@pytest.mark.parametrize("name", SCENARIOS)
-@pytest.mark.parametrize("sensors", ["vision", "gps"])
-def test_every_scenario_stays_finite_under_hard_switching(name: str, sensors: str) -> None:
-    env: Any = StabilityEnv(sensors, scenario=name, control_period=100, reference="limited")
-    for seed in range(3):
-        obs, info = env.reset(seed=seed)
-        rng = np.random.default_rng(seed)
-        moments = play(env, rng.choice([-1.0, 1.0], 200))
-        for each in [obs, *[moment.obs for moment in moments]]:
-            assert env.observation_space.contains(each)
-        for each in [info, *[moment.info for moment in moments]]:
-            assert all(math.isfinite(value) for value in each.values())
-        assert np.all(np.isfinite(fast_rows(moments)))
-        assert moments[-1].terminated or moments[-1].truncated
+    assert FAILURES[moments[-1].info["failure"]] == "spin"
+    assert abs(moments[-1].info["beta"]) > 3.0

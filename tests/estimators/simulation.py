@@ -7,6 +7,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+
 from sideslip.envs.linear import vision
 from sideslip.envs.record import (
     FAST,

@@ -1,0 +1,302 @@
+"""EstimateObservation: an estimator's view beside, or instead of, the raw observation."""
+
+from collections.abc import Mapping, Sequence
+from functools import cache
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import numpy.typing as npt
+from gymnasium.utils import RecordConstructorArgs
+from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker
+
+from ..envs.backend import jit, maximum, minimum
+from ..envs.elementary import wrap
+from ..envs.layout import Entry
+from ..envs.vehicle import Vehicle, vehicle_from
+from .core import advance, covariance_of, deviation
+from .estimator import Estimator, entry
+from .make import make_estimator
+from .memory import FILTER
+from .models import UNITS
+
+BOUNDS = {
+    "beta": np.pi / 2.0,
+    "gamma": 10.0,
+    "psi": np.pi,
+    "y_l": 200.0,
+    "d1": 100.0,
+    "d2": 1000.0,
+    "F_d": 1e5,
+    "N_d": 1e5,
+}
+"""Estimates are clipped here, the heading is wrapped."""
+
+_TRUE = ("beta", "gamma")  # states whose truth stands in the info
+_MAY_STAND_BETWEEN = (PassiveEnvChecker, OrderEnforcing)
+_OFFERED = ("rows", "ticks_done", "packets", "delivered", "slow_sensors", "nominal", "layout")
+
+
+class EstimateObservation(
+    gym.Wrapper[npt.NDArray[np.float32], Any, npt.NDArray[np.float32], Any], RecordConstructorArgs
+):
+    """Runs an estimator on the car's record and appends what it says to the observation.
+
+    It must be the innermost wrapper: the estimator sees every tick of every step. Others of its
+    kind may be stacked, each with its own `name`.
+
+    estimator: a name of `make_estimator`. outputs: states to append, each as `<state>_hat`, then,
+    if `std`, each one's standard deviation as `<state>_std`. replace: the observation is these
+    alone. vehicle: what the estimator is told (a preset, a mapping; default the env's nominal).
+    options: of `make_estimator`. name: put before every name as `<name>_`.
+
+    `info` gains `beta_hat`, `beta_std` and, if beta or gamma is among the outputs, `nees`: their
+    normalised estimation error squared, divided by their number. `layout` describes the whole
+    observation; `estimator` is the estimator at work.
+
+    Raises TypeError if it is not the innermost wrapper or the env has no record; ValueError for an
+    unknown output, or where names would stand twice.
+    """
+
+    def __init__(
+        self,
+        env: gym.Env[Any, Any],
+        estimator: str = "dakf",
+        outputs: Sequence[str] = ("beta", "gamma"),
+        std: bool = True,
+        replace: bool = False,
+        vehicle: str | Mapping[str, Any] | Vehicle | None = None,
+        options: Mapping[str, Any] | None = None,
+        name: str | None = None,
+    ) -> None:
+        car = vehicle.to_dict() if isinstance(vehicle, Vehicle) else vehicle
+        RecordConstructorArgs.__init__(
+            self,
+            estimator=estimator,
+            outputs=list(outputs),
+            std=bool(std),
+            replace=bool(replace),
+            vehicle=dict(car) if isinstance(car, Mapping) else car,
+            options=dict(options or {}),
+            name=name,
+        )
+        gym.Wrapper.__init__(self, env)
+        self._base = _base_of(env)
+        self._kind, self._options = estimator, dict(options or {})
+        self._vehicle = None if vehicle is None else vehicle_from(vehicle)
+        self._told: Any = None
+        self.estimator: Estimator = self._current_estimator()
+        states = self.estimator.names
+        for output in outputs:
+            if output not in states:
+                raise ValueError(
+                    f"{estimator} has no state {output!r}; it has: {', '.join(states)}"
+                )
+        before = "" if name is None else f"{name}_"
+        self._keys = f"{before}beta_hat", f"{before}beta_std", f"{before}nees"
+        inner: tuple[Entry, ...] = () if replace else env.get_wrapper_attr("layout")
+        hats = [Entry(f"{before}{s}_hat", UNITS[s], -BOUNDS[s], BOUNDS[s]) for s in outputs]
+        stds = [Entry(f"{before}{s}_std", UNITS[s], 0.0, BOUNDS[s]) for s in outputs]
+        self.layout: tuple[Entry, ...] = (*inner, *hats, *(stds if std else ()))
+        names = [each.name for each in self.layout]
+        twice = sorted({each for each in names if names.count(each) > 1})
+        if twice:
+            raise ValueError(f"{', '.join(twice)} would stand twice; give this wrapper a name=...")
+        low, high = np.array([each[2:] for each in self.layout]).T.astype(np.float32)
+        self.observation_space = gym.spaces.Box(low, high, dtype=np.float32)
+        self._kept, self._width = len(inner), len(self.layout)
+        judged = [s in _TRUE for s in outputs]
+        columns = [states.index(s) for s in outputs], [s == "psi" for s in outputs], judged
+        self._plan = np.array(columns, np.int64).T.copy()
+        self._limits = high[self._kept : self._kept + len(outputs)].astype(np.float64)
+        self._judges = any(judged)
+        self._said = np.zeros(3)
+
+    def _current_estimator(self) -> Estimator:
+        """The estimator for what the env tells now; the one at hand where nothing changed."""
+        base = self._base
+        vehicle = base.nominal if self._vehicle is None else self._vehicle
+        speed = getattr(base, "held_speed", None)
+        clocks = {name: (s.period, s.delays, s.jitter) for name, s in base.slow_sensors.items()}
+        told = vehicle, clocks, speed
+        if told != self._told:
+            self.estimator = make_estimator(
+                self._kind,
+                vehicle=vehicle,
+                sensors=base.slow_sensors,
+                dt=base.dt,
+                speed=speed,
+                **self._options,
+            )
+            self._told = told
+        return self.estimator
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[npt.NDArray[np.float32], dict[str, Any]]:
+        """Reset the env, then the estimator with this episode's clocks, and take tick 0."""
+        obs, info = self.env.reset(seed=seed, options=options)
+        self._current_estimator().reset(self._base.slow_sensors)
+        return self._observed(obs, info), info
+
+    def step(
+        self, action: Any
+    ) -> tuple[npt.NDArray[np.float32], Any, bool, bool, dict[str, Any]]:
+        """One env-step, whose record the estimator takes before the observation is made."""
+        obs, reward, terminated, truncated, info = self.env.step(action)
+        return self._observed(obs, info), reward, terminated, truncated, info
+
+    def get_state(self) -> dict[str, Any]:
+        """A snapshot of the env and the estimator that `set_state` continues from."""
+        inner = self.env.get_wrapper_attr("get_state")()
+        return {"env": inner, "estimator": self.estimator.get_state()}
+
+    def set_state(self, snapshot: Mapping[str, Any]) -> None:
+        """Go back to a snapshot of this env or of one built with the same arguments."""
+        self.env.get_wrapper_attr("set_state")(snapshot["env"])
+        self._current_estimator().set_state(snapshot["estimator"])
+
+    def _observed(
+        self, obs: npt.NDArray[np.float32], info: dict[str, Any]
+    ) -> npt.NDArray[np.float32]:
+        base, estimator = self._base, self.estimator
+        out, said, rows, done = np.empty(self._width, np.float32), self._said, base.ticks_done, 0
+        while True:
+            done = _entry()(
+                estimator.filters,
+                estimator.gains,
+                base.rows,
+                rows,
+                base.packets,
+                base.delivered,
+                done,
+                obs,
+                self._kept,
+                self._plan,
+                self._limits,
+                info["beta"],
+                info["gamma"],
+                out,
+                said,
+            )
+            if done == rows:
+                break
+            estimator.design_missing()
+        hat, std, nees = said.tolist()
+        keys = self._keys
+        info[keys[0]], info[keys[1]] = hat, std
+        if self._judges:
+            info[keys[2]] = nees
+        base.annotate(**{keys[0]: hat})
+        return out
+
+
+def _base_of(env: gym.Env[Any, Any]) -> Any:
+    """The base env; TypeError if anything that may hide ticks from the estimator is in between."""
+    layer = env
+    while isinstance(layer, gym.Wrapper):
+        if not isinstance(layer, (*_MAY_STAND_BETWEEN, EstimateObservation)):
+            raise TypeError(
+                "EstimateObservation must be the innermost wrapper, directly around the "
+                f"environment; inside it is {type(layer).__name__}"
+            )
+        layer = layer.env
+    missing = [name for name in _OFFERED if not hasattr(layer, name)]
+    if missing:
+        raise TypeError(
+            f"EstimateObservation reads the record of a sideslip environment; "
+            f"{type(layer).__name__} has no {', '.join(missing)}"
+        )
+    return layer
+
+
+@jit
+def _clipped(value: Any, limit: Any) -> Any:
+    return minimum(maximum(value, 0.0 - limit), limit)
+
+
+@jit
+def _nees(f: Any, gains: Any, beta: Any, gamma: Any, both: Any, first: int) -> Any:
+    """e^T P^-1 e of beta and gamma, or of the state `first` of them, per state; 0 if P is singular.
+
+    beta, gamma: the true ones.
+    """
+    a, b = f.x[0] - beta, f.x[1] - gamma
+    p, q = covariance_of(f, gains, 0, 0), covariance_of(f, gains, 1, 1)
+    if both:
+        r = covariance_of(f, gains, 0, 1)
+        det = p * q - r * r
+        return 0.5 * (a * a * q - 2.0 * a * b * r + b * b * p) / det if det > 0.0 else 0.0
+    if first == 1:
+        a, p = b, q
+    return a * a / p if p > 0.0 else 0.0
+
+
+@jit
+def observe(
+    filters: Any,
+    gains: Any,
+    fast: Any,
+    rows: int,
+    packets: Any,
+    count: int,
+    start: int,
+    obs: Any,
+    kept: int,
+    plan: Any,
+    limits: Any,
+    beta: float,
+    gamma: float,
+    out: Any,
+    said: Any,
+) -> int:
+    """`advance`, then the first `kept` entries of obs and the outputs into out.
+
+    plan: (m, 3), each output's state, whether it is wrapped and whether its truth is known.
+    limits: (m,). out: kept + m entries, or kept + 2 m with standard deviations. said: beta, its
+    standard deviation and the nees. Returns the rows done, as `advance` does.
+    """
+    f = filters[0]
+    done = advance(f, gains, fast, rows, packets, count, start, fast[:0], fast[:0])
+    if done < rows:
+        return done
+    for i in range(kept):
+        out[i] = obs[i]
+    m, judged, first = len(plan), 0, 0
+    for i in range(m):
+        state = plan[i, 0]
+        value = f.x[state]
+        if plan[i, 1] == 1:
+            value = wrap(value)
+        out[kept + i] = _clipped(value, limits[i])
+        if len(out) > kept + m:
+            out[kept + m + i] = _clipped(deviation(f, gains, state), limits[i])
+        if plan[i, 2] == 1:
+            judged, first = judged + 1, state
+    said[0], said[1] = f.x[0], deviation(f, gains, 0)
+    said[2] = _nees(f, gains, beta, gamma, judged == 2, first) if judged > 0 else 0.0
+    return done
+
+
+@cache
+def _entry() -> Any:
+    """`observe` as a plain call."""
+    small, wide, matrix = np.zeros(1, np.float32), np.zeros(1), np.zeros((1, 1))
+    return entry(
+        observe,
+        np.zeros(1, FILTER),
+        np.zeros((1, 1, 1)),
+        matrix,
+        0,
+        matrix,
+        0,
+        0,
+        small,
+        0,
+        np.zeros((1, 3), np.int64),
+        wide,
+        0.0,
+        0.0,
+        small,
+        wide,
+    )

@@ -1,0 +1,187 @@
+"""Bad input is refused at the border, names the thing, and steps nothing."""
+
+import math
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+
+from sideslip.envs import FAILURES, StabilityEnv
+
+from .helpers import LINEAR, bits, play
+
+pytestmark = pytest.mark.plain
+
+Arguments = dict[str, Any]
+ARGUMENTS: list[tuple[Arguments, type[Exception], str]] = [
+    (
+        {"sensors": "radar"},
+        ValueError,
+        "unknown sensors 'radar'; known: vision, ",
+    ),
+    ({"scenario": "slalon"}, ValueError, "unknown scenario 'slalon'; known: straight"),
+    ({"scenario": {"speeed": 1.0}}, TypeError, "unknown scenario field 'speeed'"),
+    ({"scenario": {"duration": -1.0}}, ValueError, "'custom': duration -1.0"),
+    ({"vehicle": "comms"}, ValueError, "unknown vehicle 'comms'; known: coms"),
+    (
+        {"vehicle": {"base": "coms", "mass": 0.0}},
+        ValueError,
+        "Vehicle.mass: 0.0 kg is not",
+    ),
+    ({"vehicle": {"base": "coms", "mass": math.nan}}, ValueError, "Vehicle.mass: nan kg"),
+    ({"vehicle": {"base": "coms", "masss": 1.0}}, TypeError, "unknown vehicle parameter 'masss'"),
+    ({"nominal": "comms"}, ValueError, "unknown vehicle 'comms'"),
+    ({"control_period": 0}, ValueError, "control_period is 1 to 1000 ticks, got 0"),
+    ({"control_period": 1001}, ValueError, "control_period is 1 to 1000 ticks, got 1001"),
+    ({"control_period": 10.0}, TypeError, "control_period is a number of ticks, got 10.0"),
+    ({"control_period": True}, TypeError, "control_period is a number of ticks, got True"),
+    (
+        {"reference": "slip"},
+        ValueError,
+        "unknown reference 'slip'; known: zero-slip",
+    ),
+    ({"fast": "some"}, ValueError, "fast is 'summary' or 'all', got 'some'"),
+    ({"on_bad_action": "shrug"}, ValueError, "on_bad_action is 'raise' or 'fail', got 'shrug'"),
+    ({"render_mode": "human"}, TypeError, "unknown render_mode 'human'"),
+    ({"gps": {"period": 0.1}}, ValueError, "this id has no gps; it has: camera"),
+    ({"camera": {"perriod": 0.1}}, TypeError, "perriod"),
+    ({"camera": {"period": -0.1}}, ValueError, "period must be at least one tick, got -0.1"),
+    (
+        {"camera": {"delays": [0.3]}},
+        ValueError,
+        "10 packets under way at once; .* room for 8",
+    ),
+    ({"estimator": "dakf"}, TypeError, "estimator"),
+]
+
+
+@pytest.mark.smoke
+@pytest.mark.parametrize(("arguments", "error", "message"), ARGUMENTS, ids=str)
+def test_arguments(arguments: Arguments, error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message):
+        StabilityEnv(**arguments)
+
+
+def test_a_camera_argument_on_the_gps_id() -> None:
+    with pytest.raises(ValueError, match="this id has no camera; it has: gps"):
+        gymnasium.make("sideslip/YawGps-v0", camera={"period": 0.05})
+
+
+OPTIONS: list[tuple[Arguments, type[Exception], str]] = [
+    ({"speed": 5.0}, ValueError, "unknown reset option speed; known: scenario, vehicle, friction"),
+    ({"state": {"beta": 0.1}}, ValueError, "unknown state beta; known: v_x, v_y, gamma"),
+    ({"state": {"v_y": math.nan}}, ValueError, "reset option state: v_y is nan"),
+    ({"state": {"v_x": math.inf}}, ValueError, "reset option state: v_x is inf"),
+    ({"state": {"X": 1e300}}, ValueError, "reset option state: X is 1e\\+300, not a number up to"),
+    ({"scenario": "slalon"}, ValueError, "unknown scenario 'slalon'"),
+    ({"vehicle": "comms"}, ValueError, "unknown vehicle 'comms'"),
+    ({"friction": 0.0}, ValueError, "friction must be positive"),
+    ({"friction": math.nan}, ValueError, "friction nan"),
+    ({"duration": 0.0}, ValueError, "duration 0.0"),
+    ({"scenario": {"camera_delays": [0.3]}}, ValueError, "under way at once"),
+]
+
+
+@pytest.mark.smoke
+@pytest.mark.parametrize(("options", "error", "message"), OPTIONS, ids=str)
+def test_a_refused_reset_leaves_the_episode_running(
+    options: Arguments, error: type[Exception], message: str
+) -> None:
+    env, untouched = StabilityEnv(), StabilityEnv()
+    for each in (env, untouched):
+        each.reset(seed=0)
+        play(each, [0.2] * 5)
+    with pytest.raises(error, match=message):
+        env.reset(seed=1, options=options)
+    assert bits(env.np_random.bit_generator.state) == bits(untouched.np_random.bit_generator.state)
+    assert env.scenario.name == "random-steering"
+    assert bits(play(env, [0.2] * 20)) == bits(play(untouched, [0.2] * 20))
+
+
+ACTIONS: list[tuple[Any, str]] = [
+    (np.array([np.nan], np.float32), r"action \[nan\] is not finite; nothing was stepped"),
+    (np.array([np.inf], np.float32), r"action \[inf\] is not finite; nothing was stepped"),
+    (0.5, r"an action has shape \(1,\), got shape \(\)"),
+    (np.zeros(2, np.float32), r"an action has shape \(1,\), got shape \(2,\)"),
+    (np.zeros((1, 1), np.float32), r"an action has shape \(1,\), got shape \(1, 1\)"),
+    (np.zeros(0, np.float32), r"an action has shape \(1,\), got shape \(0,\)"),
+    (["left"], "could not convert"),
+]
+
+
+@pytest.mark.smoke
+@pytest.mark.parametrize(("action", "message"), ACTIONS, ids=str)
+def test_a_bad_action_steps_nothing(action: Any, message: str) -> None:
+    env, untouched = StabilityEnv(), StabilityEnv()
+    for each in (env, untouched):
+        each.reset(seed=0)
+        play(each, [0.2] * 5)
+    with pytest.raises(ValueError, match=message):
+        env.step(action)
+    assert bits(env.record) == bits(untouched.record)
+    assert bits(env.get_state()["state"]) == bits(untouched.get_state()["state"])
+    assert bits(play(env, [0.2] * 20)) == bits(play(untouched, [0.2] * 20))
+
+
+def test_a_wrong_shape_is_refused_whatever_on_bad_action_says() -> None:
+    env = StabilityEnv(on_bad_action="fail")
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="an action has shape"):
+        env.step(np.zeros(2, np.float32))
+    assert len(play(env, [0.0] * 3)) == 3
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_on_bad_action_fail_ends_the_episode_and_charges_the_rest(value: float) -> None:
+    env = StabilityEnv(scenario=LINEAR, on_bad_action="fail")
+    env.reset(seed=0)
+    before = play(env, [0.0] * 30)[-1]
+    obs, reward, terminated, truncated, info = env.step(np.array([value], np.float32))
+    assert (terminated, truncated) == (True, False)
+    assert FAILURES[info["failure"]] == "bad-action"
+    assert not info["is_success"]
+    assert reward == pytest.approx(-100.0 * (10.0 - 0.3), rel=1e-15)
+    assert info["t"] == before.info["t"]  # nothing was stepped
+    assert env.observation_space.contains(obs)
+    assert len(env.record.fast) == len(env.record.packets) == 0
+    assert all(math.isfinite(number) for number in info.values())
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.step(np.zeros(1, np.float32))
+    assert env.reset()[1]["failure"] == 0
+
+
+@pytest.mark.smoke
+def test_step_before_reset() -> None:
+    with pytest.raises(gymnasium.error.ResetNeeded, match=r"never started: call reset\(\) first"):
+        StabilityEnv().step(np.zeros(1, np.float32))
+
+
+@pytest.mark.smoke
+@pytest.mark.parametrize("end", ["time", "failure"])
+def test_step_after_the_end(end: str) -> None:
+    env = StabilityEnv()
+    options: Arguments = {"duration": 0.05} if end == "time" else {"state": {"y": 60.0}}
+    env.reset(seed=0, options=options)
+    last = play(env, [0.0] * 10)[-1]
+    assert (last.truncated, last.terminated) == (end == "time", end == "failure")
+    with pytest.raises(gymnasium.error.ResetNeeded, match="the episode is over"):
+        env.step(np.zeros(1, np.float32))
+
+
+def test_a_snapshot_of_another_kind_of_env_is_refused_and_changes_nothing() -> None:
+    env = StabilityEnv()
+    env.reset(seed=0)
+    before = bits(env.get_state()["state"])
+    others: list[tuple[Arguments, str]] = [
+        ({"control_period": 33}, "the snapshot has 33 ticks a step, this env 10"),
+        # without this check the kernel would write past the end of the observation
+        ({"sensors": "gps"}, "other sensors or another observation"),
+        ({"fast": "all"}, "other sensors or another observation"),
+    ]
+    for arguments, message in others:
+        other = StabilityEnv(**arguments)
+        other.reset(seed=1)
+        with pytest.raises(ValueError, match=message):
+            env.set_state(other.get_state())
+        assert bits(env.get_state()["state"]) == before

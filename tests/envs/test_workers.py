@@ -1,0 +1,94 @@
+"""Environments in other processes: spawned by hand, and by stable-baselines3's vector env."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from .helpers import IDS
+
+SPAWN = """
+import multiprocessing, pickle, sys
+import gymnasium, numpy
+
+def drive(env, name):
+    env = env or gymnasium.make(name)  # an id of the form "module:id" imports the package
+    obs, info = env.reset(seed=3)
+    rewards = [float(env.step(numpy.array([0.2], "f"))[1]) for _ in range(20)]
+    return obs.tobytes(), rewards, sys.modules["sideslip.envs"].__name__
+
+def work(sender, env, name):
+    sender.send(drive(env, name))
+
+if __name__ == "__main__":
+    import sideslip
+    for name in {ids}:
+        here = drive(None, name)
+        env = gymnasium.make(name).unwrapped
+        env.reset(seed=1)
+        for sent in (None, env):
+            receiver, sender = multiprocessing.Pipe()
+            context = multiprocessing.get_context("{method}")
+            worker = context.Process(target=work, args=(sender, sent, "sideslip:" + name))
+            worker.start()
+            assert receiver.recv() == here
+            worker.join()
+            assert worker.exitcode == 0
+    print("the same everywhere")
+"""
+
+SUBPROC = """
+import numpy
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+
+def drive(name, kind, how):
+    env = make_vec_env("sideslip:" + name, n_envs=2, seed=5, vec_env_cls=kind, vec_env_kwargs=how)
+    rows = [env.reset()]
+    for k in range(30):
+        obs, rewards, dones, infos = env.step(numpy.full((2, 1), 0.1 * k - 1.0, "f"))
+        rows += [obs, rewards.astype("f"), dones]  # one of the two keeps rewards in 32 bits
+    assert env.get_attr("control_period") == [10, 10]
+    env.close()
+    return [row.tobytes() for row in rows]
+
+if __name__ == "__main__":
+    for name in {ids}:
+        here = drive(name, DummyVecEnv, {})
+        assert drive(name, SubprocVecEnv, {"start_method": "{method}"}) == here
+    print("the same everywhere")
+"""
+
+
+def run(folder: Path, script: str, ids: tuple[str, ...], method: str) -> str:
+    """Run a script in a fresh interpreter that finds the same `sideslip`."""
+    path = folder / "script.py"
+    path.write_text(script.replace("{ids}", repr(ids)).replace("{method}", method))
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run(
+        [sys.executable, str(path)], cwd=folder, env=environment, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip()
+
+
+@pytest.mark.smoke
+def test_a_spawned_process_makes_unpickles_and_drives_the_same(tmp_path: Path) -> None:
+    assert run(tmp_path, SPAWN, IDS[:1], "spawn") == "the same everywhere"
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("method", ["spawn", "forkserver", "fork"])
+def test_so_does_every_id_and_way_of_starting(method: str, tmp_path: Path) -> None:
+    assert run(tmp_path, SPAWN, IDS, method) == "the same everywhere"
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("method", ["spawn", "forkserver"])
+def test_stable_baselines_subprocesses_equal_its_single_process(
+    method: str, tmp_path: Path
+) -> None:
+    pytest.importorskip("stable_baselines3")
+    assert run(tmp_path, SUBPROC, IDS, method) == "the same everywhere"
