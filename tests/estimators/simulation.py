@@ -7,6 +7,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.signal import lfilter
 
 from sideslip.envs.linear import vision
 from sideslip.envs.record import (
@@ -87,18 +88,17 @@ def simulate(
     t = np.arange(K + 1) * dt
     on = (t >= drive.onset) & ((t - drive.onset) * drive.frequency < drive.periods)
     steer = drive.amplitude * np.sin(2.0 * math.pi * drive.frequency * (t - drive.onset)) * on
-    ou = np.zeros((K + 1, 2))
     sd = np.array([50.0, 20.0]) * disturbed
     keep = math.exp(-dt / 0.3)
-    ou[0] = sd * rng.standard_normal(2)
-    fresh = math.sqrt(1.0 - keep * keep) * sd * rng.standard_normal((K + 1, 2))
+    drawn = sd * rng.standard_normal((K + 1, 2))
+    drawn[1:] *= math.sqrt(1.0 - keep * keep)
+    ou = lfilter([1.0], [1.0, -keep], drawn, axis=0)
     force, arm, start, end = drive.wind
     blowing = ((t >= start) & (t < end))[:, None] * np.array([force, force * arm])
+    acting = np.column_stack([steer, np.zeros((K + 1, 2)), ou + blowing]) @ H.T
     x = np.zeros((K + 1, 4))
     for k in range(K):
-        u = np.concatenate([[steer[k], 0.0, 0.0], ou[k] + blowing[k]])
-        x[k + 1] = G @ x[k] + H @ u
-        ou[k + 1] = keep * ou[k] + fresh[k]
+        x[k + 1] = G @ x[k] + acting[k]
     noisy = 0.0 if quiet else 1.0
     fast = np.zeros((K + 1, FAST_WIDTH))
     fast[:, FAST.gyro] = x[:, 1] + gyro_bias + noisy * 0.005 * rng.standard_normal(K + 1)

@@ -1,0 +1,189 @@
+"""Bad input is refused with a message that names the thing, or skipped and counted."""
+
+import numpy as np
+import pytest
+from sideslip.envs.record import FAST, PACKET, Log, Record, SlowSensor
+from sideslip.estimators import FILTERS, make_estimator
+
+from tests.estimators.simulation import CAMERA, FIG7, GPS, simulate
+
+pytestmark = pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning")
+
+BOTH = {"camera": CAMERA, "gps": GPS}
+SHORT = type(FIG7)(duration=0.3)
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "error", "message"),
+    [
+        ("multirate", {}, ValueError, "unknown estimator 'multirate'; did you mean"),
+        ("kalman9", {}, ValueError, "known: bicycle-kf"),
+        ("dakf", {"sensors": {"camera": CAMERA}}, ValueError, "dakf needs .* gps; there is: camera"),
+        ("dakf", {"sensors": None}, ValueError, "dakf needs the slow sensor gps; there is: none"),
+        ("multirate-kf", {"sensors": None}, ValueError, "multirate-kf needs .* camera or gps"),
+        ("multirate-kf", {"slow": "radar"}, ValueError, "multirate-kf can use camera or gps"),
+        ("dakf", {"slow": "camera"}, ValueError, "dakf can use gps"),
+        ("bicycle-kf", {"slow": "gps"}, ValueError, "bicycle-kf uses no slow sensor"),
+        ("bicycle-kf", {"q_psi": 1.0}, TypeError, "bicycle-kf has no option 'q_psi'"),
+        ("dakf", {"wibble": 1, "wobble": 2}, TypeError, "no option 'wibble', 'wobble'; it has: .*Q"),
+        ("dakf", {"force_sd": 1.0}, TypeError, "dakf has no option 'force_sd'"),
+        ("bicycle-kf", {"q_beta": -1.0}, ValueError, "Q is indefinite.*-1"),
+        ("bicycle-kf", {"q_beta": float("nan")}, ValueError, "Q is not finite"),
+        ("bicycle-kf", {"Q": [[1.0, 2.0], [2.0, 1.0]]}, ValueError, "Q is indefinite"),
+        ("bicycle-kf", {"Q": [[1.0, 0.5], [0.0, 1.0]]}, ValueError, "Q is not symmetric"),
+        ("bicycle-kf", {"Q": np.eye(3)}, ValueError, r"shape \(2, 2\) or \(2,\), got \(3, 3\)"),
+        ("bicycle-kf", {"gyro_noise": 0.0}, ValueError, "gyro_noise must be positive"),
+        ("bicycle-kf", {"gyro_noise": "loud"}, TypeError, "gyro_noise is a number, got 'loud'"),
+        ("course-kf", {"course_noise": -0.1}, ValueError, "course_noise must be positive"),
+        ("bicycle-kf", {"prior": {"psi": 1.0}}, ValueError, "no state 'psi'"),
+        ("bicycle-kf", {"prior": {"beta": -1.0}}, ValueError, "prior of beta"),
+        ("multirate-kf", {"gains": "random"}, ValueError, "gains is one of periodic, covariance"),
+        ("multirate-kf", {"delay": "hope"}, ValueError, "delay is one of clone, ignore"),
+        ("multirate-residual-kf", {"inverse": "left"}, ValueError, "inverse is one of moore-pen"),
+        ("multirate-residual-kf", {"gains": "covariance"}, ValueError, "one constant gain"),
+        ("exact-kf", {"slow": ["camera", "gps"], "gains": "periodic"}, ValueError, "two slow sens"),
+        ("bicycle-kf", {"speed": -1.0}, ValueError, "speed is in m/s"),
+        ("bicycle-kf", {"dt": 0.0}, ValueError, "a tick of 0.0 s"),
+        ("multirate-kf", {"dt": 0.01}, ValueError, "camera's period of 0.033 s is no whole number"),
+        ("bicycle-kf", {"vehicle": "tank"}, ValueError, "unknown vehicle 'tank'"),
+    ],
+)
+def test_constructor_errors_name_the_thing(name, options, error, message):
+    with pytest.raises(error, match=message):
+        make_estimator(name, **({"sensors": BOTH} | options))
+
+
+@pytest.mark.parametrize(
+    ("sensor", "name", "options", "message"),
+    [
+        (SlowSensor(0.033, (0.01,), jitter=0.02), "multirate-kf", {"gains": "periodic"}, "random"),
+        (SlowSensor(0.033, (0.05,)), "multirate-residual-kf", {}, "before the next one"),
+        (SlowSensor(0.033, (0.3,)), "exact-kf", {}, "at most 8 frames"),
+    ],
+)
+def test_schedules_that_a_filter_cannot_hold(sensor, name, options, message):
+    with pytest.raises(ValueError, match=message):
+        make_estimator(name, sensors={"camera": sensor}, **options)
+
+
+def test_random_delay_needs_no_option():
+    sensors = {"camera": SlowSensor(0.033, (0.01,), jitter=0.02)}
+    assert make_estimator("multirate-kf", sensors=sensors, speed=7.0).filters[0].periodic == 0
+    late = {"camera": SlowSensor(0.033, (0.01,), jitter=0.02)}
+    assert make_estimator("single-rate-kf", sensors=late, speed=7.0).filters[0].periodic == 1
+
+
+@pytest.fixture
+def log():
+    return simulate(SHORT, {"camera": CAMERA}, 0)
+
+
+def test_logs_that_cannot_be_filtered(log):
+    filter_ = make_estimator("multirate-kf", sensors=log.slow)
+    record = log.record
+    for column in ("gyro", "steer", "wheel_left"):
+        record.present = tuple(c for c in FAST._fields if c != column)
+        with pytest.raises(ValueError, match=f"multirate-kf needs the column '{column}'"):
+            filter_.run(log)
+    record.present = ("gyro", "steer", "wheel_left")
+    filter_.run(log)  # these are enough
+    with pytest.raises(ValueError, match="empty"):
+        filter_.run(Record(record.fast[:0], record.packets))
+    with pytest.raises(ValueError, match=r"ticks of 0.001 s, the record has 0.01 s"):
+        filter_.run(Record(record.fast, record.packets, dt=0.01))
+    with pytest.raises(ValueError, match="built for the camera .* the reset tells"):
+        filter_.run(Log(record, {"camera": SlowSensor(0.05)}))
+    with pytest.raises(ValueError, match=r"fast rows have shape \(k, 10\), got \(1, 3\)"):
+        filter_.predict(np.zeros(3))
+    with pytest.raises(ValueError, match=r"packet has shape \(9,\), got \(3,\)"):
+        filter_.update(np.zeros(3))
+
+
+def packet(sensor=0, captured=0, arrived=None, quality=1.0, value=0.01):
+    row = np.zeros(9)
+    row[:5] = sensor, captured, captured if arrived is None else arrived, quality, 0
+    row[5:] = value
+    return row
+
+
+def counted(filter_, *packets):
+    """What the counters say after 100 quiet ticks and these packets, apart from zeros."""
+    filter_.reset()
+    filter_.step(np.zeros((100, 10)), np.zeros((0, 9)))
+    before = filter_.x
+    for row in packets:
+        filter_.update(row)
+    used = not np.array_equal(filter_.x, before)
+    return {k: v for k, v in filter_.counts.items() if v}, used
+
+
+@pytest.mark.parametrize("name", ["multirate-kf", "exact-kf", "multirate-residual-kf"])
+def test_packets_that_are_skipped_are_counted(name):
+    filter_ = make_estimator(name, sensors={"camera": CAMERA}, speed=7.0)  # now is tick 99
+    assert counted(filter_, packet(captured=66)) == ({}, True)
+    assert counted(filter_, packet(captured=99)) == ({}, True)  # earlier than told, but sound
+    assert counted(filter_, packet(captured=33)) == ({"refused": 1}, False)
+    assert counted(filter_, packet(captured=132)) == ({"future": 1}, False)
+    assert counted(filter_, packet(captured=67)) == ({"unknown": 1}, False)
+    assert counted(filter_, packet(sensor=7, captured=66)) == ({"unknown": 1}, False)
+    assert counted(filter_, packet(sensor=1, captured=66)) == ({}, False)  # not for this filter
+    assert counted(filter_, packet(captured=66, quality=0.0)) == ({"poor": 1}, False)
+    for column in (PACKET.captured, PACKET.arrived, PACKET.quality, PACKET.value + 1):
+        row = packet(captured=66)
+        row[column] = np.nan
+        assert counted(filter_, row) == ({"invalid": 1}, False)
+    twice = packet(captured=66), packet(captured=66, value=0.5)
+    assert counted(filter_, *twice)[0] == {"duplicates": 1}
+    assert filter_.duplicates == 1 and filter_.refused == 0
+    filter_.update(packet(captured=33))
+    assert filter_.refused == 1
+    with pytest.raises(AttributeError, match="lost"):
+        filter_.lost  # noqa: B018
+
+
+def test_a_duplicate_changes_nothing(log):
+    filter_ = make_estimator("exact-kf", sensors=log.slow, speed=7.0)
+    once = filter_.run(log)
+    packets = np.repeat(log.record.packets, 2, 0)
+    packets[1::2, 5:] += 1.0  # the first counts
+    twice = filter_.run(Record(log.record.fast, packets))
+    np.testing.assert_array_equal(once.x, twice.x)
+    assert filter_.duplicates == len(log.record.packets)
+
+
+def test_packets_beyond_the_record_are_from_the_future(log):
+    log.record.packets[-1, PACKET.arrived] = 5000
+    filter_ = make_estimator("exact-kf", sensors=log.slow, speed=7.0)
+    filter_.run(log)
+    assert filter_.future == 1
+
+
+@pytest.mark.parametrize("name", list(FILTERS))
+def test_rows_that_are_not_finite_are_skipped(name):
+    log = simulate(SHORT, BOTH, 0)
+    for column in (FAST.gyro, FAST.steer, FAST.torque_left, FAST.wheel_left):
+        rows = log.record.fast.copy()
+        rows[150, column] = np.nan
+        rows[160, column] = np.inf
+        filter_ = make_estimator(name, sensors=BOTH)
+        found = filter_.run(Record(rows, log.record.packets))
+        assert np.isfinite(found.x).all() and np.isfinite(found.std).all()
+        expected = 0 if column == FAST.wheel_left else 2
+        if name == "single-rate-kf" and column == FAST.gyro:
+            expected = 0  # it samples the gyro every 33 ms
+        assert filter_.invalid == expected
+
+
+def test_the_first_course_far_off_sets_the_heading():
+    """A log whose heading does not start at zero; courses are wrapped."""
+    for name in ("multirate-kf", "course-kf"):
+        filter_ = make_estimator(name, sensors={"gps": GPS}, speed=7.0)
+        rows = np.zeros((1001, 10))
+        for heading in (2.0, -3.0):
+            courses = [
+                packet(1, k, value=(heading + 0.01 * (-1) ** k + np.pi) % (2 * np.pi) - np.pi)
+                for k in range(0, 1001, 200)
+            ]
+            estimates = filter_.run(Record(rows, np.array(courses)))
+            assert np.abs(estimates["beta"]).max() < 0.02
+            assert np.abs(estimates["psi"] - heading).max() < 0.05

@@ -1,0 +1,51 @@
+"""The textbook equations: conditioning, Joseph's form, generalised inverses."""
+
+import numpy as np
+import pytest
+from sideslip.estimators import kalman
+
+pytestmark = [pytest.mark.smoke, pytest.mark.plain]
+
+
+def some(seed):
+    rng = np.random.default_rng(seed)
+    A, C = rng.standard_normal((4, 4)), rng.standard_normal((2, 4))
+    L = rng.standard_normal((2, 2))
+    return rng, A @ A.T, C, L @ L.T
+
+
+def test_update_is_conditioning_of_the_joint_gaussian():
+    rng, P, C, R = some(0)
+    x, y = rng.standard_normal(4), rng.standard_normal(2)
+    joint = np.block([[P, P @ C.T], [C @ P, C @ P @ C.T + R]])
+    S = np.linalg.inv(joint[4:, 4:])
+    mean, cov = kalman.update(x, P, C, R, y)
+    np.testing.assert_allclose(mean, x + joint[:4, 4:] @ S @ (y - C @ x), rtol=1e-10)
+    np.testing.assert_allclose(cov, P - joint[:4, 4:] @ S @ joint[4:, :4], rtol=1e-9, atol=1e-12)
+
+
+def test_predict_carries_mean_and_covariance():
+    rng, P, _, _ = some(1)
+    F, x = rng.standard_normal((4, 4)), rng.standard_normal(4)
+    mean, cov = kalman.predict(x, P, F, np.eye(4))
+    np.testing.assert_array_equal(mean, F @ x)
+    np.testing.assert_array_equal(cov, F @ P @ F.T + np.eye(4))
+
+
+def test_no_gain_leaves_less_covariance_than_the_kalman_gain():
+    rng, P, C, R = some(2)
+    best = np.trace(kalman.joseph(P, kalman.gain(P, C, R), C, R))
+    for _ in range(20):
+        other = kalman.gain(P, C, R) + 0.1 * rng.standard_normal((4, 2))
+        after = kalman.joseph(P, other, C, R)
+        assert np.trace(after) > best
+        assert np.linalg.eigvalsh(after).min() > 0.0
+
+
+def test_without_noise_the_gain_is_a_generalised_inverse():
+    _, P, C, _ = some(3)
+    zero = np.zeros((2, 2))
+    np.testing.assert_allclose(kalman.gain(np.eye(4), C, zero), np.linalg.pinv(C), rtol=1e-10)
+    np.testing.assert_allclose(C @ kalman.gain(P, C, zero), np.eye(2), atol=1e-12)
+    ridge = np.linalg.solve(C.T @ C + 0.1 * np.eye(4), C.T)
+    np.testing.assert_allclose(kalman.gain(np.eye(4), C, 0.1 * np.eye(2)), ridge, rtol=1e-9)

@@ -1,0 +1,122 @@
+"""The compiled model is the vehicle's, exactly discretised, at every speed and step."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+from sideslip.envs.linear import course, vision
+from sideslip.envs.record import SlowSensor
+from sideslip.envs.vehicle import COMS, PASSENGER_CAR
+from sideslip.estimators import make_estimator
+from sideslip.estimators.models import discretise
+
+from tests.estimators.simulation import CAMERA, GPS
+
+STEPS = (0.001, 0.01, 0.033, 0.1, 0.2)
+
+
+def model_of(name, vehicle, speed, step, sensors):
+    """G (dense, n) and H of a filter's record whose step is the given one."""
+    filter_ = make_estimator(name, vehicle=vehicle, sensors=sensors, speed=speed)
+    f = filter_.filters[0]
+    f.step = step
+    discretise(f)
+    return f.G[: f.dense, : f.n].copy(), f.H[: f.dense].copy()
+
+
+@pytest.mark.parametrize("step", STEPS)
+@pytest.mark.parametrize("speed", [1.5, 5.0, 12.5, 60.0])
+@pytest.mark.parametrize("vehicle", [COMS, PASSENGER_CAR], ids=["coms", "passenger-car"])
+def test_discretisation_is_the_exact_zero_order_hold(vehicle, speed, step):
+    G, H = model_of("multirate-kf", vehicle, speed, step, {"camera": CAMERA})
+    exact_G, exact_H = vision(vehicle, speed).discrete(step)
+    assert np.abs(G - exact_G).max() < 1e-12 * max(1.0, np.abs(exact_G).max())
+    assert np.abs(H - exact_H[:, :2]).max() < 1e-12 * np.abs(exact_H).max()
+
+
+def test_below_walking_pace_the_model_stays():
+    G, _ = model_of("multirate-kf", COMS, 0.0, 0.001, {"camera": CAMERA})
+    np.testing.assert_allclose(G, vision(COMS, 1.5).discrete(0.001)[0], atol=1e-13)
+
+
+def test_dakf_is_the_papers_discrete_model():
+    """dakf-stability (5)-(17), written out."""
+    V, T_c = 25.0 / 3.6, 0.001
+    m, I, l_f, l_r, C_f, C_r = 380.0, 136.08, 0.8, 0.6, 10000.0, 10000.0
+    A_n = np.array(
+        [
+            [-2 * (C_f + C_r) / (m * V), -1 - 2 * (C_f * l_f - C_r * l_r) / (m * V**2), 0],  # (10)
+            [-2 * (C_f * l_f - C_r * l_r) / I, -2 * (C_f * l_f**2 + C_r * l_r**2) / (I * V), 0],
+            [0, 1, 0],
+        ]
+    )
+    B_n = np.array([[2 * C_f / (m * V), 0], [2 * C_f * l_f / I, 1 / I], [0, 0]])  # (11)
+    D_n = np.array([[1.0, 0], [0, 1], [0, 0]])  # (7)
+    grid = (np.arange(50) + 0.5) * T_c / 50
+    integral = sum(expm(A_n * t) for t in grid) * T_c / 50  # (13)
+    A_nd, B_nd, D_nd = expm(A_n * T_c), integral @ B_n, integral @ D_n
+    stiff = COMS.replace(front_stiffness=C_f, rear_stiffness=C_r)
+    with pytest.warns(UserWarning, match="cannot see"):
+        filter_ = make_estimator("dakf", vehicle=stiff, sensors={"gps": GPS}, speed=V)
+    f = filter_.filters[0]
+    np.testing.assert_allclose(f.G[:3, :5], np.hstack([A_nd, D_nd]), atol=1e-9)
+    np.testing.assert_allclose(f.H[:3], B_nd, atol=1e-9)
+    np.testing.assert_array_equal(f.decay[3:5], [1.0, 1.0])  # (14): a random walk
+    np.testing.assert_array_equal(f.gyro[:5], [0, 1, 0, 0, 0])  # (19)
+    np.testing.assert_array_equal(f.row[1, 0, :5], [1, 0, 1, 0, 0])
+    assert filter_.names == ("beta", "gamma", "psi", "d1", "d2")
+
+
+def rank(A, C):
+    rows = [C]
+    for _ in range(len(A) - 1):
+        rows.append(rows[-1] @ A)
+    return np.linalg.matrix_rank(np.vstack(rows), tol=1e-9)
+
+
+def test_dakf_sees_four_of_five_directions():
+    """The paper's IV.D claims five."""
+    V = 25.0 / 3.6
+    model = course(COMS, V)
+    A = np.zeros((5, 5))
+    A[:3, :3] = model.A
+    A[0, 3] = A[1, 4] = 1.0
+    C = np.hstack([model.C, np.zeros((2, 2))])
+    assert rank(A, C) == 4
+    assert rank(model.A, model.C) == 3
+    with pytest.warns(UserWarning, match="cannot see"):
+        (named,) = make_estimator("dakf", sensors={"gps": GPS}, speed=V).unobservable
+    parts = dict(part.split() for part in named.split(", "))
+    direction = np.array([float(parts.get(s, 0.0)) for s in ("beta", "gamma", "psi", "d1", "d2")])
+    assert direction[0] == 1.0 and direction[2] == -1.0
+    assert np.abs(C @ direction).max() < 1e-9
+    assert np.abs(A @ direction).max() < 2e-3 * np.abs(direction).max()  # four digits are printed
+
+
+def test_vision_sees_everything():
+    model = vision(COMS, 25.0 / 3.6)
+    assert rank(model.A, model.C) == 4
+    assert rank(model.A, model.C[1:]) == 4  # from vision alone
+    assert make_estimator("multirate-kf", sensors={"camera": CAMERA}, speed=7.0).unobservable == ()
+
+
+def test_the_course_noise_grows_as_one_over_speed():
+    def sd(**options):
+        filter_ = make_estimator("course-kf", sensors={"gps": GPS}, **options)
+        return math.degrees(math.sqrt(filter_.filters[0].r[1, 0]))
+
+    assert sd(speed=60.0 / 3.6) == pytest.approx(0.14)
+    assert sd(speed=25.0 / 3.6) == pytest.approx(0.336)
+    assert sd(speed=25.0 / 3.6, course_noise=math.radians(0.5)) == pytest.approx(0.5)
+
+
+def test_process_noise_means_the_same_at_every_tick():
+    fine = make_estimator("bicycle-kf", speed=7.0, q_beta=1e-3)
+    coarse = make_estimator("bicycle-kf", speed=7.0, q_beta=1e-3, dt=0.01)
+    single = make_estimator(
+        "single-rate-kf", speed=7.0, q_beta=1e-3, sensors={"camera": SlowSensor(0.033, (0.03,))}
+    )
+    assert fine.filters[0].Q[0, 0] == pytest.approx(1e-6)
+    assert coarse.filters[0].Q[0, 0] == pytest.approx(1e-5)
+    assert single.filters[0].Q[0, 0] == pytest.approx(33e-6)

@@ -1,0 +1,121 @@
+"""Periodic gains are the covariance filter's limit."""
+
+import numpy as np
+import pytest
+from sideslip.envs.record import FAST, Record, SlowSensor
+from sideslip.estimators import make_estimator
+
+from tests.estimators.simulation import CAMERA, FIG7, GPS, simulate
+
+SETS = {
+    "camera": {"camera": CAMERA},
+    "uneven": {"camera": SlowSensor(0.033, (0.020, 0.015, 0.010, 0.025))},
+    "gps": {"gps": GPS},
+    "late-gps": {"gps": SlowSensor(0.1, (0.25,), phase=0.030)},
+}
+LONG = type(FIG7)(duration=80.0)
+
+
+@pytest.mark.parametrize("name", ["multirate-kf", "single-rate-kf"])
+@pytest.mark.parametrize("which", SETS)
+def test_periodic_gains_equal_the_covariance_filters_limit(name, which):
+    log = simulate(LONG, SETS[which], 0)
+    common = {"sensors": log.slow, "speed": LONG.speed, "q_psi": 1e-5}
+    if "camera" in log.slow:
+        common["q_y_l"] = 1e-4
+    periodic = make_estimator(name, gains="periodic", **common)
+    covariance = make_estimator(name, gains="covariance", **common)
+    a, b = periodic.run(log), covariance.run(log)
+    late = log.time > 75.0
+    assert np.abs((a.x - b.x)[late] / b.std[late]).max() < 1e-6
+    np.testing.assert_allclose(a.std[late], b.std[late], rtol=1e-9)
+    np.testing.assert_allclose(periodic.P, covariance.P, rtol=1e-7, atol=1e-18)
+
+
+def test_gains_have_a_limit_where_the_covariance_has_none():
+    with pytest.warns(UserWarning, match="cannot see"):
+        filter_ = make_estimator("dakf", sensors={"gps": GPS}, speed=7.0, gains="periodic")
+    filter_.P  # noqa: B018  designs the table
+    assert np.isfinite(filter_.gains).all()
+    assert filter_.spectral_radius == pytest.approx(1.0, abs=1e-9)
+
+
+def test_gains_are_made_for_each_speed_when_it_is_reached():
+    """A filter that measures its speed has, at a held one, the gains of the nearest table."""
+    log = simulate(FIG7, {"camera": CAMERA}, 1)
+    measured = make_estimator("multirate-kf", sensors=log.slow)
+    told = make_estimator("multirate-kf", sensors=log.slow, speed=7.0)
+    measured.run(log)
+    told.run(log)
+    cell = int(measured.filters[0].cell)
+    assert 1.5 + 0.5 * cell == 7.0
+    np.testing.assert_array_equal(measured.gains[cell], told.gains[0])
+    assert measured.gains[cell - 1].max() == 0.0  # never asked for
+
+
+def test_a_changing_speed_rebuilds_the_model_by_half_a_percent():
+    rows = np.zeros((4000, 10))
+    rows[:, FAST.wheel_left] = rows[:, FAST.wheel_right] = np.linspace(3.0, 12.0, 4000)
+    filter_ = make_estimator("multirate-kf", sensors={"camera": CAMERA})
+    speeds = []
+    for row in rows[::10]:
+        filter_.step(np.repeat(row[None], 10, 0), np.zeros((0, 9)))
+        speeds.append(float(filter_.filters[0].model_speed))
+    lowpass = 3.0
+    for k, row in enumerate(np.repeat(rows[::10, FAST.wheel_left], 10)):
+        lowpass = row if k == 0 else lowpass + (1.0 - np.exp(-0.005)) * (row - lowpass)
+    assert speeds[-1] == pytest.approx(lowpass, rel=0.0051)
+    steps = np.diff([s for i, s in enumerate(speeds) if i == 0 or s != speeds[i - 1]])
+    assert steps.min() > 0.005 * 3.0
+
+
+@pytest.mark.parametrize("name", ["multirate-kf", "exact-kf", "single-rate-kf"])
+def test_equal_bits_however_the_ticks_are_chunked(name):
+    log = simulate(type(FIG7)(duration=1.0), {"camera": CAMERA}, 2)
+    log.record.fast[:, FAST.wheel_left] *= np.linspace(1.0, 1.3, 1001)
+    whole = make_estimator(name, sensors=log.slow).run(log)
+    packets = log.record.packets
+    for n in (1, 10, 33):
+        filter_ = make_estimator(name, sensors=log.slow)
+        for start in range(0, 1001, n):
+            end = min(start + n, 1001)
+            here = (packets[:, 2] >= start) & (packets[:, 2] < end)
+            filter_.step(log.record.fast[start:end], packets[here])
+            np.testing.assert_array_equal(filter_.x, whole.x[end - 1])
+            np.testing.assert_array_equal(np.sqrt(np.diag(filter_.P)), whole.std[end - 1])
+
+
+@pytest.mark.parametrize("name", ["multirate-residual-kf", "exact-kf", "single-rate-kf"])
+def test_predict_and_update_are_the_same_filter(name):
+    log = simulate(type(FIG7)(duration=0.5), {"camera": CAMERA}, 3)
+    whole = make_estimator(name, sensors=log.slow, speed=FIG7.speed).run(log)
+    filter_ = make_estimator(name, sensors=log.slow, speed=FIG7.speed)
+    due = {}
+    for packet in log.record.packets:
+        due.setdefault(int(packet[2]), []).append(packet)
+    for k, row in enumerate(log.record.fast):
+        filter_.predict(row)
+        for packet in due.get(k, []):
+            filter_.update(packet)
+        np.testing.assert_array_equal(filter_.x, whole.x[k])
+    assert filter_.tick == 500
+
+
+def test_a_snapshot_continues_bit_for_bit():
+    log = simulate(type(FIG7)(duration=0.5), {"camera": CAMERA}, 4)
+    filter_ = make_estimator("exact-kf", sensors=log.slow, speed=FIG7.speed)
+    halves = [
+        Record(
+            log.record.fast[a:b],
+            log.record.packets[(log.record.packets[:, 2] >= a) & (log.record.packets[:, 2] < b)],
+            a,
+        )
+        for a, b in ((0, 250), (250, 501))
+    ]
+    filter_.run(halves[0])
+    snapshot = filter_.get_state()
+    filter_.step(halves[1].fast, halves[1].packets)
+    once = filter_.x
+    filter_.set_state(snapshot)
+    filter_.step(halves[1].fast, halves[1].packets)
+    np.testing.assert_array_equal(filter_.x, once)

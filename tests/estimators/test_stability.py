@@ -1,0 +1,131 @@
+"""What diverges is refused with its number; what cannot be seen is named."""
+
+import re
+
+import numpy as np
+import pytest
+from sideslip.envs.record import SlowSensor
+from sideslip.envs.vehicle import COMS
+from sideslip.estimators import UnobservableWarning, make_estimator
+from sideslip.estimators.periodic import design
+from sideslip.estimators.stability import error_map, spectral_radius
+
+from tests.estimators.simulation import CAMERA, FIG6, GPS, Drive, simulate
+
+ALL = [
+    ("bicycle-kf", {}),
+    ("single-rate-kf", {"camera": CAMERA}),
+    ("multirate-kf", {"camera": CAMERA}),
+    ("multirate-residual-kf", {"camera": CAMERA}),
+    ("exact-kf", {"camera": CAMERA}),
+    ("course-kf", {"gps": GPS}),
+    ("multirate-residual-kf", {"gps": GPS}),
+    ("exact-kf", {"gps": SlowSensor(0.1, (0.25,))}),
+]
+
+
+def quiet(drive, sensors):
+    return simulate(drive, sensors, 0, disturbed=False, quiet=True)
+
+
+@pytest.mark.parametrize(("name", "sensors"), ALL)
+def test_without_noise_every_error_dies_out_as_its_spectral_radius_says(name, sensors):
+    """The error of a filter that starts wrong on a quiet, exactly known car."""
+    drive = Drive(real=6000.0, duration=12.0)
+    log = quiet(drive, sensors)
+    filter_ = make_estimator(
+        name, vehicle=drive.truth, sensors=sensors, speed=drive.speed, gains=""
+    )
+    assert filter_.spectral_radius < 1.0
+    n = len(filter_.names)
+    filter_.take(log.record.fast, 1, np.zeros((0, 9)), 0)
+    wrong = filter_.get_state()
+    wrong["x"][0, :n] += np.where(np.array(filter_.units) == "N", 10.0, 0.05)
+    filter_.set_state(wrong)
+    packets = log.record.packets[log.record.packets[:, 2] > 0]
+    filter_.step(log.record.fast[1:], packets)
+    truth = np.array([log.truth.get(state, np.zeros(1))[-1] for state in filter_.names])
+    cycles = drive.duration / (filter_._schedules[0].cycle * filter_.filters[0].step)
+    left = 2.0 * 0.05 * filter_.spectral_radius**cycles
+    hold = 0.035 if name == "single-rate-kf" else 0.0  # its estimate is up to a frame old
+    assert np.abs(filter_.x - truth)[:2].max() < left + hold + 1e-6
+
+
+def test_the_error_map_is_what_the_compiled_filter_does():
+    """Column by column: a small error put in comes out as the map says, one cycle later."""
+    sensors = {"camera": SlowSensor(0.033, (0.020, 0.010))}
+    for name in ("multirate-kf", "multirate-residual-kf"):
+        filter_ = make_estimator(name, vehicle=COMS, sensors=sensors, speed=7.0)
+        filter_.P  # noqa: B018  designs the table
+        f, schedule = filter_.filters[0], filter_._schedules[0]
+        table, G = design(f, schedule, 7.0, "moore-penrose")
+        M = error_map(f, table, G, schedule)
+        N, n = int(f.total), int(f.n)
+        cycle = schedule.cycle
+        rows = np.zeros((5 * cycle, 10))
+        packets = np.zeros((10, 9))
+        for i in range(10):
+            packets[i, :5] = 0, 33 * i, 33 * i + (20, 10)[i % 2], 1, i
+        due = packets[packets[:, 2] < 2 * cycle]
+        for column in range(n):
+            filter_.reset()
+            filter_.step(rows[: 2 * cycle], due)
+            state = filter_.get_state()
+            state["x"][0, :N] = 0.0
+            state["x"][0, column] = -1.0  # error = truth - estimate
+            filter_.set_state(state)
+            later = (packets[:, 2] >= 2 * cycle) & (packets[:, 2] < 3 * cycle)
+            filter_.step(rows[2 * cycle : 3 * cycle], packets[later])
+            np.testing.assert_allclose(-filter_.filters[0].x[:N], M[:N, column], atol=1e-12)
+
+
+def test_a_filter_whose_error_grows_is_refused_with_the_number():
+    options = {"sensors": {"camera": CAMERA}, "speed": 40.0}
+    with pytest.raises(ValueError, match=r"multirate-residual-kf.*factor of 1\.0\d+.*40 m/s"):
+        make_estimator("multirate-residual-kf", **options)
+    filter_ = make_estimator("multirate-residual-kf", allow_unstable=True, **options)
+    assert filter_.spectral_radius > 1.0 + 1e-9
+
+
+def test_one_that_starts_to_diverge_on_the_way_is_refused_there():
+    filter_ = make_estimator("multirate-residual-kf", sensors={"camera": CAMERA})
+    rows = np.zeros((10, 10))
+    rows[:, 3:5] = 40.0
+    with pytest.raises(ValueError, match="error grows"):
+        filter_.step(rows, np.zeros((0, 9)))
+
+
+def test_the_unobservable_direction_is_named_and_warned_about():
+    with pytest.warns(UnobservableWarning, match=r"beta 1, psi -1, d1 .*, d2 "):
+        filter_ = make_estimator("dakf", sensors={"gps": GPS}, speed=7.0)
+    assert len(filter_.unobservable) == 1
+    assert re.match(r"beta 1, psi -1", filter_.unobservable[0])
+
+
+@pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning")
+def test_a_gyro_bias_drives_dakf_off():
+    """0.05 deg/s for 120 s at a standstill of everything else; the three-state filter stays."""
+    still = Drive(amplitude=0.0, duration=120.0)
+    bias = np.radians(0.05)
+    log = simulate(still, {"gps": GPS}, 0, gyro_bias=bias, disturbed=False, quiet=True)
+    common = {"vehicle": FIG6.told, "sensors": log.slow, "speed": still.speed}
+    dakf = make_estimator("dakf", **common).run(log)["beta"]
+    three = make_estimator("course-kf", **common).run(log)["beta"]
+    assert dakf[-1] == pytest.approx(-120.0 * bias, rel=0.02)  # the whole integral of the bias
+    assert abs(three[-1]) < 0.02
+    assert abs(three[-1] - three[90_000]) < 1e-3 < abs(dakf[-1] - dakf[90_000])
+
+
+def test_random_delay_is_judged_by_its_extremes():
+    sensors = {"camera": SlowSensor(0.033, (0.010,), jitter=0.020)}
+    filter_ = make_estimator("exact-kf", sensors=sensors, speed=7.0)
+    ends = [
+        make_estimator("exact-kf", sensors={"camera": SlowSensor(0.033, (d,))}, speed=7.0)
+        for d in (0.010, 0.030)
+    ]
+    assert filter_.spectral_radius == pytest.approx(max(e.spectral_radius for e in ends), abs=1e-9)
+
+
+def test_spectral_radius_of_a_rotation_is_its_growth():
+    turn = 1.25 * np.array([[0.0, -1.0], [1.0, 0.0]])
+    assert spectral_radius(turn) == pytest.approx(1.25)

@@ -1,0 +1,193 @@
+"""EstimateObservation around the real environments."""
+
+import copy
+import json
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import sideslip  # noqa: F401  registers the environments
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.utils.env_checker import check_env
+from sideslip.agents.rollout import rollout
+from sideslip.envs import COMS
+from sideslip.estimators import EstimateObservation, make_estimator
+
+pytestmark = pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning")
+
+VISION, UNEVEN, GPS = (f"sideslip/Yaw{kind}-v0" for kind in ("Vision", "VisionUneven", "Gps"))
+FIG7 = {"scenario": "tie-vision-fig7"}
+
+
+def still(env):
+    return np.zeros(env.action_space.shape, np.float32)
+
+
+@pytest.mark.parametrize(
+    ("env_id", "name"),
+    [
+        (VISION, "bicycle-kf"),
+        (VISION, "single-rate-kf"),
+        (VISION, "multirate-kf"),
+        (VISION, "multirate-residual-kf"),
+        (VISION, "exact-kf"),
+        (UNEVEN, "multirate-residual-kf"),
+        (UNEVEN, "exact-kf"),
+        (GPS, "course-kf"),
+        (GPS, "dakf"),
+        (GPS, "exact-kf"),
+    ],
+)
+@pytest.mark.parametrize("control_period", [1, 10, 33])
+def test_the_wrapped_filter_equals_the_filter_on_the_log(env_id, name, control_period):
+    """Equal bits for every control period, and what is observed is what the filter says."""
+    env = gym.make(env_id, control_period=control_period, **FIG7)
+    wrapped = EstimateObservation(env, name)
+    obs, info = wrapped.reset(seed=3, options={"duration": 0.7})
+    start = info["beta_hat"]
+    while True:
+        obs, _, terminated, truncated, info = wrapped.step(still(env))
+        assert wrapped.observation_space.contains(obs)
+        if terminated or truncated:
+            break
+    drive = rollout(gym.make(env_id, **FIG7), seed=3, options={"duration": 0.7})
+    found = make_estimator(
+        name, vehicle=env.unwrapped.nominal, sensors=drive.log.slow, speed=env.unwrapped.held_speed
+    ).run(drive.log)
+    np.testing.assert_array_equal(wrapped.estimator.x, found.x[-1])
+    assert [info["beta_hat"], info["beta_std"]] == [found["beta"][-1], found.std[-1, 0]]
+    assert start != info["beta_hat"]
+    np.testing.assert_array_equal(obs[-4:-2], found.x[-1, :2].astype(np.float32))
+    np.testing.assert_array_equal(obs[-2:], found.std[-1, :2].astype(np.float32))
+
+
+def test_layout_and_space_describe_the_observation():
+    inner = gym.make(VISION)
+    env = EstimateObservation(inner, "multirate-kf", outputs=["beta", "y_l"])
+    names = [entry.name for entry in env.layout]
+    assert names[: len(names) - 4] == [entry.name for entry in inner.get_wrapper_attr("layout")]
+    assert names[-4:] == ["beta_hat", "y_l_hat", "beta_std", "y_l_std"]
+    assert env.layout[-3].unit == "m"
+    assert env.observation_space.shape == (len(names),)
+    obs, _ = env.reset(seed=0)
+    assert env.observation_space.contains(obs) and obs.dtype == np.float32
+    alone = EstimateObservation(gym.make(VISION), "multirate-kf", std=False, replace=True)
+    assert [entry.name for entry in alone.layout] == ["beta_hat", "gamma_hat"]
+    assert alone.reset(seed=0)[0].shape == (2,)
+    with pytest.warns(UserWarning, match="different from the unwrapped version"):
+        check_env(alone, skip_render_check=True)
+
+
+def test_nees_is_the_normalised_error_per_output():
+    env = EstimateObservation(gym.make(VISION, **FIG7), "exact-kf")
+    env.reset(seed=1)
+    for _ in range(40):
+        *_, info = env.step(still(env))
+        e = env.estimator.x[:2] - [info["beta"], info["gamma"]]
+        P = env.estimator.P[:2, :2]
+        assert info["nees"] == pytest.approx(e @ np.linalg.solve(P, e) / 2.0, rel=1e-9)
+        assert isinstance(info["nees"], float)
+    for output, i in (("beta", 0), ("gamma", 1)):
+        env = EstimateObservation(gym.make(VISION, **FIG7), "multirate-kf", outputs=[output])
+        env.reset(seed=1)
+        *_, info = env.step(still(env))
+        e = env.estimator.x[i] - info[output]
+        assert info["nees"] == pytest.approx(e * e / env.estimator.P[i, i], rel=1e-9)
+    blind = EstimateObservation(gym.make(VISION), "multirate-kf", outputs=["psi"])
+    assert "nees" not in blind.reset(seed=0)[1]
+
+
+def test_it_is_the_innermost_wrapper_or_an_error():
+    env = gym.wrappers.ClipAction(gym.make(VISION))
+    with pytest.raises(TypeError, match="innermost wrapper.*ClipAction"):
+        EstimateObservation(env, "multirate-kf")
+    with pytest.raises(TypeError, match="CartPoleEnv has no rows"):
+        EstimateObservation(gym.make("CartPole-v1").unwrapped, "multirate-kf")
+
+
+def test_several_estimators_stand_side_by_side():
+    env = EstimateObservation(gym.make(VISION, **FIG7), "bicycle-kf", name="plain")
+    with pytest.raises(ValueError, match="plain_beta_hat.* would stand twice; give"):
+        EstimateObservation(env, "exact-kf", name="plain")
+    env = EstimateObservation(env, "exact-kf", std=False)
+    env.reset(seed=0)
+    for _ in range(30):
+        obs, *_, info = env.step(still(env))
+    assert info["plain_beta_hat"] != info["beta_hat"]
+    values = dict(zip([entry.name for entry in env.layout], obs, strict=True))
+    for name in ("plain_beta_hat", "beta_hat"):
+        assert values[name] == np.float32(info[name])
+        assert env.unwrapped.annotations[name] == info[name]
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"estimator": "dakf"}, ValueError, "dakf needs the slow sensor gps; there is: camera"),
+        ({"estimator": "bicycle-kf", "outputs": ["psi"]}, ValueError, "no state 'psi'"),
+        ({"estimator": "multirate-kf", "options": {"q": 1}}, TypeError, "no option 'q'"),
+    ],
+)
+def test_wrong_arguments(options, error, message):
+    with pytest.raises(error, match=message):
+        EstimateObservation(gym.make(VISION), **options)
+
+
+def test_one_json_string_names_env_and_estimator():
+    env = EstimateObservation(
+        gym.make(VISION, **FIG7),
+        "multirate-kf",
+        outputs=("beta",),
+        vehicle=COMS.scaled(0.8),
+        options={"q_beta": 1e-3},
+        name="mine",
+    )
+    text = env.spec.to_json()
+    json.loads(text)
+    again = gym.make(EnvSpec.from_json(text))
+    assert again.spec.to_json() == text
+    first, second = env.reset(seed=5), again.reset(seed=5)
+    np.testing.assert_array_equal(first[0], second[0])
+    for _ in range(20):
+        first, second = env.step(still(env)), again.step(still(env))
+    np.testing.assert_array_equal(first[0], second[0])
+    assert first[-1] == second[-1]
+
+
+def test_snapshots_and_copies_continue_bit_for_bit():
+    env = EstimateObservation(gym.make(UNEVEN), "exact-kf")
+    env.reset(seed=2)
+    for _ in range(25):
+        env.step(still(env))
+    snapshot, twin = env.get_state(), copy.deepcopy(env)
+    once = [env.step(still(env))[0] for _ in range(15)]
+    env.set_state(snapshot)
+    again = [env.step(still(env))[0] for _ in range(15)]
+    copied = [twin.step(still(env))[0] for _ in range(15)]
+    np.testing.assert_array_equal(once, again)
+    np.testing.assert_array_equal(once, copied)
+
+
+def test_a_reset_tells_the_filter_the_drawn_clock():
+    env = gym.make(VISION, camera={"phase": None})
+    wrapped = EstimateObservation(env, "exact-kf")
+    phases = set()
+    for seed in range(8):
+        wrapped.reset(seed=seed)
+        for _ in range(12):
+            wrapped.step(still(env))
+        phase = round(env.unwrapped.slow_sensors["camera"].phase * 1e3)
+        assert wrapped.estimator.filters[0].phase[0] == phase
+        assert wrapped.estimator.counts == dict.fromkeys(wrapped.estimator.counts, 0)
+        phases.add(phase)
+    assert len(phases) > 1
+
+
+def test_a_reset_to_another_scenario_tells_the_filter():
+    env = EstimateObservation(gym.make(VISION, **FIG7), "exact-kf")
+    env.reset(seed=0)
+    assert env.estimator.filters[0].measured == 0
+    env.reset(seed=0, options={"scenario": "uneven-delay-fig5"})
+    assert env.estimator.sensors["camera"].delays == (0.020, 0.015, 0.010, 0.025)
+    env.reset(seed=0, options={"scenario": "sine"})
+    assert env.estimator.filters[0].measured == 1
