@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import typer
 from rich import box
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table as RichTable
 
 from .. import __version__
@@ -38,7 +39,9 @@ def main() -> None:
     try:
         app()
     except (ValueError, TypeError, FileNotFoundError, ModuleNotFoundError, OSError) as error:
-        Console(stderr=True).print(f"[bold red]error:[/] {error}", highlight=False)
+        Console(stderr=True, soft_wrap=True).print(
+            "[bold red]error:[/]", escape(str(error)), highlight=False
+        )
         sys.exit(2)
 
 
@@ -81,6 +84,7 @@ def run(
     from ..agents.rollout import rollout
     from ..estimators import EstimateObservation
 
+    _writable(plot, parquet)
     options: dict[str, Any] = {} if scenario is None else {"scenario": scenario}
     env: gym.Env[Any, Any] = gym.make(env_id, control_period=control_period, **options)
     if estimator is not None:
@@ -139,6 +143,7 @@ def bench(
     unknown = [name for name in names if name not in SUITES]
     if unknown:
         raise ValueError(f"unknown suite {', '.join(unknown)}; known: {', '.join(SUITES)}")
+    _writable(html, json, parquet, picture)
     done = []
     if log is not None:  # first: a log that cannot be read should not cost minutes
         from .replay import replay_file
@@ -178,6 +183,13 @@ def _give(
 
         write_report(html, list(suites), _command(), environment())
         console.print(f"report: {html}", highlight=False)
+
+
+def _writable(*paths: Path | None) -> None:
+    """FileNotFoundError before the work, not after it, where a result has no folder to go to."""
+    for path in paths:
+        if path is not None and not path.absolute().parent.is_dir():
+            raise FileNotFoundError(f"cannot write {path}: there is no such folder")
 
 
 def _command() -> str:
@@ -223,6 +235,7 @@ def replay(
     """Run the estimators over a recorded drive and score them."""
     from .replay import replay_file
 
+    _writable(html, json, parquet)
     suite = replay_file(
         log,
         vehicle,

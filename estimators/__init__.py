@@ -3,7 +3,8 @@
 `make_estimator` builds one by name; `EstimateObservation` puts it around an environment.
 """
 
-from .estimator import Estimates, Estimator, UnobservableWarning
+from .estimates import Estimates, UnobservableWarning
+from .estimator import Estimator
 from .make import make_estimator
 from .papers import FILTERS
 from .wrappers import EstimateObservation

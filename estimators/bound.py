@@ -17,11 +17,13 @@ from ..envs.linear import LinearModel, vision
 from ..envs.record import SLOW_NAMES, TICK, Record, SlowSensor
 from ..envs.vehicle import Vehicle
 from . import kalman
-from .make import DISTURBANCE, NOISE, make_estimator
+from .make import make_estimator
 from .models import COURSE_SPEED, ROWS, states_for
+from .options import DISTURBANCE, NOISE
 from .schedule import whole_ticks
 
 Array = npt.NDArray[np.float64]
+
 
 def bound(
     vehicle: Vehicle,

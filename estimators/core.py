@@ -8,21 +8,15 @@ came meanwhile.
 
 from typing import Any
 
-from ..envs.backend import absolute, jit, maximum, minimum, sqrt
-from ..envs.elementary import wrap
-from ..envs.record import FAST, GPS, PACKET, PACKET_WIDTH
-from .covariance import measure_clone, measure_state, predict_covariance
-from .delay import DIRECT, DROPPED, find, latch_due
-from .intersample import correct_between, correct_sample
-from .memory import COUNTERS, INPUTS, SEEN, SLOW, WAITING, WIDTH
-from .models import MOVED, SLOWEST, build
-
-ASTRAY = 0.5  # rad: the first course sets the heading where it is so far off
-
-
-@jit
-def _finite(value: Any) -> Any:
-    return value - value == 0.0
+from ..envs.backend import jit, maximum, sqrt
+from ..envs.record import FAST, PACKET
+from .arrivals import receive, use
+from .covariance import measure_state, predict_covariance
+from .delay import latch_due
+from .intersample import correct_between
+from .memory import COUNTERS, FRAMES, INPUTS, SEEN, SLOW, WIDTH
+from .models import build
+from .speed import cell_of, finite, measured_speed, moved, next_cell
 
 
 @jit
@@ -40,7 +34,8 @@ def begin(f: Any, first: int) -> None:
     for i in range(INPUTS):
         f.u[i], f.u_sum[i] = 0.0, 0.0
     for s in range(SLOW):
-        f.stamp[s, :] = -1
+        for i in range(FRAMES):
+            f.stamp[s, i] = -1
         for i in range(SEEN):
             f.seen[s, i] = -1
         if f.period[s] > 0:
@@ -55,52 +50,17 @@ def begin(f: Any, first: int) -> None:
 
 
 @jit
-def _measured_speed(f: Any, now: Any) -> Any:
-    """The low-passed mean of the front wheels' speeds, with this sample of it."""
-    if not _finite(now):
-        return f.speed
-    if f.model_speed == 0.0:
-        return now
-    return f.speed + f.smoothing * (now - f.speed)
-
-
-@jit
-def _moved(f: Any, speed: Any) -> Any:
-    """Whether the model has to be built anew for this speed."""
-    return absolute(maximum(speed, SLOWEST) - f.model_speed) > MOVED * f.model_speed
-
-
-@jit
-def _cell_of(f: Any, speed: Any) -> int:
-    """The table of gains nearest to a speed."""
-    if f.spacing == 0.0:
-        return 0
-    V = minimum(maximum(speed, f.low), f.high)
-    return int((V - f.low) / f.spacing + 0.5)
-
-
-@jit
-def _next_cell(f: Any, now: Any) -> int:
-    """The table of gains that a row with this sample of the speed will ask for."""
-    if f.measured == 1:
-        speed = _measured_speed(f, now)
-        if _moved(f, speed):
-            return _cell_of(f, speed)
-    return f.cell
-
-
-@jit
 def _note_inputs(f: Any, delta_f: Any, N_z: Any, now: Any) -> None:
     """Keep a row's inputs (the last finite ones), and its speed; rebuild the model if needed."""
-    if _finite(delta_f) and _finite(N_z):
+    if finite(delta_f) and finite(N_z):
         f.u[0], f.u[1] = delta_f, N_z
     else:
         f.counts[COUNTERS.invalid] += 1
     if f.measured == 1:
-        f.speed = _measured_speed(f, now)
-        if _moved(f, f.speed):
+        f.speed = measured_speed(f, now)
+        if moved(f, f.speed):
             build(f, f.speed)
-            f.cell = _cell_of(f, f.speed)
+            f.cell = cell_of(f, f.speed)
 
 
 @jit
@@ -135,7 +95,7 @@ def _gyro(f: Any, gains: Any, measured: Any) -> None:
     residual = measured
     for k in range(f.n):
         residual -= f.gyro[k] * f.x[k]
-    if not _finite(residual):
+    if not finite(residual):
         f.counts[COUNTERS.invalid] += 1
         residual = 0.0
         if f.periodic == 0:
@@ -148,80 +108,6 @@ def _gyro(f: Any, gains: Any, measured: Any) -> None:
             x[i] += gains[cell, at, i] * residual
     else:
         measure_state(f, f.gyro, f.r_gyro, residual)
-
-
-@jit
-def _align(f: Any, residual: Any) -> None:
-    """Turn the heading, and all clones of courses, onto the first course."""
-    f.x[2] += residual
-    for i in range(f.frames[GPS]):
-        f.x[f.home[GPS] + i] += residual
-
-
-@jit
-def _use(f: Any, gains: Any, s: int, packet: Any) -> None:
-    """Correct by one packet of sensor s whose values are sound."""
-    captured = int(packet[PACKET.captured])
-    first = find(f, s, captured)
-    if first == DROPPED:
-        return
-    if f.pseudo == 1:
-        correct_sample(f, gains, s, packet[PACKET.value :])
-        return
-    frame = (captured - f.phase[s]) // f.period[s] % f.pattern
-    for i in range(f.rows[s]):
-        residual = packet[PACKET.value + i]
-        if first == DIRECT:
-            for k in range(f.n):
-                residual -= f.row[s, i, k] * f.x[k]
-        else:
-            residual -= f.x[first + i]
-        if f.angle[s, i] == 1:
-            residual = wrap(residual)
-        if s == GPS:
-            f.fixes += 1
-            if f.fixes == 1 and absolute(residual) > ASTRAY:
-                _align(f, residual)
-                residual = 0.0
-        if f.periodic == 1:
-            x, cell, at = f.x, f.cell, 1 + f.cycle + frame * f.rows[s] + i
-            for j in range(f.total):
-                x[j] += gains[cell, at, j] * residual
-        elif first == DIRECT:
-            measure_state(f, f.row[s, i], f.r[s, i], residual)
-        else:
-            measure_clone(f, first + i, f.r[s, i], residual)
-
-
-@jit
-def receive(f: Any, gains: Any, packet: Any) -> None:
-    """Use a packet that is here now, keep it for the next step, or drop and count it."""
-    for i in range(PACKET.value):
-        if not _finite(packet[i]):
-            f.counts[COUNTERS.invalid] += 1
-            return
-    s = int(packet[PACKET.sensor])
-    if s < 0 or s >= SLOW:
-        f.counts[COUNTERS.unknown] += 1
-        return
-    if f.period[s] == 0:
-        return
-    for i in range(f.rows[s]):
-        if not _finite(packet[PACKET.value + i]):
-            f.counts[COUNTERS.invalid] += 1
-            return
-    if packet[PACKET.quality] <= 0.0:
-        f.counts[COUNTERS.poor] += 1
-        return
-    if f.stride > 1 and not (f.begun == 1 and (f.tick - f.origin) % f.stride == 0):
-        if f.waits == WAITING:
-            f.counts[COUNTERS.refused] += 1
-            return
-        for i in range(PACKET_WIDTH):
-            f.waiting[f.waits, i] = packet[i]
-        f.waits += 1
-        return
-    _use(f, gains, s, packet)
 
 
 @jit
@@ -248,7 +134,7 @@ def tick(f: Any, gains: Any, gyro: Any) -> None:
     if f.stride > 1:
         f.u_sum[0], f.u_sum[1], f.u_count = 0.0, 0.0, 0
         for i in range(f.waits):
-            _use(f, gains, int(f.waiting[i, PACKET.sensor]), f.waiting[i])
+            use(f, gains, int(f.waiting[i, PACKET.sensor]), f.waiting[i])
         f.waits = 0
 
 
@@ -287,7 +173,7 @@ def advance(
     for j in range(start, rows):
         now = 0.5 * (fast[j, FAST.wheel_left] + fast[j, FAST.wheel_right])
         if f.periodic == 1:
-            cell = _next_cell(f, now)
+            cell = next_cell(f, now)
             if gains[cell, 0, 0] == 0.0:
                 f.wanted, f.cursor = cell, at
                 return j

@@ -1,7 +1,7 @@
 """The covariance and its gains in compiled code: `kalman.py`'s equations on a filter's record.
 
-Only the first n of N = `total` states move; the others are clones. Measurements come one scalar at a
-time, so that a gain is a division and not a matrix inverse.
+Only the first n of N = `total` states move; the others are clones. Measurements come one scalar at
+a time, so that a gain is a division and not a matrix inverse.
 """
 
 from typing import Any

@@ -77,7 +77,7 @@ def latch_due(f: Any, last: int) -> None:
 
 
 @jit
-def find(f: Any, s: int, captured: int) -> int:
+def find(f: Any, s: int, captured: int) -> Any:
     """The first clone that a sample measures, DIRECT for the states, or DROPPED (and counted)."""
     frame = (captured - f.phase[s]) // f.period[s]
     if captured > f.tick:

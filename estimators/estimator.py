@@ -3,18 +3,16 @@
 import itertools
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import cache
 from typing import Any
 
-import numba
 import numpy as np
 import numpy.typing as npt
-from numba.core.dispatcher import Dispatcher
 
 from ..envs.record import FAST_WIDTH, PACKET_WIDTH, SLOW_NAMES, Log, Record, SlowSensor
-from .core import advance_filter, begin_filter, receive_filter
-from .memory import FILTER, Counters
+from .compiled import entries
+from .core import begin_filter
+from .estimates import Estimates, UnobservableWarning
+from .memory import Counters
 from .models import UNITS
 from .periodic import design, table_shape
 from .schedule import Schedule, whole_ticks
@@ -25,50 +23,8 @@ Array = npt.NDArray[np.float64]
 CHECKED_SPEEDS = (3.0, 7.0, 14.0)  # m/s, where a filter without a fixed speed is checked
 
 
-class UnobservableWarning(UserWarning):
-    """A filter has a direction that its sensors cannot see."""
-
-
-@dataclass(frozen=True)
-class Estimates:
-    """What a filter said at every row of a record.
-
-    time: (K,) s. x, std: (K, n), states and standard deviations. names: of the n states.
-    """
-
-    time: Array
-    x: Array
-    std: Array
-    names: tuple[str, ...]
-
-    def __getitem__(self, name: str) -> Array:
-        """One state by name, (K,)."""
-        return self.x[:, self.names.index(name)]
-
-
-def entry(function: Any, *example: Any) -> Any:
-    """The compiled call of a function for arguments of the example's types.
-
-    numba finds out the types of the arguments at every call, which costs more than a filter's
-    step; this is the call without it, so arguments must have exactly these types and layouts.
-    """
-    if not isinstance(function, Dispatcher):
-        return function
-    return function.compile(tuple(map(numba.typeof, example)))
-
-
 _NOTHING = np.zeros((0, 0))
 _NO_PACKETS = np.zeros((0, PACKET_WIDTH))
-
-
-@cache
-def entries() -> tuple[Any, Any]:
-    """(`advance_filter`, `receive_filter`) as plain calls."""
-    filters, gains = np.zeros(1, FILTER), np.zeros((1, 1, 1))
-    return (
-        entry(advance_filter, filters, gains, _NOTHING, 0, _NOTHING, 0, 0, _NOTHING, _NOTHING),
-        entry(receive_filter, filters, gains, np.zeros(PACKET_WIDTH)),
-    )
 
 
 class Estimator:
@@ -76,7 +32,7 @@ class Estimator:
 
     `names` and `units` of its states; `x` (n,) and `P` (n, n) at "now"; `tick`, the last fast row.
     `unobservable`: directions that its sensors cannot see. `spectral_radius` of its error over a
-    cycle. `dt`: seconds of a tick. `needs`: the fast columns it reads. `filters`, `gains`: its whole
+    cycle. `dt`: seconds of a tick. `needs`: the fast columns it reads. `filters`, `gains`: its
     memory and its tables, as compiled code takes them.
     Counters of what was skipped: `refused` (older than the filter's window), `duplicates`,
     `future`, `invalid` (not finite), `poor` (quality 0), `unknown` (sensor or stamp).
@@ -157,9 +113,7 @@ class Estimator:
         speed = float(f.low + cell * f.spacing) if f.measured else float(f.speed)
         self.gains[cell] = self._designed(f, self._schedules[-1], speed)[0]
 
-    def reset(
-        self, sensors: Mapping[str, SlowSensor] | None = None, first: int = 0
-    ) -> None:
+    def reset(self, sensors: Mapping[str, SlowSensor] | None = None, first: int = 0) -> None:
         """Forget everything; the next fast row is the tick `first`.
 
         sensors: slow sensors whose clocks have a new phase. Raises ValueError if anything but the
@@ -239,7 +193,8 @@ class Estimator:
         n = len(self.names)
         X, S = np.empty((len(fast), n)), np.empty((len(fast), n))
         self.take(fast, len(fast), packets, len(packets), X, S)
-        return Estimates(record.ticks * record.dt, X, S, self.names)
+        time = np.asarray(record.ticks * record.dt, np.float64)
+        return Estimates(time, X, S, self.names)
 
     def get_state(self) -> Any:
         """A snapshot that `set_state` continues from, bit for bit."""
@@ -256,7 +211,7 @@ class Estimator:
 
     @property
     def P(self) -> Array:
-        """Their covariance now, (n, n); with periodic gains that of the schedule's settled cycle."""
+        """Their covariance now, (n, n); with periodic gains that of the settled cycle."""
         f, n = self._f, len(self.names)
         if not f.periodic:
             return np.array(f.P[:n, :n])

@@ -21,8 +21,7 @@ def gain(P: Array, C: Array, R: Array) -> Array:
     one for a covariance P; with P = I, R = lambda I it is Tikhonov's.
     """
     PC = P @ C.T
-    K: Array = np.linalg.solve((C @ PC + R).T, PC.T).T
-    return K
+    return np.asarray(np.linalg.solve((C @ PC + R).T, PC.T).T, np.float64)
 
 
 def update(x: Array, P: Array, C: Array, R: Array, y: Array) -> tuple[Array, Array]:

@@ -2,11 +2,10 @@
 
 import difflib
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from ..envs.record import SLOW_NAMES, TICK, SlowSensor
 from ..envs.vehicle import COMS, Vehicle, vehicle_from
@@ -15,23 +14,13 @@ from .delay import RULES, place_clones
 from .estimator import Estimator
 from .memory import FILTER
 from .models import SLOWEST, SMOOTHING_TIME, Model, states_for, write_model
+from .options import Options, noise_levels, prior_variances, process_noise
 from .papers import FILTERS, Filter
 from .schedule import NO_SENSOR, Schedule, schedules, whole_ticks
 from .tunings import TUNINGS
 
-Array = npt.NDArray[np.float64]
-
 FASTEST = 80.0  # m/s, of the tables of gains
 SPACING = 0.5  # m/s between them
-
-NOISE = {
-    "gyro_noise": 0.005,  # rad/s
-    "psi_noise": 3.5e-3,  # rad
-    "y_l_noise": 0.02,  # m
-    "course_noise": math.radians(0.14),  # rad at 60 km/h, growing as 1/V
-}
-DISTURBANCE = {"force_sd": 50.0, "moment_sd": 20.0, "disturbance_time": 0.3}  # N, N m, s
-PRIOR = {"beta": 0.02, "gamma": 0.05, "psi": 0.05, "y_l": 0.3, "d1": 0.1, "d2": 1.0}
 
 
 def make_estimator(
@@ -75,16 +64,16 @@ def make_estimator(
     row, there = FILTERS[name], dict(sensors or {})
     if not dt > 0.0:
         raise ValueError(f"{name}: a tick of {dt!r} s")
-    told = _Options(name, options)
+    told = Options(name, options)
     used = _slow_sensors(name, row, there, told.take("slow", None))
     model = Model(states_for(used), row.disturbances)
     rule = told.one_of("delay", row.delay, RULES)
     kind = told.one_of("inverse", intersample.INVERSES[0], intersample.INVERSES)
     wish = told.one_of("gains", "", ("", "periodic", "covariance"))
     tuning = TUNINGS.get((name, ",".join(used)), {})
-    Q = _process_noise(name, model, tuning, told)
-    noise = _noise(name, row, told)
-    prior = _prior(name, model, noise, told.take("prior", {}))
+    Q = process_noise(name, model, tuning, told)
+    noise = noise_levels(name, row, told)
+    prior = prior_variances(name, model, noise, told.take("prior", {}))
     unstable = bool(told.take("allow_unstable", False))
     told.done()
     car = vehicle_from(vehicle)
@@ -123,45 +112,6 @@ def make_estimator(
     return estimator
 
 
-class _Options:
-    """Options that must all be asked for."""
-
-    def __init__(self, name: str, options: Mapping[str, Any]) -> None:
-        self.name, self._left, self._known = name, dict(options), list[str]()
-
-    def has(self, key: str) -> bool:
-        return key in self._left
-
-    def take(self, key: str, default: Any) -> Any:
-        self._known.append(key)
-        return self._left.pop(key, default)
-
-    def one_of(self, key: str, default: str, known: Sequence[str]) -> str:
-        value = self.take(key, default)
-        if value not in known:
-            raise ValueError(
-                f"{self.name}: {key} is one of {', '.join(filter(None, known))}, got {value!r}"
-            )
-        return str(value)
-
-    def positive(self, key: str, default: float) -> float:
-        value = self.take(key, default)
-        try:
-            number = float(value)
-        except (TypeError, ValueError):
-            raise TypeError(f"{self.name}: {key} is a number, got {value!r}") from None
-        if not (number > 0.0 and math.isfinite(number)):
-            raise ValueError(f"{self.name}: {key} must be positive and finite, got {value!r}")
-        return number
-
-    def done(self) -> None:
-        if self._left:
-            raise TypeError(
-                f"{self.name} has no option {', '.join(map(repr, sorted(self._left)))}; "
-                f"it has: {', '.join(sorted(self._known))}"
-            )
-
-
 def _slow_sensors(
     name: str, row: Filter, there: Mapping[str, SlowSensor], wish: Any
 ) -> tuple[str, ...]:
@@ -183,67 +133,7 @@ def _slow_sensors(
     return tuple(sensor for sensor in SLOW_NAMES if sensor in wished)
 
 
-def _process_noise(
-    name: str, model: Model, tuning: Mapping[str, float], told: _Options
-) -> Array:
-    """Q (n, n) per second."""
-    n = len(model.names)
-    Q = np.diag([float(tuning.get(state, 0.0)) for state in model.names])
-    whole = told.take("Q", None)
-    if whole is not None:
-        Q = np.array(whole, np.float64)
-        Q = np.diag(Q) if Q.ndim == 1 else Q
-        if Q.shape != (n, n):
-            raise ValueError(f"{name}: Q has shape ({n}, {n}) or ({n},), got {np.shape(whole)}")
-    for i, state in enumerate(model.names):
-        value = told.take(f"q_{state}", None)
-        if value is not None:
-            Q[i, i] = float(value)
-    _covariance(f"{name}: Q", Q)
-    return Q
-
-
-def _covariance(what: str, M: Array) -> None:
-    """ValueError unless M is finite, symmetric and positive semidefinite."""
-    if not np.isfinite(M).all():
-        raise ValueError(f"{what} is not finite")
-    if not np.allclose(M, M.T, rtol=1e-9, atol=0.0):
-        raise ValueError(f"{what} is not symmetric")
-    least = np.linalg.eigvalsh(M).min()
-    if least < -1e-12 * max(np.abs(M).max(), 1e-300):
-        raise ValueError(f"{what} is indefinite: its least eigenvalue is {least:.3g}")
-
-
-def _noise(name: str, row: Filter, told: _Options) -> dict[str, float]:
-    """Standard deviations as `write_model` takes them."""
-    noise = {}
-    for key, default in NOISE.items():
-        if key == "course_noise" and told.has(key):
-            noise["course_fixed"] = told.positive(key, default)
-        noise[key.removesuffix("_noise")] = told.positive(key, default)
-    if row.disturbances == "forces":
-        keys = zip(("force", "moment", "time"), DISTURBANCE.items(), strict=True)
-        noise |= {short: told.positive(key, default) for short, (key, default) in keys}
-    return noise
-
-
-def _prior(
-    name: str, model: Model, noise: Mapping[str, float], prior: Mapping[str, float]
-) -> list[float]:
-    """The states' variances at the start."""
-    sd = PRIOR | {"F_d": noise.get("force", 0.0), "N_d": noise.get("moment", 0.0)}
-    for state, value in prior.items():
-        if state not in model.names:
-            raise ValueError(f"{name} has no state {state!r}; it has: {', '.join(model.names)}")
-        if not (float(value) >= 0.0 and math.isfinite(value)):
-            raise ValueError(f"{name}: the prior of {state} is a standard deviation, got {value!r}")
-        sd[state] = float(value)
-    return [sd[state] ** 2 for state in model.names]
-
-
-def _clocks(
-    name: str, f: Any, row: Filter, slow: Mapping[str, SlowSensor], dt: float
-) -> None:
+def _clocks(name: str, f: Any, row: Filter, slow: Mapping[str, SlowSensor], dt: float) -> None:
     for sensor, link in slow.items():
         what = f"{name}: the {sensor}'s period"
         f.period[SLOW_NAMES.index(sensor)] = whole_ticks(link.period, dt, what)

@@ -16,11 +16,11 @@ from ..envs.backend import jit, maximum
 from ..envs.linear import bicycle_coefficients
 from ..envs.record import CAMERA, GPS, SLOW_NAMES
 from ..envs.vehicle import Vehicle
+from .memory import CORE
 
 Array = npt.NDArray[np.float64]
 
 SLOWEST = 1.5  # m/s: below it the model stays that of this speed
-MOVED = 0.005  # the model is built anew where the speed moved by this share
 SMOOTHING_TIME = 0.2  # s, of the measured speed
 COURSE_SPEED = 60.0 / 3.6  # m/s at which the receivers' course noise is quoted
 
@@ -128,8 +128,10 @@ def continuous(f: Any, V: Any) -> None:
     m, I, l_f, l_r, C_f, C_r = f.car[0], f.car[1], f.car[2], f.car[3], f.car[4], f.car[5]  # noqa: E741
     a11, a12, a21, a22, b11, b21, b22 = bicycle_coefficients(m, I, l_f, l_r, C_f, C_r, V)
     A, B = f.A, f.B
-    A[:, :] = 0.0
-    B[:, :] = 0.0
+    for i in range(CORE):
+        for j in range(CORE):
+            A[i, j] = 0.0
+            B[i, j] = 0.0
     A[0, 0], A[0, 1], A[1, 0], A[1, 1] = a11, a12, a21, a22
     B[0, 0], B[1, 0], B[1, 1] = b11, b21, b22
     if f.dense > 2:
@@ -172,8 +174,9 @@ def discretise(f: Any) -> None:
         norm *= 0.5
         h *= 0.5
         doublings += 1
-    Phi[:, :] = 0.0
     for i in range(n):
+        for j in range(n):
+            Phi[i, j] = 0.0
         Phi[i, i] = h
     for order in range(15, 1, -1):  # Horner: Phi = h (I + A h / 2 (I + A h / 3 (...)))
         _product(f.A, Phi, T, n, n)
@@ -186,7 +189,9 @@ def discretise(f: Any) -> None:
         for i in range(n):
             E[i, i] += 2.0
         _product(E, Phi, T, n, n)
-        Phi[:n, :n] = T[:n, :n]
+        for i in range(n):
+            for j in range(n):
+                Phi[i, j] = T[i, j]
     _product(f.A, Phi, E, n, n)
     _product(Phi, f.B, T, n, m)
     for i in range(n):

@@ -46,7 +46,8 @@ def settle(f: Any, s: int, lags: Any, cycles: int, table: Any, before: Any, gain
                 first = find(f, s, captured)
                 if first == DROPPED:
                     continue
-                before[:, :] = f.P[:size, :size]
+                for i in range(size):
+                    _copy(f.P[i], before[i], size)
                 for i in range(f.rows[s]):
                     if first == DIRECT:
                         measure_state(f, f.row[s, i], f.r[s, i], 0.0)

@@ -46,12 +46,12 @@ def error_map(f: Any, table: Array, G: Array, schedule: Schedule) -> Array:
     F[: len(G), :n] = G
     F[range(len(G), n), range(len(G), n)] = f.decay[len(G) : n]
     correct = _pseudo_correction if f.pseudo else _correction
-    total = np.eye(2 * size if f.pseudo else size)
+    total: Array = np.eye(2 * size if f.pseudo else size)
     for step in range(schedule.cycle):
-        move = F @ _latched(f, s, schedule, step)
+        move: Array = F @ _latched(f, s, schedule, step)
         if f.pseudo:
-            move = np.kron(np.eye(2), move)
-        total = correct(f, s, table, schedule, step) @ move @ total
+            move = np.asarray(np.kron(np.eye(2), move), np.float64)
+        total = np.asarray(correct(f, s, table, schedule, step) @ move @ total, np.float64)
     return total
 
 

@@ -162,6 +162,7 @@ def test_what_the_env_tells_about_its_sensors_is_what_happens(name: str) -> None
         assert np.all(own[:, ARRIVED] - own[:, CAPTURED] <= round(1000.0 * told.longest_delay))
 
 
+@pytest.mark.plain
 def test_packets_come_in_the_order_of_arrival_then_capture_then_sensor(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -55,6 +55,58 @@ def drive(
     return state
 
 
+def forces(state: Motion, steer: float, T: Any, small: int, law: int) -> list[float]:
+    """Lateral forces of the front axle and the rear wheels, and the rear wheels' drive forces."""
+    m, l_f, l_r = CAR.m, CAR.l_f, CAR.l_r
+    if small:  # tie-vision (1)
+        a_f = steer - (state.v_y + l_f * state.gamma) / state.v_x
+    else:
+        a_f = steer - math.atan((state.v_y + l_f * state.gamma) / state.v_x)
+    a_r = (l_r * state.gamma - state.v_y) / state.v_x
+    a_r = a_r if small else math.atan(a_r)
+    capacity = [CAR.mu * m * 9.81 * arm / (2.0 * (l_f + l_r)) for arm in (l_r, l_f, l_f)]
+    along = [0.0, T[0] / CAR.r, T[1] / CAR.r]
+    found = []
+    for C, angle, limit, F_x in zip(
+        (CAR.C_f, CAR.C_r, CAR.C_r), (a_f, a_r, a_r), capacity, along, strict=True
+    ):
+        left = limit if small else math.sqrt(limit**2 - F_x**2)
+        if law == LINEAR:
+            found.append(C * angle)
+        else:
+            t = angle if small else math.tan(angle)
+            z = min(max(C * t / (3.0 * left), -1.0), 1.0)
+            found.append(left * (3.0 * z - 3.0 * z * abs(z) + z**3))
+    return [2.0 * found[0], *found[1:], *along[1:]]
+
+
+@given(st.floats(4.0, 20.0), speeds, speeds, st.floats(-0.5, 0.5), st.floats(-100.0, 100.0), speeds)
+def test_equations_written_out_slowly(
+    v_x: float, v_y: float, gamma: float, steer: float, torque: float, psi: float
+) -> None:
+    """The drive forces of two tyres differ, so that each one's friction circle is seen."""
+    T = (torque, 60.0)
+    state = motion(v_x=v_x, v_y=v_y, gamma=gamma, psi=psi, theta=0.3, y=2.0)
+    for small, law in PLANTS:
+        how = {"small_angle": small, "law": law, "road": CIRCLE}
+        rate = slope(state, steer, T, push=Push(30.0, -7.0), **how)
+        F_yf, F_l, F_r, F_xl, F_xr = forces(state, steer, T, small, law)
+        s, c = (0.0, 1.0) if small else (math.sin(steer), math.cos(steer))
+        turning = 0.0 if small else v_y * gamma
+        N_z = CAR.d_r / 2.0 * (F_xr - F_xl)
+        error = 1e-10  # some roundings of forces up to 1e4 N
+        assert CAR.m * (rate.v_x - turning) == pytest.approx(F_xl + F_xr - F_yf * s, abs=error)
+        across = F_yf * c + F_l + F_r + 30.0
+        assert CAR.m * (rate.v_y + v_x * gamma) == pytest.approx(across, abs=error)
+        moment = CAR.l_f * F_yf * c - CAR.l_r * (F_l + F_r) + N_z - 7.0
+        assert CAR.I * rate.gamma == pytest.approx(moment, abs=error)
+        assert rate.psi == gamma
+        if small:  # tie-vision (5), and the road's direction
+            assert v_x * psi + v_y == rate.Y
+            assert rate.y == v_x * (psi - 0.3) + v_y
+            assert (rate.X, rate.s, rate.theta) == (v_x, v_x, v_x * 0.02)
+
+
 @pytest.mark.smoke
 @pytest.mark.parametrize(("small_angle", "law"), PLANTS)
 def test_straight_on_is_exactly_straight(small_angle: int, law: int) -> None:

@@ -1,10 +1,12 @@
 """Bad input is refused with a message that names the thing, or skipped and counted."""
 
+from typing import Any
+
 import numpy as np
 import pytest
+
 from sideslip.envs.record import FAST, PACKET, Log, Record, SlowSensor
 from sideslip.estimators import FILTERS, make_estimator
-
 from tests.estimators.simulation import CAMERA, FIG7, GPS, simulate
 
 pytestmark = pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning")
@@ -18,14 +20,24 @@ SHORT = type(FIG7)(duration=0.3)
     [
         ("multirate", {}, ValueError, "unknown estimator 'multirate'; did you mean"),
         ("kalman9", {}, ValueError, "known: bicycle-kf"),
-        ("dakf", {"sensors": {"camera": CAMERA}}, ValueError, "dakf needs .* gps; there is: camera"),
+        (
+            "dakf",
+            {"sensors": {"camera": CAMERA}},
+            ValueError,
+            "dakf needs .* gps; there is: camera",
+        ),
         ("dakf", {"sensors": None}, ValueError, "dakf needs the slow sensor gps; there is: none"),
         ("multirate-kf", {"sensors": None}, ValueError, "multirate-kf needs .* camera or gps"),
         ("multirate-kf", {"slow": "radar"}, ValueError, "multirate-kf can use camera or gps"),
         ("dakf", {"slow": "camera"}, ValueError, "dakf can use gps"),
         ("bicycle-kf", {"slow": "gps"}, ValueError, "bicycle-kf uses no slow sensor"),
         ("bicycle-kf", {"q_psi": 1.0}, TypeError, "bicycle-kf has no option 'q_psi'"),
-        ("dakf", {"wibble": 1, "wobble": 2}, TypeError, "no option 'wibble', 'wobble'; it has: .*Q"),
+        (
+            "dakf",
+            {"wibble": 1, "wobble": 2},
+            TypeError,
+            "no option 'wibble', 'wobble'; it has: .*Q",
+        ),
         ("dakf", {"force_sd": 1.0}, TypeError, "dakf has no option 'force_sd'"),
         ("bicycle-kf", {"q_beta": -1.0}, ValueError, "Q is indefinite.*-1"),
         ("bicycle-kf", {"q_beta": float("nan")}, ValueError, "Q is not finite"),
@@ -48,7 +60,9 @@ SHORT = type(FIG7)(duration=0.3)
         ("bicycle-kf", {"vehicle": "tank"}, ValueError, "unknown vehicle 'tank'"),
     ],
 )
-def test_constructor_errors_name_the_thing(name, options, error, message):
+def test_constructor_errors_name_the_thing(
+    name: Any, options: Any, error: Any, message: Any
+) -> None:
     with pytest.raises(error, match=message):
         make_estimator(name, **({"sensors": BOTH} | options))
 
@@ -61,12 +75,14 @@ def test_constructor_errors_name_the_thing(name, options, error, message):
         (SlowSensor(0.033, (0.3,)), "exact-kf", {}, "at most 8 frames"),
     ],
 )
-def test_schedules_that_a_filter_cannot_hold(sensor, name, options, message):
+def test_schedules_that_a_filter_cannot_hold(
+    sensor: Any, name: Any, options: Any, message: Any
+) -> None:
     with pytest.raises(ValueError, match=message):
         make_estimator(name, sensors={"camera": sensor}, **options)
 
 
-def test_random_delay_needs_no_option():
+def test_random_delay_needs_no_option() -> None:
     sensors = {"camera": SlowSensor(0.033, (0.01,), jitter=0.02)}
     assert make_estimator("multirate-kf", sensors=sensors, speed=7.0).filters[0].periodic == 0
     late = {"camera": SlowSensor(0.033, (0.01,), jitter=0.02)}
@@ -74,11 +90,11 @@ def test_random_delay_needs_no_option():
 
 
 @pytest.fixture
-def log():
+def log() -> Any:
     return simulate(SHORT, {"camera": CAMERA}, 0)
 
 
-def test_logs_that_cannot_be_filtered(log):
+def test_logs_that_cannot_be_filtered(log: Any) -> None:
     filter_ = make_estimator("multirate-kf", sensors=log.slow)
     record = log.record
     for column in ("gyro", "steer", "wheel_left"):
@@ -91,7 +107,7 @@ def test_logs_that_cannot_be_filtered(log):
         filter_.run(Record(record.fast[:0], record.packets))
     with pytest.raises(ValueError, match=r"ticks of 0.001 s, the record has 0.01 s"):
         filter_.run(Record(record.fast, record.packets, dt=0.01))
-    with pytest.raises(ValueError, match="built for the camera .* the reset tells"):
+    with pytest.raises(ValueError, match=r"built for the camera .* the reset tells"):
         filter_.run(Log(record, {"camera": SlowSensor(0.05)}))
     with pytest.raises(ValueError, match=r"fast rows have shape \(k, 10\), got \(1, 3\)"):
         filter_.predict(np.zeros(3))
@@ -99,14 +115,16 @@ def test_logs_that_cannot_be_filtered(log):
         filter_.update(np.zeros(3))
 
 
-def packet(sensor=0, captured=0, arrived=None, quality=1.0, value=0.01):
+def packet(
+    sensor: Any = 0, captured: Any = 0, arrived: Any = None, quality: Any = 1.0, value: Any = 0.01
+) -> Any:
     row = np.zeros(9)
     row[:5] = sensor, captured, captured if arrived is None else arrived, quality, 0
     row[5:] = value
     return row
 
 
-def counted(filter_, *packets):
+def counted(filter_: Any, *packets: Any) -> Any:
     """What the counters say after 100 quiet ticks and these packets, apart from zeros."""
     filter_.reset()
     filter_.step(np.zeros((100, 10)), np.zeros((0, 9)))
@@ -118,7 +136,7 @@ def counted(filter_, *packets):
 
 
 @pytest.mark.parametrize("name", ["multirate-kf", "exact-kf", "multirate-residual-kf"])
-def test_packets_that_are_skipped_are_counted(name):
+def test_packets_that_are_skipped_are_counted(name: Any) -> None:
     filter_ = make_estimator(name, sensors={"camera": CAMERA}, speed=7.0)  # now is tick 99
     assert counted(filter_, packet(captured=66)) == ({}, True)
     assert counted(filter_, packet(captured=99)) == ({}, True)  # earlier than told, but sound
@@ -141,7 +159,7 @@ def test_packets_that_are_skipped_are_counted(name):
         filter_.lost  # noqa: B018
 
 
-def test_a_duplicate_changes_nothing(log):
+def test_a_duplicate_changes_nothing(log: Any) -> None:
     filter_ = make_estimator("exact-kf", sensors=log.slow, speed=7.0)
     once = filter_.run(log)
     packets = np.repeat(log.record.packets, 2, 0)
@@ -151,7 +169,7 @@ def test_a_duplicate_changes_nothing(log):
     assert filter_.duplicates == len(log.record.packets)
 
 
-def test_packets_beyond_the_record_are_from_the_future(log):
+def test_packets_beyond_the_record_are_from_the_future(log: Any) -> None:
     log.record.packets[-1, PACKET.arrived] = 5000
     filter_ = make_estimator("exact-kf", sensors=log.slow, speed=7.0)
     filter_.run(log)
@@ -159,7 +177,7 @@ def test_packets_beyond_the_record_are_from_the_future(log):
 
 
 @pytest.mark.parametrize("name", list(FILTERS))
-def test_rows_that_are_not_finite_are_skipped(name):
+def test_rows_that_are_not_finite_are_skipped(name: Any) -> None:
     log = simulate(SHORT, BOTH, 0)
     for column in (FAST.gyro, FAST.steer, FAST.torque_left, FAST.wheel_left):
         rows = log.record.fast.copy()
@@ -174,7 +192,7 @@ def test_rows_that_are_not_finite_are_skipped(name):
         assert filter_.invalid == expected
 
 
-def test_the_first_course_far_off_sets_the_heading():
+def test_the_first_course_far_off_sets_the_heading() -> None:
     """A log whose heading does not start at zero; courses are wrapped."""
     for name in ("multirate-kf", "course-kf"):
         filter_ = make_estimator(name, sensors={"gps": GPS}, speed=7.0)

@@ -1,11 +1,13 @@
 """The bound: Riccati, Monte Carlo and the exact filter tell the same story."""
 
+from typing import Any
+
 import numpy as np
 import pytest
+
 from sideslip.envs.record import SlowSensor
 from sideslip.estimators import make_estimator
 from sideslip.estimators.bound import bound, riccati
-
 from tests.estimators.simulation import CAMERA, FIG7, GPS, error, simulate
 
 SETS = {
@@ -17,7 +19,7 @@ SETS = {
 
 
 @pytest.mark.parametrize("which", SETS)
-def test_the_recursion_along_the_arrivals_equals_the_riccati_limit(which):
+def test_the_recursion_along_the_arrivals_equals_the_riccati_limit(which: Any) -> None:
     sensors = SETS[which]
     log = simulate(FIG7, sensors, 0)
     along = bound(FIG7.truth, record=log.record, sensors=sensors, speed=FIG7.speed)
@@ -25,7 +27,7 @@ def test_the_recursion_along_the_arrivals_equals_the_riccati_limit(which):
     np.testing.assert_allclose(along[3000:4000], limit, rtol=1e-10)
 
 
-def test_the_exact_filters_error_is_its_covariance():
+def test_the_exact_filters_error_is_its_covariance() -> None:
     """100 seeds of tie-vision-fig7: within 3 % of the bound, and consistent."""
     sensors = {"camera": CAMERA}
     filter_ = make_estimator("exact-kf", vehicle=FIG7.truth, sensors=sensors, speed=FIG7.speed)
@@ -41,15 +43,15 @@ def test_the_exact_filters_error_is_its_covariance():
     assert np.mean(nees) == pytest.approx(1.0, abs=0.05)
 
 
-def test_lost_frames_raise_the_bound():
+def test_lost_frames_raise_the_bound() -> None:
     log = simulate(FIG7, {"camera": CAMERA}, 0)
-    common = {"sensors": log.slow, "speed": FIG7.speed}
+    common: dict[str, Any] = {"sensors": log.slow, "speed": FIG7.speed}
     full = bound(FIG7.truth, record=log.record, **common)
     log.record.packets = log.record.packets[::3]
     assert (bound(FIG7.truth, record=log.record, **common)[100:] >= full[100:]).all()
 
 
-def test_riccati_refuses_what_has_no_limit():
+def test_riccati_refuses_what_has_no_limit() -> None:
     jittery = {"camera": SlowSensor(0.033, (0.01,), jitter=0.02)}
     with pytest.raises(ValueError, match="camera's delay is random"):
         riccati(FIG7.truth, sensors=jittery, speed=7.0)

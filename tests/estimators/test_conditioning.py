@@ -1,10 +1,12 @@
 """The filter equals conditioning the joint Gaussian of all ticks on everything that arrived."""
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy.linalg import expm
+
 from sideslip.envs.linear import vision
 from sideslip.envs.record import FAST, FAST_WIDTH, PACKET_WIDTH, Record, SlowSensor
 from sideslip.envs.vehicle import COMS
@@ -17,7 +19,7 @@ NOISE = {"camera": (3.5e-3, 0.02), "gps": (math.radians(0.14) * (60.0 / 3.6) / S
 MEASURED = {"camera": ((2,), (3,)), "gps": ((0, 2),)}
 
 
-def disturbed_model():
+def disturbed_model() -> Any:
     """F, B, Q of beta, gamma, psi, y_l, force, moment; the disturbances are held over a tick."""
     model = vision(COMS, SPEED)
     push = np.zeros((4, 2))
@@ -34,13 +36,13 @@ def disturbed_model():
     return F, B, Q
 
 
-def random_record(rng, sensors):
+def random_record(rng: Any, sensors: Any) -> Any:
     """Inputs, gyro samples and packets that come late, out of order or never."""
     fast = np.zeros((TICKS + 1, FAST_WIDTH))
     fast[:, FAST.steer] = 0.05 * rng.standard_normal(TICKS + 1)
     fast[:, FAST.torque_right] = 20.0 * rng.standard_normal(TICKS + 1)
     fast[:, FAST.gyro] = 0.1 * rng.standard_normal(TICKS + 1)
-    packets = []
+    packets: Any = []
     for code, (name, sensor) in enumerate(sensors.items()):
         for i, k in enumerate(range(round(sensor.phase / DT), TICKS, round(sensor.period / DT))):
             late = int(rng.integers(0, round(sensor.longest_delay / DT) + 1))
@@ -53,7 +55,7 @@ def random_record(rng, sensors):
     return Record(fast, packets[np.lexsort((packets[:, 0], packets[:, 1], packets[:, 2]))])
 
 
-def dense_posterior(record):
+def dense_posterior(record: Any) -> Any:
     """Mean and covariance at the last tick from the joint Gaussian of all ticks."""
     F, B, Q = disturbed_model()
     n, K = 6, TICKS
@@ -68,7 +70,9 @@ def dense_posterior(record):
         cov[b : b + n, :b] = F @ cov[a:b, :b]
         cov[:b, b : b + n] = cov[b : b + n, :b].T
         cov[b : b + n, b : b + n] = F @ cov[a:b, a:b] @ F.T + Q
-    C, y, r = [], [], []
+    C: Any = []
+    y: Any = []
+    r: Any = []
     for k in range(K + 1):
         C.append(np.eye(1, len(mean), n * k + 1)[0])
         y.append(record.fast[k, FAST.gyro])
@@ -95,7 +99,7 @@ GPS = SlowSensor(period=0.011, delays=(0.0,), jitter=0.030, phase=0.0)
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_the_filter_equals_dense_gaussian_conditioning(seed):
+def test_the_filter_equals_dense_gaussian_conditioning(seed: Any) -> None:
     sensors = {"camera": CAMERA, "gps": GPS}
     record = random_record(np.random.default_rng(seed), sensors)
     prior = {name: PRIOR[name] for name in ("beta", "gamma", "psi", "y_l")}
@@ -110,7 +114,7 @@ def test_the_filter_equals_dense_gaussian_conditioning(seed):
     assert np.abs((filter_.P - cov) / np.outer(sd, sd)).max() < 1e-9
 
 
-def test_a_late_sample_used_at_once_is_the_sample_used_in_time():
+def test_a_late_sample_used_at_once_is_the_sample_used_in_time() -> None:
     """With all samples in, the order of arrival has left no trace."""
     sensors = {"camera": CAMERA}
     record = random_record(np.random.default_rng(7), sensors)

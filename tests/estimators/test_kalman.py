@@ -1,20 +1,23 @@
 """The textbook equations: conditioning, Joseph's form, generalised inverses."""
 
+from typing import Any
+
 import numpy as np
 import pytest
+
 from sideslip.estimators import kalman
 
 pytestmark = [pytest.mark.smoke, pytest.mark.plain]
 
 
-def some(seed):
+def some(seed: Any) -> Any:
     rng = np.random.default_rng(seed)
     A, C = rng.standard_normal((4, 4)), rng.standard_normal((2, 4))
     L = rng.standard_normal((2, 2))
     return rng, A @ A.T, C, L @ L.T
 
 
-def test_update_is_conditioning_of_the_joint_gaussian():
+def test_update_is_conditioning_of_the_joint_gaussian() -> None:
     rng, P, C, R = some(0)
     x, y = rng.standard_normal(4), rng.standard_normal(2)
     joint = np.block([[P, P @ C.T], [C @ P, C @ P @ C.T + R]])
@@ -24,7 +27,7 @@ def test_update_is_conditioning_of_the_joint_gaussian():
     np.testing.assert_allclose(cov, P - joint[:4, 4:] @ S @ joint[4:, :4], rtol=1e-9, atol=1e-12)
 
 
-def test_predict_carries_mean_and_covariance():
+def test_predict_carries_mean_and_covariance() -> None:
     rng, P, _, _ = some(1)
     F, x = rng.standard_normal((4, 4)), rng.standard_normal(4)
     mean, cov = kalman.predict(x, P, F, np.eye(4))
@@ -32,7 +35,7 @@ def test_predict_carries_mean_and_covariance():
     np.testing.assert_array_equal(cov, F @ P @ F.T + np.eye(4))
 
 
-def test_no_gain_leaves_less_covariance_than_the_kalman_gain():
+def test_no_gain_leaves_less_covariance_than_the_kalman_gain() -> None:
     rng, P, C, R = some(2)
     best = np.trace(kalman.joseph(P, kalman.gain(P, C, R), C, R))
     for _ in range(20):
@@ -42,7 +45,7 @@ def test_no_gain_leaves_less_covariance_than_the_kalman_gain():
         assert np.linalg.eigvalsh(after).min() > 0.0
 
 
-def test_without_noise_the_gain_is_a_generalised_inverse():
+def test_without_noise_the_gain_is_a_generalised_inverse() -> None:
     _, P, C, _ = some(3)
     zero = np.zeros((2, 2))
     np.testing.assert_allclose(kalman.gain(np.eye(4), C, zero), np.linalg.pinv(C), rtol=1e-10)

@@ -1,22 +1,23 @@
 """The compiled model is the vehicle's, exactly discretised, at every speed and step."""
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy.linalg import expm
+
 from sideslip.envs.linear import course, vision
 from sideslip.envs.record import SlowSensor
 from sideslip.envs.vehicle import COMS, PASSENGER_CAR
 from sideslip.estimators import make_estimator
 from sideslip.estimators.models import discretise
-
 from tests.estimators.simulation import CAMERA, GPS
 
 STEPS = (0.001, 0.01, 0.033, 0.1, 0.2)
 
 
-def model_of(name, vehicle, speed, step, sensors):
+def model_of(name: Any, vehicle: Any, speed: Any, step: Any, sensors: Any) -> Any:
     """G (dense, n) and H of a filter's record whose step is the given one."""
     filter_ = make_estimator(name, vehicle=vehicle, sensors=sensors, speed=speed)
     f = filter_.filters[0]
@@ -28,30 +29,30 @@ def model_of(name, vehicle, speed, step, sensors):
 @pytest.mark.parametrize("step", STEPS)
 @pytest.mark.parametrize("speed", [1.5, 5.0, 12.5, 60.0])
 @pytest.mark.parametrize("vehicle", [COMS, PASSENGER_CAR], ids=["coms", "passenger-car"])
-def test_discretisation_is_the_exact_zero_order_hold(vehicle, speed, step):
+def test_discretisation_is_the_exact_zero_order_hold(vehicle: Any, speed: Any, step: Any) -> None:
     G, H = model_of("multirate-kf", vehicle, speed, step, {"camera": CAMERA})
     exact_G, exact_H = vision(vehicle, speed).discrete(step)
     assert np.abs(G - exact_G).max() < 1e-12 * max(1.0, np.abs(exact_G).max())
     assert np.abs(H - exact_H[:, :2]).max() < 1e-12 * np.abs(exact_H).max()
 
 
-def test_below_walking_pace_the_model_stays():
+def test_below_walking_pace_the_model_stays() -> None:
     G, _ = model_of("multirate-kf", COMS, 0.0, 0.001, {"camera": CAMERA})
     np.testing.assert_allclose(G, vision(COMS, 1.5).discrete(0.001)[0], atol=1e-13)
 
 
-def test_dakf_is_the_papers_discrete_model():
+def test_dakf_is_the_papers_discrete_model() -> None:
     """dakf-stability (5)-(17), written out."""
     V, T_c = 25.0 / 3.6, 0.001
-    m, I, l_f, l_r, C_f, C_r = 380.0, 136.08, 0.8, 0.6, 10000.0, 10000.0
+    m, I_z, l_f, l_r, C_f, C_r = 380.0, 136.08, 0.8, 0.6, 10000.0, 10000.0
     A_n = np.array(
         [
             [-2 * (C_f + C_r) / (m * V), -1 - 2 * (C_f * l_f - C_r * l_r) / (m * V**2), 0],  # (10)
-            [-2 * (C_f * l_f - C_r * l_r) / I, -2 * (C_f * l_f**2 + C_r * l_r**2) / (I * V), 0],
+            [-2 * (C_f * l_f - C_r * l_r) / I_z, -2 * (C_f * l_f**2 + C_r * l_r**2) / (I_z * V), 0],
             [0, 1, 0],
         ]
     )
-    B_n = np.array([[2 * C_f / (m * V), 0], [2 * C_f * l_f / I, 1 / I], [0, 0]])  # (11)
+    B_n = np.array([[2 * C_f / (m * V), 0], [2 * C_f * l_f / I_z, 1 / I_z], [0, 0]])  # (11)
     D_n = np.array([[1.0, 0], [0, 1], [0, 0]])  # (7)
     grid = (np.arange(50) + 0.5) * T_c / 50
     integral = sum(expm(A_n * t) for t in grid) * T_c / 50  # (13)
@@ -68,14 +69,14 @@ def test_dakf_is_the_papers_discrete_model():
     assert filter_.names == ("beta", "gamma", "psi", "d1", "d2")
 
 
-def rank(A, C):
+def rank(A: Any, C: Any) -> Any:
     rows = [C]
     for _ in range(len(A) - 1):
         rows.append(rows[-1] @ A)
     return np.linalg.matrix_rank(np.vstack(rows), tol=1e-9)
 
 
-def test_dakf_sees_four_of_five_directions():
+def test_dakf_sees_four_of_five_directions() -> None:
     """The paper's IV.D claims five."""
     V = 25.0 / 3.6
     model = course(COMS, V)
@@ -94,15 +95,15 @@ def test_dakf_sees_four_of_five_directions():
     assert np.abs(A @ direction).max() < 2e-3 * np.abs(direction).max()  # four digits are printed
 
 
-def test_vision_sees_everything():
+def test_vision_sees_everything() -> None:
     model = vision(COMS, 25.0 / 3.6)
     assert rank(model.A, model.C) == 4
     assert rank(model.A, model.C[1:]) == 4  # from vision alone
     assert make_estimator("multirate-kf", sensors={"camera": CAMERA}, speed=7.0).unobservable == ()
 
 
-def test_the_course_noise_grows_as_one_over_speed():
-    def sd(**options):
+def test_the_course_noise_grows_as_one_over_speed() -> None:
+    def sd(**options: Any) -> Any:
         filter_ = make_estimator("course-kf", sensors={"gps": GPS}, **options)
         return math.degrees(math.sqrt(filter_.filters[0].r[1, 0]))
 
@@ -111,7 +112,7 @@ def test_the_course_noise_grows_as_one_over_speed():
     assert sd(speed=25.0 / 3.6, course_noise=math.radians(0.5)) == pytest.approx(0.5)
 
 
-def test_process_noise_means_the_same_at_every_tick():
+def test_process_noise_means_the_same_at_every_tick() -> None:
     fine = make_estimator("bicycle-kf", speed=7.0, q_beta=1e-3)
     coarse = make_estimator("bicycle-kf", speed=7.0, q_beta=1e-3, dt=0.01)
     single = make_estimator(

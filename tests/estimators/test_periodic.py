@@ -1,10 +1,12 @@
 """Periodic gains are the covariance filter's limit."""
 
+from typing import Any
+
 import numpy as np
 import pytest
+
 from sideslip.envs.record import FAST, Record, SlowSensor
 from sideslip.estimators import make_estimator
-
 from tests.estimators.simulation import CAMERA, FIG7, GPS, simulate
 
 SETS = {
@@ -18,9 +20,9 @@ LONG = type(FIG7)(duration=80.0)
 
 @pytest.mark.parametrize("name", ["multirate-kf", "single-rate-kf"])
 @pytest.mark.parametrize("which", SETS)
-def test_periodic_gains_equal_the_covariance_filters_limit(name, which):
+def test_periodic_gains_equal_the_covariance_filters_limit(name: Any, which: Any) -> None:
     log = simulate(LONG, SETS[which], 0)
-    common = {"sensors": log.slow, "speed": LONG.speed, "q_psi": 1e-5}
+    common: dict[str, Any] = {"sensors": log.slow, "speed": LONG.speed, "q_psi": 1e-5}
     if "camera" in log.slow:
         common["q_y_l"] = 1e-4
     periodic = make_estimator(name, gains="periodic", **common)
@@ -32,7 +34,7 @@ def test_periodic_gains_equal_the_covariance_filters_limit(name, which):
     np.testing.assert_allclose(periodic.P, covariance.P, rtol=1e-7, atol=1e-18)
 
 
-def test_gains_have_a_limit_where_the_covariance_has_none():
+def test_gains_have_a_limit_where_the_covariance_has_none() -> None:
     with pytest.warns(UserWarning, match="cannot see"):
         filter_ = make_estimator("dakf", sensors={"gps": GPS}, speed=7.0, gains="periodic")
     filter_.P  # noqa: B018  designs the table
@@ -40,7 +42,7 @@ def test_gains_have_a_limit_where_the_covariance_has_none():
     assert filter_.spectral_radius == pytest.approx(1.0, abs=1e-9)
 
 
-def test_gains_are_made_for_each_speed_when_it_is_reached():
+def test_gains_are_made_for_each_speed_when_it_is_reached() -> None:
     """A filter that measures its speed has, at a held one, the gains of the nearest table."""
     log = simulate(FIG7, {"camera": CAMERA}, 1)
     measured = make_estimator("multirate-kf", sensors=log.slow)
@@ -53,7 +55,7 @@ def test_gains_are_made_for_each_speed_when_it_is_reached():
     assert measured.gains[cell - 1].max() == 0.0  # never asked for
 
 
-def test_a_changing_speed_rebuilds_the_model_by_half_a_percent():
+def test_a_changing_speed_rebuilds_the_model_by_half_a_percent() -> None:
     rows = np.zeros((4000, 10))
     rows[:, FAST.wheel_left] = rows[:, FAST.wheel_right] = np.linspace(3.0, 12.0, 4000)
     filter_ = make_estimator("multirate-kf", sensors={"camera": CAMERA})
@@ -70,7 +72,7 @@ def test_a_changing_speed_rebuilds_the_model_by_half_a_percent():
 
 
 @pytest.mark.parametrize("name", ["multirate-kf", "exact-kf", "single-rate-kf"])
-def test_equal_bits_however_the_ticks_are_chunked(name):
+def test_equal_bits_however_the_ticks_are_chunked(name: Any) -> None:
     log = simulate(type(FIG7)(duration=1.0), {"camera": CAMERA}, 2)
     log.record.fast[:, FAST.wheel_left] *= np.linspace(1.0, 1.3, 1001)
     whole = make_estimator(name, sensors=log.slow).run(log)
@@ -86,11 +88,11 @@ def test_equal_bits_however_the_ticks_are_chunked(name):
 
 
 @pytest.mark.parametrize("name", ["multirate-residual-kf", "exact-kf", "single-rate-kf"])
-def test_predict_and_update_are_the_same_filter(name):
+def test_predict_and_update_are_the_same_filter(name: Any) -> None:
     log = simulate(type(FIG7)(duration=0.5), {"camera": CAMERA}, 3)
     whole = make_estimator(name, sensors=log.slow, speed=FIG7.speed).run(log)
     filter_ = make_estimator(name, sensors=log.slow, speed=FIG7.speed)
-    due = {}
+    due: dict[int, Any] = {}
     for packet in log.record.packets:
         due.setdefault(int(packet[2]), []).append(packet)
     for k, row in enumerate(log.record.fast):
@@ -101,7 +103,7 @@ def test_predict_and_update_are_the_same_filter(name):
     assert filter_.tick == 500
 
 
-def test_a_snapshot_continues_bit_for_bit():
+def test_a_snapshot_continues_bit_for_bit() -> None:
     log = simulate(type(FIG7)(duration=0.5), {"camera": CAMERA}, 4)
     filter_ = make_estimator("exact-kf", sensors=log.slow, speed=FIG7.speed)
     halves = [

@@ -1,15 +1,16 @@
 """What diverges is refused with its number; what cannot be seen is named."""
 
 import re
+from typing import Any
 
 import numpy as np
 import pytest
+
 from sideslip.envs.record import SlowSensor
 from sideslip.envs.vehicle import COMS
 from sideslip.estimators import UnobservableWarning, make_estimator
 from sideslip.estimators.periodic import design
 from sideslip.estimators.stability import error_map, spectral_radius
-
 from tests.estimators.simulation import CAMERA, FIG6, GPS, Drive, simulate
 
 ALL = [
@@ -24,12 +25,14 @@ ALL = [
 ]
 
 
-def quiet(drive, sensors):
+def quiet(drive: Any, sensors: Any) -> Any:
     return simulate(drive, sensors, 0, disturbed=False, quiet=True)
 
 
 @pytest.mark.parametrize(("name", "sensors"), ALL)
-def test_without_noise_every_error_dies_out_as_its_spectral_radius_says(name, sensors):
+def test_without_noise_every_error_dies_out_as_its_spectral_radius_says(
+    name: Any, sensors: Any
+) -> None:
     """The error of a filter that starts wrong on a quiet, exactly known car."""
     drive = Drive(real=6000.0, duration=12.0)
     log = quiet(drive, sensors)
@@ -51,7 +54,7 @@ def test_without_noise_every_error_dies_out_as_its_spectral_radius_says(name, se
     assert np.abs(filter_.x - truth)[:2].max() < left + hold + 1e-6
 
 
-def test_the_error_map_is_what_the_compiled_filter_does():
+def test_the_error_map_is_what_the_compiled_filter_does() -> None:
     """Column by column: a small error put in comes out as the map says, one cycle later."""
     sensors = {"camera": SlowSensor(0.033, (0.020, 0.010))}
     for name in ("multirate-kf", "multirate-residual-kf"):
@@ -79,15 +82,15 @@ def test_the_error_map_is_what_the_compiled_filter_does():
             np.testing.assert_allclose(-filter_.filters[0].x[:N], M[:N, column], atol=1e-12)
 
 
-def test_a_filter_whose_error_grows_is_refused_with_the_number():
-    options = {"sensors": {"camera": CAMERA}, "speed": 40.0}
+def test_a_filter_whose_error_grows_is_refused_with_the_number() -> None:
+    options: dict[str, Any] = {"sensors": {"camera": CAMERA}, "speed": 40.0}
     with pytest.raises(ValueError, match=r"multirate-residual-kf.*factor of 1\.0\d+.*40 m/s"):
         make_estimator("multirate-residual-kf", **options)
     filter_ = make_estimator("multirate-residual-kf", allow_unstable=True, **options)
     assert filter_.spectral_radius > 1.0 + 1e-9
 
 
-def test_one_that_starts_to_diverge_on_the_way_is_refused_there():
+def test_one_that_starts_to_diverge_on_the_way_is_refused_there() -> None:
     filter_ = make_estimator("multirate-residual-kf", sensors={"camera": CAMERA})
     rows = np.zeros((10, 10))
     rows[:, 3:5] = 40.0
@@ -95,7 +98,7 @@ def test_one_that_starts_to_diverge_on_the_way_is_refused_there():
         filter_.step(rows, np.zeros((0, 9)))
 
 
-def test_the_unobservable_direction_is_named_and_warned_about():
+def test_the_unobservable_direction_is_named_and_warned_about() -> None:
     with pytest.warns(UnobservableWarning, match=r"beta 1, psi -1, d1 .*, d2 "):
         filter_ = make_estimator("dakf", sensors={"gps": GPS}, speed=7.0)
     assert len(filter_.unobservable) == 1
@@ -103,12 +106,12 @@ def test_the_unobservable_direction_is_named_and_warned_about():
 
 
 @pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning")
-def test_a_gyro_bias_drives_dakf_off():
+def test_a_gyro_bias_drives_dakf_off() -> None:
     """0.05 deg/s for 120 s at a standstill of everything else; the three-state filter stays."""
     still = Drive(amplitude=0.0, duration=120.0)
     bias = np.radians(0.05)
     log = simulate(still, {"gps": GPS}, 0, gyro_bias=bias, disturbed=False, quiet=True)
-    common = {"vehicle": FIG6.told, "sensors": log.slow, "speed": still.speed}
+    common: dict[str, Any] = {"vehicle": FIG6.told, "sensors": log.slow, "speed": still.speed}
     dakf = make_estimator("dakf", **common).run(log)["beta"]
     three = make_estimator("course-kf", **common).run(log)["beta"]
     assert dakf[-1] == pytest.approx(-120.0 * bias, rel=0.02)  # the whole integral of the bias
@@ -116,7 +119,7 @@ def test_a_gyro_bias_drives_dakf_off():
     assert abs(three[-1] - three[90_000]) < 1e-3 < abs(dakf[-1] - dakf[90_000])
 
 
-def test_random_delay_is_judged_by_its_extremes():
+def test_random_delay_is_judged_by_its_extremes() -> None:
     sensors = {"camera": SlowSensor(0.033, (0.010,), jitter=0.020)}
     filter_ = make_estimator("exact-kf", sensors=sensors, speed=7.0)
     ends = [
@@ -126,6 +129,6 @@ def test_random_delay_is_judged_by_its_extremes():
     assert filter_.spectral_radius == pytest.approx(max(e.spectral_radius for e in ends), abs=1e-9)
 
 
-def test_spectral_radius_of_a_rotation_is_its_growth():
+def test_spectral_radius_of_a_rotation_is_its_growth() -> None:
     turn = 1.25 * np.array([[0.0, -1.0], [1.0, 0.0]])
     assert spectral_radius(turn) == pytest.approx(1.25)

@@ -2,13 +2,15 @@
 
 import copy
 import json
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
-import sideslip  # noqa: F401  registers the environments
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
+
+import sideslip  # noqa: F401  registers the environments
 from sideslip.agents.rollout import rollout
 from sideslip.envs import COMS
 from sideslip.estimators import EstimateObservation, make_estimator
@@ -16,10 +18,10 @@ from sideslip.estimators import EstimateObservation, make_estimator
 pytestmark = pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning")
 
 VISION, UNEVEN, GPS = (f"sideslip/Yaw{kind}-v0" for kind in ("Vision", "VisionUneven", "Gps"))
-FIG7 = {"scenario": "tie-vision-fig7"}
+FIG7: dict[str, Any] = {"scenario": "tie-vision-fig7"}
 
 
-def still(env):
+def still(env: Any) -> Any:
     return np.zeros(env.action_space.shape, np.float32)
 
 
@@ -39,9 +41,11 @@ def still(env):
     ],
 )
 @pytest.mark.parametrize("control_period", [1, 10, 33])
-def test_the_wrapped_filter_equals_the_filter_on_the_log(env_id, name, control_period):
+def test_the_wrapped_filter_equals_the_filter_on_the_log(
+    env_id: Any, name: Any, control_period: Any
+) -> None:
     """Equal bits for every control period, and what is observed is what the filter says."""
-    env = gym.make(env_id, control_period=control_period, **FIG7)
+    env: Any = gym.make(env_id, control_period=control_period, **FIG7)
     wrapped = EstimateObservation(env, name)
     obs, info = wrapped.reset(seed=3, options={"duration": 0.7})
     start = info["beta_hat"]
@@ -61,9 +65,10 @@ def test_the_wrapped_filter_equals_the_filter_on_the_log(env_id, name, control_p
     np.testing.assert_array_equal(obs[-2:], found.std[-1, :2].astype(np.float32))
 
 
-def test_layout_and_space_describe_the_observation():
+@pytest.mark.smoke
+def test_layout_and_space_describe_the_observation() -> None:
     inner = gym.make(VISION)
-    env = EstimateObservation(inner, "multirate-kf", outputs=["beta", "y_l"])
+    env: Any = EstimateObservation(inner, "multirate-kf", outputs=["beta", "y_l"])
     names = [entry.name for entry in env.layout]
     assert names[: len(names) - 4] == [entry.name for entry in inner.get_wrapper_attr("layout")]
     assert names[-4:] == ["beta_hat", "y_l_hat", "beta_std", "y_l_std"]
@@ -78,8 +83,8 @@ def test_layout_and_space_describe_the_observation():
         check_env(alone, skip_render_check=True)
 
 
-def test_nees_is_the_normalised_error_per_output():
-    env = EstimateObservation(gym.make(VISION, **FIG7), "exact-kf")
+def test_nees_is_the_normalised_error_per_output() -> None:
+    env: Any = EstimateObservation(gym.make(VISION, **FIG7), "exact-kf")
     env.reset(seed=1)
     for _ in range(40):
         *_, info = env.step(still(env))
@@ -97,17 +102,17 @@ def test_nees_is_the_normalised_error_per_output():
     assert "nees" not in blind.reset(seed=0)[1]
 
 
-def test_it_is_the_innermost_wrapper_or_an_error():
+def test_it_is_the_innermost_wrapper_or_an_error() -> None:
     env = gym.wrappers.ClipAction(gym.make(VISION))
-    with pytest.raises(TypeError, match="innermost wrapper.*ClipAction"):
+    with pytest.raises(TypeError, match=r"innermost wrapper.*ClipAction"):
         EstimateObservation(env, "multirate-kf")
     with pytest.raises(TypeError, match="CartPoleEnv has no rows"):
         EstimateObservation(gym.make("CartPole-v1").unwrapped, "multirate-kf")
 
 
-def test_several_estimators_stand_side_by_side():
-    env = EstimateObservation(gym.make(VISION, **FIG7), "bicycle-kf", name="plain")
-    with pytest.raises(ValueError, match="plain_beta_hat.* would stand twice; give"):
+def test_several_estimators_stand_side_by_side() -> None:
+    env: Any = EstimateObservation(gym.make(VISION, **FIG7), "bicycle-kf", name="plain")
+    with pytest.raises(ValueError, match=r"plain_beta_hat.* would stand twice; give"):
         EstimateObservation(env, "exact-kf", name="plain")
     env = EstimateObservation(env, "exact-kf", std=False)
     env.reset(seed=0)
@@ -128,13 +133,14 @@ def test_several_estimators_stand_side_by_side():
         ({"estimator": "multirate-kf", "options": {"q": 1}}, TypeError, "no option 'q'"),
     ],
 )
-def test_wrong_arguments(options, error, message):
+def test_wrong_arguments(options: Any, error: Any, message: Any) -> None:
     with pytest.raises(error, match=message):
         EstimateObservation(gym.make(VISION), **options)
 
 
-def test_one_json_string_names_env_and_estimator():
-    env = EstimateObservation(
+@pytest.mark.smoke
+def test_one_json_string_names_env_and_estimator() -> None:
+    env: Any = EstimateObservation(
         gym.make(VISION, **FIG7),
         "multirate-kf",
         outputs=("beta",),
@@ -144,9 +150,10 @@ def test_one_json_string_names_env_and_estimator():
     )
     text = env.spec.to_json()
     json.loads(text)
-    again = gym.make(EnvSpec.from_json(text))
+    again: Any = gym.make(EnvSpec.from_json(text))
     assert again.spec.to_json() == text
-    first, second = env.reset(seed=5), again.reset(seed=5)
+    first: Any = env.reset(seed=5)
+    second: Any = again.reset(seed=5)
     np.testing.assert_array_equal(first[0], second[0])
     for _ in range(20):
         first, second = env.step(still(env)), again.step(still(env))
@@ -154,8 +161,8 @@ def test_one_json_string_names_env_and_estimator():
     assert first[-1] == second[-1]
 
 
-def test_snapshots_and_copies_continue_bit_for_bit():
-    env = EstimateObservation(gym.make(UNEVEN), "exact-kf")
+def test_snapshots_and_copies_continue_bit_for_bit() -> None:
+    env: Any = EstimateObservation(gym.make(UNEVEN), "exact-kf")
     env.reset(seed=2)
     for _ in range(25):
         env.step(still(env))
@@ -168,8 +175,8 @@ def test_snapshots_and_copies_continue_bit_for_bit():
     np.testing.assert_array_equal(once, copied)
 
 
-def test_a_reset_tells_the_filter_the_drawn_clock():
-    env = gym.make(VISION, camera={"phase": None})
+def test_a_reset_tells_the_filter_the_drawn_clock() -> None:
+    env: Any = gym.make(VISION, camera={"phase": None})
     wrapped = EstimateObservation(env, "exact-kf")
     phases = set()
     for seed in range(8):
@@ -183,8 +190,8 @@ def test_a_reset_tells_the_filter_the_drawn_clock():
     assert len(phases) > 1
 
 
-def test_a_reset_to_another_scenario_tells_the_filter():
-    env = EstimateObservation(gym.make(VISION, **FIG7), "exact-kf")
+def test_a_reset_to_another_scenario_tells_the_filter() -> None:
+    env: Any = EstimateObservation(gym.make(VISION, **FIG7), "exact-kf")
     env.reset(seed=0)
     assert env.estimator.filters[0].measured == 0
     env.reset(seed=0, options={"scenario": "uneven-delay-fig5"})

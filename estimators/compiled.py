@@ -1,0 +1,33 @@
+"""Compiled functions as plain calls."""
+
+from functools import cache
+from typing import Any
+
+import numba
+import numpy as np
+from numba.core.dispatcher import Dispatcher
+
+from ..envs.record import PACKET_WIDTH
+from .core import advance_filter, receive_filter
+from .memory import FILTER
+
+
+def entry(function: Any, *example: Any) -> Any:
+    """The compiled call of a function for arguments of the example's types.
+
+    numba finds out the types of the arguments at every call, which costs more than a filter's
+    step; this is the call without it, so arguments must have exactly these types and layouts.
+    """
+    if not isinstance(function, Dispatcher):
+        return function
+    return function.compile(tuple(map(numba.typeof, example)))
+
+
+@cache
+def entries() -> tuple[Any, Any]:
+    """(`advance_filter`, `receive_filter`) as plain calls."""
+    filters, gains, matrix = np.zeros(1, FILTER), np.zeros((1, 1, 1)), np.zeros((1, 1))
+    return (
+        entry(advance_filter, filters, gains, matrix, 0, matrix, 0, 0, matrix, matrix),
+        entry(receive_filter, filters, gains, np.zeros(PACKET_WIDTH)),
+    )

@@ -1,0 +1,29 @@
+"""What an estimator says about a whole record."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+
+
+class UnobservableWarning(UserWarning):
+    """A filter has a direction that its sensors cannot see."""
+
+
+@dataclass(frozen=True)
+class Estimates:
+    """What a filter said at every row of a record.
+
+    time: (K,) s. x, std: (K, n), states and standard deviations. names: of the n states.
+    """
+
+    time: Array
+    x: Array
+    std: Array
+    names: tuple[str, ...]
+
+    def __getitem__(self, name: str) -> Array:
+        """One state by name, (K,)."""
+        return self.x[:, self.names.index(name)]

@@ -1,0 +1,124 @@
+"""What a user may say about a filter: options, each checked where it comes in."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from .models import Model
+from .papers import Filter
+
+Array = npt.NDArray[np.float64]
+
+NOISE = {
+    "gyro_noise": 0.005,  # rad/s
+    "psi_noise": 3.5e-3,  # rad
+    "y_l_noise": 0.02,  # m
+    "course_noise": math.radians(0.14),  # rad at 60 km/h, growing as 1/V
+}
+DISTURBANCE = {"force_sd": 50.0, "moment_sd": 20.0, "disturbance_time": 0.3}  # N, N m, s
+PRIOR = {"beta": 0.02, "gamma": 0.05, "psi": 0.05, "y_l": 0.3, "d1": 0.1, "d2": 1.0}
+
+
+class Options:
+    """Options that must all be asked for."""
+
+    def __init__(self, name: str, options: Mapping[str, Any]) -> None:
+        self.name, self._left, self._known = name, dict(options), list[str]()
+
+    def has(self, key: str) -> bool:
+        """Whether the option was given and is not taken yet."""
+        return key in self._left
+
+    def take(self, key: str, default: Any) -> Any:
+        """The option, or its default."""
+        self._known.append(key)
+        return self._left.pop(key, default)
+
+    def one_of(self, key: str, default: str, known: Sequence[str]) -> str:
+        """An option that is one of some words; ValueError for another."""
+        value = self.take(key, default)
+        if value not in known:
+            raise ValueError(
+                f"{self.name}: {key} is one of {', '.join(filter(None, known))}, got {value!r}"
+            )
+        return str(value)
+
+    def number(self, key: str, default: float) -> float:
+        """A number; TypeError for anything else."""
+        value = self.take(key, default)
+        try:
+            return float(value)
+        except (TypeError, ValueError):
+            raise TypeError(f"{self.name}: {key} is a number, got {value!r}") from None
+
+    def positive(self, key: str, default: float) -> float:
+        """A number above zero; TypeError or ValueError for anything else."""
+        number = self.number(key, default)
+        if not (number > 0.0 and math.isfinite(number)):
+            raise ValueError(f"{self.name}: {key} must be positive and finite, got {number!r}")
+        return number
+
+    def done(self) -> None:
+        """TypeError for options that nothing asked for."""
+        if self._left:
+            raise TypeError(
+                f"{self.name} has no option {', '.join(map(repr, sorted(self._left)))}; "
+                f"it has: {', '.join(sorted(self._known))}"
+            )
+
+
+def process_noise(name: str, model: Model, tuning: Mapping[str, float], told: Options) -> Array:
+    """Q (n, n) per second."""
+    n = len(model.names)
+    Q: Array = np.diag([float(tuning.get(state, 0.0)) for state in model.names])
+    whole = told.take("Q", None)
+    if whole is not None:
+        given = np.array(whole, np.float64)
+        Q = np.diag(given) if given.ndim == 1 else given
+        if Q.shape != (n, n):
+            raise ValueError(f"{name}: Q has shape ({n}, {n}) or ({n},), got {np.shape(whole)}")
+    for i, state in enumerate(model.names):
+        Q[i, i] = told.number(f"q_{state}", Q[i, i])
+    _covariance(f"{name}: Q", Q)
+    return Q
+
+
+def _covariance(what: str, M: Array) -> None:
+    """ValueError unless M is finite, symmetric and positive semidefinite."""
+    if not np.isfinite(M).all():
+        raise ValueError(f"{what} is not finite")
+    if not np.allclose(M, M.T, rtol=1e-9, atol=0.0):
+        raise ValueError(f"{what} is not symmetric")
+    least = np.linalg.eigvalsh(M).min()
+    if least < -1e-12 * max(np.abs(M).max(), 1e-300):
+        raise ValueError(f"{what} is indefinite: its least eigenvalue is {least:.3g}")
+
+
+def noise_levels(name: str, row: Filter, told: Options) -> dict[str, float]:
+    """Standard deviations as `write_model` takes them."""
+    noise = {}
+    for key, default in NOISE.items():
+        if key == "course_noise" and told.has(key):
+            noise["course_fixed"] = told.positive(key, default)
+        noise[key.removesuffix("_noise")] = told.positive(key, default)
+    if row.disturbances == "forces":
+        keys = zip(("force", "moment", "time"), DISTURBANCE.items(), strict=True)
+        noise |= {short: told.positive(key, default) for short, (key, default) in keys}
+    return noise
+
+
+def prior_variances(
+    name: str, model: Model, noise: Mapping[str, float], prior: Mapping[str, float]
+) -> list[float]:
+    """The states' variances at the start."""
+    sd = PRIOR | {"F_d": noise.get("force", 0.0), "N_d": noise.get("moment", 0.0)}
+    for state, value in prior.items():
+        if state not in model.names:
+            raise ValueError(f"{name} has no state {state!r}; it has: {', '.join(model.names)}")
+        if not (float(value) >= 0.0 and math.isfinite(value)):
+            raise ValueError(f"{name}: the prior of {state} is a standard deviation, got {value!r}")
+        sd[state] = float(value)
+    return [sd[state] ** 2 for state in model.names]
