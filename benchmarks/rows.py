@@ -115,10 +115,8 @@ def read_json(path: str | Path) -> list[Row]:
         unknown = sorted(set(entry) - set(names))
         if unknown:
             raise ValueError(f"{path}: unknown column {', '.join(unknown)}")
-        floats = ("value", "low", "high")
-        rows.append(
-            Row(**{k: math.nan if v is None and k in floats else v for k, v in entry.items()})
-        )
+        known: dict[str, Any] = {k: math.nan if v is None else v for k, v in entry.items()}
+        rows.append(Row(**known))
     return rows
 
 

@@ -15,11 +15,25 @@ ASTRAY = 0.5  # rad: the first course sets the heading where it is so far off
 
 
 @jit
-def _align(f: Any, residual: Any) -> None:
-    """Turn the heading, and all clones of courses, onto the first course."""
-    f.x[2] += residual
-    for i in range(f.frames[GPS]):
-        f.x[f.home[GPS] + i] += residual
+def _expected(f: Any, s: int, i: int, first: int) -> Any:
+    """What the filter expects row i of a sample to be: a clone, or the states' combination."""
+    if first != DIRECT:
+        return f.x[first + i]
+    total = 0.0
+    for k in range(f.n):
+        total += f.row[s, i, k] * f.x[k]
+    return total
+
+
+@jit
+def _align(f: Any, course: Any, first: int) -> None:
+    """Turn the heading, and all clones of courses, onto a first course that is far off."""
+    turn = wrap(course - _expected(f, GPS, 0, first))
+    if absolute(turn) > ASTRAY:
+        f.x[2] += turn
+        f.expected[0] += turn
+        for i in range(f.frames[GPS]):
+            f.x[f.home[GPS] + i] += turn
 
 
 @jit
@@ -29,24 +43,18 @@ def use(f: Any, gains: Any, s: int, packet: Any) -> None:
     first = find(f, s, captured)
     if first == DROPPED:
         return
+    if s == GPS:
+        f.fixes += 1
+        if f.fixes == 1:
+            _align(f, packet[PACKET.value], first)
     if f.pseudo == 1:
         correct_sample(f, gains, s, packet[PACKET.value :])
         return
     frame = (captured - f.phase[s]) // f.period[s] % f.pattern
     for i in range(f.rows[s]):
-        residual = packet[PACKET.value + i]
-        if first == DIRECT:
-            for k in range(f.n):
-                residual -= f.row[s, i, k] * f.x[k]
-        else:
-            residual -= f.x[first + i]
+        residual = packet[PACKET.value + i] - _expected(f, s, i, first)
         if f.angle[s, i] == 1:
             residual = wrap(residual)
-        if s == GPS:
-            f.fixes += 1
-            if f.fixes == 1 and absolute(residual) > ASTRAY:
-                _align(f, residual)
-                residual = 0.0
         if f.periodic == 1:
             x, cell, at = f.x, f.cell, 1 + f.cycle + frame * f.rows[s] + i
             for j in range(f.total):

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 class Filter:
     """One row.
 
-    slow: slow sensors it can use ("" for none at all). intersample: of `intersample.RULES`; gains:
-    "periodic" or "covariance" (what it does when not told). disturbances: of `models.DISTURBANCES`.
-    delay: of `delay.RULES`. sources: where it comes from.
+    slow: slow sensors it can use, the preferred first (none: the gyro alone). intersample: of
+    `intersample.RULES`. gains: "periodic" or "covariance" (what it does when not told).
+    disturbances: of `models.DISTURBANCES`. delay: of `delay.RULES`. source: where it comes from.
     """
 
     slow: tuple[str, ...]

@@ -134,8 +134,8 @@ def test_a_snapshot_is_not_changed_by_what_follows(name: str) -> None:
     snapshot = env.get_state()
     futures = []
     for _ in range(3):  # a tree search goes back again and again
-        env.set_state(snapshot)
         futures.append(bits((play(env, [0.1] * 50), env.reset(), play(env, [0.2] * 10))))
+        env.set_state(snapshot)
     assert futures[0] == futures[1] == futures[2]
 
 

@@ -50,27 +50,27 @@ def test_every_scenario_from_standstill_on_ice(name: str) -> None:
     assert np.all(np.isfinite(fast_rows(moments)))
 
 
-magnitudes = st.floats(-3.0, 3.0).map(lambda power: 10.0**power)
+def around(typical: float) -> st.SearchStrategy[float]:
+    """From a thousandth to a thousand times a typical value."""
+    return st.floats(-3.0, 3.0).map(lambda power: float(typical * 10.0**power))
+
+
+TYPICAL = {
+    "mass": 500.0,
+    "yaw_inertia": 200.0,
+    "front_arm": 1.0,
+    "rear_arm": 1.0,
+    "front_stiffness": 6000.0,
+    "rear_stiffness": 6000.0,
+    "wheel_radius": 0.3,
+    "rear_track": 1.0,
+    "motor_torque": 100.0,
+}
 
 
 @settings(max_examples=150)
 @given(
-    vehicle=st.fixed_dictionaries(
-        {
-            name: magnitudes.map(lambda size, typical=typical: size * typical)
-            for name, typical in (
-                ("mass", 500.0),
-                ("yaw_inertia", 200.0),
-                ("front_arm", 1.0),
-                ("rear_arm", 1.0),
-                ("front_stiffness", 6000.0),
-                ("rear_stiffness", 6000.0),
-                ("wheel_radius", 0.3),
-                ("rear_track", 1.0),
-                ("motor_torque", 100.0),
-            )
-        }
-    ),
+    vehicle=st.fixed_dictionaries({name: around(value) for name, value in TYPICAL.items()}),
     state=st.fixed_dictionaries(
         {name: st.floats(-50.0, 50.0) for name in ("v_x", "v_y", "gamma", "psi", "theta", "s")}
     ),

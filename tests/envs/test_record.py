@@ -74,17 +74,20 @@ def test_row_k_holds_the_inputs_that_acted_from_k_minus_1_to_k() -> None:
 
 
 @pytest.mark.plain
-def test_inputs_of_the_rows_replay_the_drive_bit_for_bit() -> None:
-    """Who has the record and the model has the truth: no input is late, early or missing."""
-    env = StabilityEnv(scenario=LINEAR | SWERVING, control_period=10)
+def test_inputs_of_the_rows_and_the_wind_replay_the_drive_bit_for_bit() -> None:
+    """Who has these and the model has the truth: no input is late, early or missing."""
+    wind = {"wind_force": 200.0, "wind_arm": 0.2, "wind_start": 0.1, "wind_length": 0.15}
+    env = StabilityEnv(scenario=LINEAR | SWERVING | wind, control_period=10)
     env.reset(seed=3)
-    car, road, calm = car_of(COMS), Road(0.0, 20.0, 20.0), Push(0.0, 0.0)
+    car, road = car_of(COMS), Road(0.0, 20.0, 20.0)
     state = Motion(25.0 / 3.6, *[0.0] * 8)
     for moment in play(env, np.random.default_rng(1).uniform(-1.0, 1.0, 30)):
-        for row in moment.record.fast.tolist():
+        for tick, row in zip(moment.record.ticks, moment.record.fast.tolist(), strict=True):
             inputs = Inputs(row[FAST.steer], row[FAST.torque_left], row[FAST.torque_right])
             load = load_of(inputs, car, 1)
-            state = rk4(state, (load, load, load), calm, car, road, TICK, 1, LINEAR_TYRES)
+            blows = 100 < tick <= 250  # it acts from tick 100 to tick 250
+            push = Push(200.0, 0.2 * 200.0) if blows else Push(0.0, 0.0)
+            state = rk4(state, (load, load, load), push, car, road, TICK, 1, LINEAR_TYRES)
         assert (state.gamma, state.psi) == (moment.info["gamma"], moment.info["psi"])
     truth = env.get_state()["state"][Z.motion : Z.motion + len(state)]
     assert bits(np.array(state)) == bits(truth)

@@ -194,7 +194,7 @@ def test_rows_that_are_not_finite_are_skipped(name: Any) -> None:
 
 def test_the_first_course_far_off_sets_the_heading() -> None:
     """A log whose heading does not start at zero; courses are wrapped."""
-    for name in ("multirate-kf", "course-kf"):
+    for name in ("multirate-kf", "multirate-residual-kf", "course-kf"):
         filter_ = make_estimator(name, sensors={"gps": GPS}, speed=7.0)
         rows = np.zeros((1001, 10))
         for heading in (2.0, -3.0):

@@ -103,6 +103,19 @@ def test_predict_and_update_are_the_same_filter(name: Any) -> None:
     assert filter_.tick == 500
 
 
+def test_a_record_may_start_at_any_tick() -> None:
+    sensors = {"camera": SlowSensor(0.033, (0.020, 0.010), phase=0.004)}
+    log = simulate(type(FIG7)(duration=0.5), sensors, 5)
+    later = log.record.packets.copy()
+    later[:, 1:3] += 660.0
+    for name in ("multirate-kf", "single-rate-kf", "exact-kf"):
+        filter_ = make_estimator(name, sensors=sensors, speed=FIG7.speed)
+        once = filter_.run(log.record)
+        again = filter_.run(Record(log.record.fast, later, 660))
+        np.testing.assert_array_equal(once.x, again.x)
+        assert again.time[0] == pytest.approx(0.660)
+
+
 def test_a_snapshot_continues_bit_for_bit() -> None:
     log = simulate(type(FIG7)(duration=0.5), {"camera": CAMERA}, 4)
     filter_ = make_estimator("exact-kf", sensors=log.slow, speed=FIG7.speed)

@@ -1,0 +1,98 @@
+"""The papers' simulations by name, exactly as PAPERS section 1 gives them."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sideslip.envs import COMS, SCENARIOS, StabilityEnv
+from sideslip.envs.layout import P
+
+pytestmark = pytest.mark.plain
+
+PAPERS = [name for name, scenario in SCENARIOS.items() if not scenario.scored]
+TYRES = ("front_stiffness", "rear_stiffness")
+SINE = {"steering": "sine", "amplitude": 0.1, "frequency": 0.5, "onset": 0.0, "duration": 10.0}
+ONE_PERIOD = {"steering": "lane-change", "amplitude": 0.13, "frequency": 0.5, "onset": 0.5}
+# PAPERS section 1: fields, real tyres, nominal tyres, OU, noise
+TABLE: dict[str, tuple[dict[str, Any], float, float, bool, dict[str, float]]] = {
+    "tie-vision-fig7": (SINE, 7200.0, 6000.0, True, {}),
+    "tie-vision-fig8": (
+        ONE_PERIOD | {"duration": 5.0},
+        6000.0,
+        6000.0,
+        False,
+        {"camera_psi": 0.0005, "camera_y": 0.003},
+    ),
+    "tie-vision-fig8-stiff": (
+        ONE_PERIOD | {"duration": 5.0},
+        7200.0,
+        6000.0,
+        False,
+        {"camera_psi": 0.0005, "camera_y": 0.003},
+    ),
+    "uneven-delay-fig5": (
+        SINE | {"camera_delays": (0.020, 0.015, 0.010, 0.025)},
+        7200.0,
+        6000.0,
+        False,
+        {"camera_psi": 0.001, "camera_y": 0.01},
+    ),
+    "uneven-delay-fig5-noisy": (
+        SINE | {"camera_delays": (0.020, 0.015, 0.010, 0.025)},
+        7200.0,
+        6000.0,
+        False,
+        {"camera_psi": 0.003, "camera_y": 0.03},
+    ),
+    "dakf-fig6": (
+        {
+            **{"steering": "lane-change", "amplitude": 0.2, "frequency": 0.2, "onset": 0.5},
+            **{"wind_force": 200.0, "wind_arm": 0.2, "wind_start": 4.0, "wind_length": 4.0},
+            **{"gps_outage": (4.0, 6.0), "duration": 10.0},
+        },
+        7000.0,
+        10000.0,
+        True,
+        {},
+    ),
+}
+
+
+def test_every_paper_simulation_stands_in_the_table() -> None:
+    assert set(TABLE) == set(PAPERS)
+
+
+@pytest.mark.smoke
+@pytest.mark.parametrize("name", TABLE)
+def test_papers_simulations_are_as_PAPERS_gives_them(name: str) -> None:
+    fields, real, told, disturbed, noise = TABLE[name]
+    scenario = SCENARIOS[name]
+    for field, value in fields.items():
+        assert getattr(scenario, field) == value, field
+    assert scenario.held_speed == 25.0 / 3.6
+    assert (scenario.small_angle, scenario.linear_tyres, scenario.lags) == (True, True, False)
+    assert (scenario.disturbance_force, scenario.disturbance_moment, scenario.disturbance_time) == (
+        (50.0, 20.0, 0.3) if disturbed else (0.0, 0.0, 0.3)
+    )
+    assert dict(scenario.noise) == noise
+    assert scenario.wind_force == fields.get("wind_force", 0.0)
+    low, high = scenario.draws()
+    np.testing.assert_array_equal(low, high)  # nothing is drawn
+    env = StabilityEnv("gps" if "dakf" in name else "vision", scenario=name)
+    for seed in (0, 1):
+        env.reset(seed=seed)
+        assert [getattr(env.vehicle, tyre) for tyre in TYRES] == [real, real]
+        assert [getattr(env.nominal, tyre) for tyre in TYRES] == [told, told]
+        assert env.vehicle.replace(front_stiffness=6000.0, rear_stiffness=6000.0) == COMS
+        assert env.redraws == 0
+
+
+def test_ou_disturbance_has_the_stated_size_and_time() -> None:
+    env = StabilityEnv(scenario="tie-vision-fig7")
+    env.reset(seed=0)
+    force, moment, keep, fresh = env.get_state()["params"][P.disturbance :][:4]
+    assert (force, moment) == (50.0, 20.0)
+    assert keep == math.exp(-0.001 / 0.3)
+    assert fresh**2 + keep**2 == pytest.approx(1.0, abs=1e-15)  # stationary
