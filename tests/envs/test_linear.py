@@ -69,7 +69,6 @@ def seen(
     return np.array(dx[: len(x)]), np.array([outputs[name] for name in names])
 
 
-@pytest.mark.smoke
 @pytest.mark.parametrize("vehicle", VEHICLES, ids=lambda each: each.name)
 @pytest.mark.parametrize("name", MODELS)
 @pytest.mark.parametrize("small_angle", [1, 0])
@@ -107,6 +106,7 @@ def test_matrices_are_the_plants_jacobian(
     assert np.abs(difference[n:]).max() <= error * np.abs(exact[n:] * size).max()
 
 
+@pytest.mark.smoke
 @pytest.mark.parametrize("V_x", SPEEDS)
 def test_vision_is_tie_vision_8_letter_by_letter(V_x: float) -> None:
     m, I, l_f, l_r, C_f, C_r, l_pre = 380.0, 136.08, 0.8, 0.6, 6000.0, 6000.0, 5.135  # noqa: E741

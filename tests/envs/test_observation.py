@@ -88,13 +88,13 @@ def test_before_the_first_packet_the_age_is_at_its_cap() -> None:
     for moment in [None, *play(env, [0.5] * 12)]:
         now = obs if moment is None else moment.obs
         assert now[at["camera_psi"]] == now[at["camera_y_l"]] == now[at["camera_fresh"]] == 0.0
-        assert now[at["camera_age"]] == AGE_CAP
+        assert now[at["camera_age"]] == 10.0
     gone = LINEAR | {"camera_outage": (0.02, 60.0), "duration": 60.0}
     env = StabilityEnv(scenario=gone, control_period=1000)
     env.reset(seed=0)
     moments = play(env, [0.0] * 15)
     assert moments[4].obs[at["camera_age"]] == np.float32(5.0)  # captured at tick 0
-    assert moments[-1].obs[at["camera_age"]] == AGE_CAP
+    assert moments[-1].obs[at["camera_age"]] == 10.0
 
 
 @pytest.mark.parametrize("name", IDS)
