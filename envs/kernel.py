@@ -481,7 +481,7 @@ def step_vehicle(
         if finite - finite != 0.0:  # squares: the references take them too
             failure = NOT_FINITE
             motion, beta, refs = before, 0.0, (0.0, 0.0)  # the last that is fit for `info`
-        elif absolute(beta) > task.spin:
+        elif absolute(beta) > task.spin and v_x > 0.0:  # backing up is no spin
             failure = SPIN
         elif absolute(motion.y) > task.half_width:
             failure = OFF_ROAD

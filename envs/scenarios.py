@@ -25,7 +25,8 @@ class Scenario:
     steering: a kind of `STEERING_KINDS`, built from onset, amplitude, frequency (random: two pairs
     of sines) and hold (step). mirror: the seed draws the side of steering and wind. front_stiffness
     and rear_stiffness are factors on the vehicle's; draws that make the car unstable at the drawn
-    speed are drawn again and counted. acceleration: None holds the speed. disturbance_*: an
+    speed are drawn again and counted. friction is the road's and replaces the vehicle's.
+    acceleration: None holds the speed. disturbance_*: an
     Ornstein-Uhlenbeck force and moment. vehicle and nominal: parameters that replace those of the
     env. noise: sensor noise that replaces the default. camera_delays: a repeating pattern that
     replaces the id's. small_angle, linear_tyres, lags: the plant.
@@ -232,7 +233,7 @@ _ALL = (
         wind_length=(1.0, 4.0),
         **_DRAWN,
     ),
-    # The papers' simulations as PAPERS section 1 gives them: fixed, never part of a score.
+    # The papers' simulations, with what they leave open chosen once: fixed, never in a score.
     Scenario(
         name="tie-vision-fig7",
         steering="sine",

@@ -214,7 +214,10 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
         if state:
             known = ", ".join(Motion._fields)
             raise ValueError(f"unknown state {', '.join(state)}; known: {known}")
-        return self._template(scenario, vehicle)
+        template = self._template(scenario, vehicle)
+        if not np.isnan(start[0]):  # the car starts at another speed than it holds
+            template = dataclasses.replace(template, held_speed=None)
+        return template
 
     def step(
         self, action: npt.ArrayLike
@@ -312,7 +315,7 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
     @property
     def held_speed(self) -> float | None:
         """The speed in m/s that is held exactly (small-angle plant), else None."""
-        return self._now.scenario.held_speed
+        return self._now.held_speed
 
     @property
     def slow_sensors(self) -> dict[str, SlowSensor]:

@@ -25,7 +25,8 @@ class Template:
     """What a reset starts from.
 
     params: (P.end,) packed parameters. low, high: (len(Draws),) ranges. switches: (6,) int64.
-    vehicle, nominal: with the scenario's replacements. duration: ticks.
+    vehicle, nominal: with the scenario's replacements. held_speed: m/s, where it is one number
+    and held exactly. duration: ticks.
     """
 
     params: Array
@@ -36,6 +37,7 @@ class Template:
     nominal: Vehicle
     scenario: Scenario
     slow: dict[str, SlowSensor]
+    held_speed: float | None
 
     @property
     def duration(self) -> int:
@@ -124,4 +126,5 @@ def template_of(
         int(fail_bad),
     )
     packed = np.array(switches, dtype=np.int64)
-    return Template(params, low, high, packed, vehicle, nominal, scenario, slow)
+    held = scenario.held_speed
+    return Template(params, low, high, packed, vehicle, nominal, scenario, slow, held)

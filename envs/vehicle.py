@@ -44,7 +44,7 @@ class Vehicle:
     motor_lag: float = _unit("s", "time constant of the motors", 0.005)
     steering_lag: float = _unit("s", "time constant of the steering actuator", 0.03)
     preview: float = _unit("m", "l_pre, the camera's preview distance", 5.135)
-    friction: float = _unit("-", "mu, tyre to road", 0.9)
+    friction: float = _unit("-", "mu, tyre to road (a scenario has its own)", 0.9)
 
     def __post_init__(self) -> None:
         for entry in dataclasses.fields(self):

@@ -35,5 +35,5 @@ FILTERS: dict[str, Filter] = {
     ),
     "course-kf": Filter(("gps",), "predict", "covariance", "none", "clone", "dakf-stability [10]"),
     "dakf": Filter(("gps",), "predict", "covariance", "walk", "clone", "dakf-stability (5)-(20)"),
-    "exact-kf": Filter(ANY, "predict", "covariance", "forces", "clone", "PAPERS section 3"),
+    "exact-kf": Filter(ANY, "predict", "covariance", "forces", "clone", "docs/PAPERS.md section 3"),
 }

@@ -154,3 +154,25 @@ def test_before_the_first_reset_the_env_can_be_asked(env: StabilityEnv) -> None:
     assert env.dt == 0.001
     assert list(env.slow_sensors) == ["camera"]
     assert len(env.record.fast) == len(env.record.packets) == 0
+
+
+def test_a_car_that_starts_at_another_speed_holds_none() -> None:
+    """Estimators are told a speed only where it is really held from the start."""
+    env = StabilityEnv(scenario="tie-vision-fig7")
+    env.reset(seed=0)
+    assert env.held_speed == pytest.approx(25 / 3.6)
+    env.reset(seed=0, options={"state": {"v_x": 5.0}})
+    assert env.held_speed is None
+    env.reset(seed=0)
+    assert env.held_speed == pytest.approx(25 / 3.6)
+
+
+def test_backing_up_is_no_spin() -> None:
+    scenario = {"speed": 1.0, "acceleration": -1.0, "duration": 4.0, "disturbance_force": 0.0}
+    env = StabilityEnv(scenario=scenario)
+    env.reset(seed=0)
+    over, info = False, dict[str, Any]()
+    while not over:
+        _, _, terminated, truncated, info = env.step(np.zeros(1, np.float32))
+        over = terminated or truncated
+    assert info["failure"] == 0 and info["is_success"]

@@ -93,7 +93,7 @@ def test_unstable_draws_are_drawn_again_and_counted() -> None:
     drawn, lost = draws("straight", 1000)
     assert all(stable(each, CAR) for each in drawn)
     share = sum(lost) / (1000 + sum(lost))
-    assert 0.0 < share < 0.15  # DESIGN: 15 % at 40 km/h, where these are fastest
+    assert 0.0 < share < 0.15  # 15 % at 40 km/h, where these are fastest
     fast = scenario_from({"base": "straight", "speed": 40.0 / 3.6})
     low, high = fast.draws()
     lost = [realise(low, high, key, 1, CAR, np.zeros(DRAWS_WIDTH))[1] for key in range(2000)]
