@@ -4,11 +4,12 @@
 if __name__ != "sideslip.envs":
     raise ImportError(f"this folder is the package sideslip.envs; it was imported as {__name__}")
 
-from .kernel import FAILURES
 from .layout import Entry
+from .manoeuvres import SCENARIOS, scenario_from
 from .record import Log, Record, SlowSensor
-from .scenarios import SCENARIOS, Scenario, scenario_from
+from .scenario import Scenario
 from .stability import StabilityEnv
+from .switches import FAILURES
 from .vehicle import COMS, PASSENGER_CAR, VEHICLES, Vehicle, critical_speed, vehicle_from
 
 __all__ = [

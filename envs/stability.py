@@ -11,12 +11,15 @@ import numpy.typing as npt
 from gymnasium.error import ResetNeeded
 
 from .dynamics import Motion
-from .kernel import REFUSED, REPORT, RUNNING, reset_vehicle, step_vehicle
+from .kernel import step_vehicle
 from .layout import Entry, P, Z, observation_layout
+from .manoeuvres import scenario_from
 from .programme import DRAWS_WIDTH
 from .record import FAST_WIDTH, PACKET_WIDTH, SLOW_NAMES, TICK, Record, SlowSensor
-from .scenarios import Scenario, scenario_from
+from .restart import reset_vehicle
+from .scenario import Scenario
 from .sensors import IN_FLIGHT, ticks
+from .switches import REFUSED, REPORT, RUNNING
 from .template import Template, template_of
 from .vehicle import Vehicle, vehicle_from
 

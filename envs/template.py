@@ -8,13 +8,13 @@ import numpy.typing as npt
 
 from .actuators import lag_of
 from .dynamics import FIALA, LINEAR, Car, Road
-from .kernel import Switches
 from .layout import Array, Disturbance, P, Task
 from .programme import FOREVER, STEERING_KINDS, STEERING_WIDTH, Pace
 from .record import TICK, SlowSensor
 from .reference import REFERENCES, target_of
-from .scenarios import Scenario
+from .scenario import Scenario
 from .sensors import Noise, link_of, ticks
+from .switches import Switches
 from .vehicle import Vehicle
 
 SPIN_ANGLE = 0.5  # rad of sideslip: the car has spun

@@ -14,6 +14,7 @@ from sideslip.envs import (
     kernel,
     noise,
     programme,
+    restart,
     stability,
 )
 from sideslip.envs.backend import ARRAYS, plain
@@ -133,6 +134,6 @@ def test_whole_steps(name: str, arguments: dict[str, Any], monkeypatch: pytest.M
         return bits((start, first, moments, env.get_state()["state"], env.get_state()["params"]))
 
     compiled = episode()
-    monkeypatch.setattr(stability, "reset_vehicle", plain(kernel.reset_vehicle))
+    monkeypatch.setattr(stability, "reset_vehicle", plain(restart.reset_vehicle))
     monkeypatch.setattr(stability, "step_vehicle", plain(kernel.step_vehicle))
     assert episode() == compiled

@@ -1,0 +1,129 @@
+"""Sensors at a tick: sample the state, put packets on their way, deliver those that arrive.
+
+Packets are delivered in the order (captured tick, sensor); what is under way lies in the state.
+"""
+
+from typing import Any
+
+from .backend import fixed_tuple, jit, minimum
+from .dynamics import Road
+from .layout import P, Z
+from .noise import CHANNELS, normals
+from .record import CAMERA, FAST, GPS, PACKET, PACKET_WIDTH, VALUES
+from .sensors import IN_FLIGHT, NEVER, Link, Noise, arrivals, camera_sample, gps_sample
+
+FAR = 1e15
+_LINK, _NOISE, _ROAD = len(Link._fields), len(Noise._fields), len(Road._fields)
+
+
+@jit
+def store(vector: Any, start: int, values: Any) -> None:
+    """Write a tuple into a vector from `start` on."""
+    for i in range(len(values)):
+        vector[start + i] = values[i]
+
+
+@jit
+def _push(z: Any, sensor: int, captured: Any, due: Any, quality: Any, frame: Any, v: Any) -> None:
+    """Put a captured sample on its way; the arrays' room was checked when the env was built."""
+    for slot in range(IN_FLIGHT):
+        at = Z.queue + (sensor * IN_FLIGHT + slot) * PACKET_WIDTH
+        if z[at + PACKET.arrived] == NEVER:
+            z[at + PACKET.sensor] = sensor
+            z[at + PACKET.captured] = captured
+            z[at + PACKET.arrived] = due
+            z[at + PACKET.quality] = quality
+            z[at + PACKET.sequence] = frame
+            for i in range(VALUES):
+                z[at + PACKET.value + i] = v[i]
+            break
+    z[Z.clock + 5] = minimum(z[Z.clock + 5], due)
+
+
+@jit
+def _capture(z: Any, sensor: int, at: int, link: Any, tick: Any, key: Any, v: Any, q: Any) -> None:
+    """A frame of a slow sensor: queue it for its arrivals and set the clock on."""
+    frame = z[at]
+    block = CHANNELS.camera_link if sensor == CAMERA else CHANNELS.gps_link
+    first, second = arrivals(link, frame, tick, key[0], key[1], block)
+    if first != NEVER:
+        _push(z, sensor, tick, first, q, frame, v)
+    if second != NEVER:
+        _push(z, sensor, tick, second, q, frame, v)
+    z[at] = frame + 1.0
+    z[at + 1] = tick + link.period
+
+
+@jit
+def _deliver(z: Any, tick: Any, packets: Any, count: int) -> int:
+    """Move the packets that arrive at this tick into `packets`; returns the new count."""
+    while True:
+        best, best_rank, due = -1, FAR, FAR
+        for slot in range(2 * IN_FLIGHT):
+            at = Z.queue + slot * PACKET_WIDTH
+            arrived = z[at + PACKET.arrived]
+            if arrived == tick:
+                rank = 2.0 * z[at + PACKET.captured] + z[at + PACKET.sensor]
+                if rank < best_rank:
+                    best, best_rank = at, rank
+            elif arrived != NEVER:
+                due = minimum(due, arrived)
+        if best < 0:
+            z[Z.clock + 5] = due
+            return count
+        for i in range(PACKET_WIDTH):
+            packets[count, i] = z[best + i]
+        newest = Z.camera if z[best] == CAMERA else Z.gps
+        if z[best + PACKET.captured] > z[newest + 2]:
+            z[newest + 2] = z[best + PACKET.captured]
+            for i in range(VALUES):
+                z[newest + 3 + i] = z[best + PACKET.value + i]
+            z[newest + 3 + VALUES] = tick
+        z[best + PACKET.arrived] = NEVER
+        count += 1
+
+
+@jit
+def sense(
+    p: Any,
+    z: Any,
+    motion: Any,
+    beta: Any,
+    accel: Any,
+    inputs: Any,
+    rows: Any,
+    j: int,
+    packets: Any,
+    count: int,
+    n_fast: Any,
+    wheels: Any,
+) -> int:
+    """Sensors sample the state at the current tick and due packets are delivered.
+
+    accel: (a_x, a_y) specific forces. inputs: what acted, in the order of Fast from `steer` on.
+    """
+    noise = Noise(*fixed_tuple(p[P.noise :], _NOISE))
+    half = 0.5 * p[P.car + 6] * motion.gamma
+    row = rows[j]
+    row[FAST.gyro] = motion.gamma + noise.gyro_bias + noise.gyro * n_fast[0]
+    row[FAST.accel_y] = accel[1] + noise.accel_y_bias + noise.accel * n_fast[1]
+    row[FAST.accel_x] = accel[0] + noise.accel * n_fast[2]
+    row[FAST.wheel_left] = motion.v_x - half + noise.wheel * wheels[0]
+    row[FAST.wheel_right] = motion.v_x + half + noise.wheel * wheels[1]
+    store(row, FAST.steer, inputs)
+    tick = z[Z.clock + 2]
+    key = (int(z[Z.clock]), int(z[Z.clock + 1]))
+    if tick == z[Z.camera + 1]:
+        link = Link(*fixed_tuple(p[P.camera :], _LINK))
+        road = Road(*fixed_tuple(p[P.road :], _ROAD))
+        n = normals(key[0], key[1], int(tick), CHANNELS.camera)
+        psi, y_l = camera_sample(motion, road, p[P.car + 11], noise, n)
+        _capture(z, CAMERA, Z.camera, link, tick, key, (psi, y_l, 0.0, 0.0), 1.0)
+    if tick == z[Z.gps + 1]:
+        link = Link(*fixed_tuple(p[P.gps :], _LINK))
+        n = normals(key[0], key[1], int(tick), CHANNELS.gps)
+        course, speed, X, Y, quality = gps_sample(motion, beta, noise, n)
+        _capture(z, GPS, Z.gps, link, tick, key, (course, speed, X, Y), quality)
+    if tick >= z[Z.clock + 5]:
+        count = _deliver(z, tick, packets, count)
+    return count

@@ -1,0 +1,94 @@
+"""Reset: draw an episode from a key and deliver tick 0; compiled."""
+
+from typing import Any
+
+from .backend import fixed_tuple, floor, jit, select
+from .delivery import FAR, sense, store
+from .dynamics import Car, Motion, sideslip_angle
+from .layout import P, Z
+from .noise import CHANNELS, normals
+from .programme import STEERING_WIDTH, realise, steering_at, write_steering
+from .record import CAMERA, FAST, PACKET, PACKET_WIDTH, TICK
+from .reference import Target, reference
+from .sensors import IN_FLIGHT, NEVER, Link, clock_phase
+from .summary import observe, write_report
+from .switches import REPORT
+
+_CAR, _MOTION, _LINK, _TARGET = (len(each._fields) for each in (Car, Motion, Link, Target))
+
+
+@jit
+def reset_vehicle(
+    template: Any,
+    low: Any,
+    high: Any,
+    switches: Any,
+    start: Any,
+    drawn: Any,
+    key_low: int,
+    key_high: int,
+    bounds: Any,
+    p: Any,
+    z: Any,
+    obs: Any,
+    rows: Any,
+    packets: Any,
+    report: Any,
+) -> None:
+    """Draw the episode from a key and deliver tick 0.
+
+    template: packed parameters with the vehicle and everything the scenario does not draw.
+    start: a Motion whose NaN entries are the default (standing on the road at the drawn speed).
+    """
+    for i in range(P.end):
+        p[i] = template[i]
+    d, redraws = realise(low, high, key_low, key_high, Car(*fixed_tuple(p, _CAR)), drawn)
+    p[P.car + 4] = p[P.car + 4] * d.front_stiffness
+    p[P.car + 5] = p[P.car + 5] * d.rear_stiffness
+    p[P.car + 10] = d.friction
+    write_steering(switches[3], d, p[P.steering :])
+    p[P.wind] = select(d.wind_side < 0.5, -d.wind_force, d.wind_force)
+    p[P.wind + 1] = d.wind_arm
+    p[P.wind + 2] = floor(d.wind_start / TICK + 0.5)
+    p[P.wind + 3] = p[P.wind + 2] + floor(d.wind_length / TICK + 0.5)
+    p[P.pace] = d.speed
+    for i in range(Z.end):
+        z[i] = 0.0
+    for slot in range(2 * IN_FLIGHT):
+        z[Z.queue + slot * PACKET_WIDTH + PACKET.arrived] = NEVER
+    z[Z.motion] = d.speed
+    for i in range(_MOTION):
+        if start[i] == start[i]:
+            z[Z.motion + i] = start[i]
+    n = normals(key_low, key_high, 0, CHANNELS.initial)
+    z[Z.drive + 2] = steering_at(0.0, fixed_tuple(p[P.steering :], STEERING_WIDTH))
+    z[Z.drive + 4] = p[P.disturbance] * n[0]
+    z[Z.drive + 5] = p[P.disturbance + 1] * n[1]
+    store(z, Z.clock, (key_low * 1.0, key_high * 1.0, 0.0, 0.0, redraws * 1.0, FAR))
+    for sensor in range(2):
+        at = Z.camera if sensor == CAMERA else Z.gps
+        link = Link(*fixed_tuple(p[P.camera if sensor == CAMERA else P.gps :], _LINK))
+        z[at + 1] = select(link.period > 0.0, clock_phase(link, key_low, key_high, sensor), NEVER)
+        z[at + 2] = NEVER
+    motion = Motion(*fixed_tuple(z[Z.motion :], _MOTION))
+    beta = sideslip_angle(motion.v_x, motion.v_y, switches[0])
+    steer = z[Z.drive + 2]
+    fast = normals(key_low, key_high, 0, CHANNELS.inertial)
+    wheels = normals(key_low, key_high, 0, CHANNELS.wheels)
+    inputs = (steer, 0.0, 0.0, steer, 0.0)
+    accel = (0.0, 0.0)
+    count = sense(p, z, motion, beta, accel, inputs, rows, 0, packets, 0, fast, wheels)
+    v = 0.5 * (rows[0, FAST.wheel_left] + rows[0, FAST.wheel_right])
+    target = Target(*fixed_tuple(p[P.target :], _TARGET))
+    refs = reference(steer, v, target, switches[2])
+    if switches[4]:  # every sample of the step is asked for: tick 0 stands for all of them
+        for j in range(1, len(rows)):
+            rows[j, :] = rows[0, :]
+        observe(p, z, switches, rows, len(rows), count, packets, refs, bounds, obs)
+    else:
+        observe(p, z, switches, rows, 1, count, packets, refs, bounds, obs)
+    write_report(report, z, motion, beta, refs, steer, 0.0)
+    report[REPORT.cost] = 0.0
+    report[REPORT.reward] = 0.0
+    report[REPORT.packets] = count
+    report[REPORT.ended] = 0.0

@@ -1,0 +1,82 @@
+"""What a step tells: the float32 observation and the numbers of `info`."""
+
+from typing import Any
+
+from .backend import jit, maximum, minimum, select
+from .layout import AGE_CAP, SAMPLED, P, Z
+from .record import CAMERA, FAST, PACKET, TICK, VALUES
+from .sensors import NEVER
+from .switches import REPORT
+
+
+@jit
+def clip(value: Any, low: Any, high: Any) -> Any:
+    """The value kept within [low, high]."""
+    return minimum(maximum(value, low), high)
+
+
+@jit
+def observe(
+    p: Any,
+    z: Any,
+    switches: Any,
+    rows: Any,
+    n: int,
+    count: int,
+    packets: Any,
+    refs: Any,
+    bounds: Any,
+    obs: Any,
+) -> None:
+    """Write the float32 summary; every entry clipped at its bounds (layout.observation_layout)."""
+    k = 0
+    for column in range(SAMPLED):
+        if switches[4]:
+            for j in range(n):
+                obs[k] = clip(rows[j, column], bounds[0, k], bounds[1, k])
+                k += 1
+        else:
+            total = 0.0
+            for j in range(n):
+                total = total + rows[j, column]
+            obs[k] = clip(rows[n - 1, column], bounds[0, k], bounds[1, k])
+            obs[k + 1] = clip(total / n, bounds[0, k + 1], bounds[1, k + 1])
+            k += 2
+    for i in range(4):
+        obs[k] = clip(rows[n - 1, FAST.steer + i], bounds[0, k], bounds[1, k])
+        k += 1
+    tick = z[Z.clock + 2]
+    for sensor in range(2):
+        at = Z.camera if sensor == CAMERA else Z.gps
+        values = 2 if sensor == CAMERA else VALUES
+        if p[P.camera if sensor == CAMERA else P.gps] > 0.0:
+            for i in range(values):
+                obs[k] = clip(z[at + 3 + i], bounds[0, k], bounds[1, k])
+                k += 1
+            seen = z[at + 2] != NEVER
+            obs[k] = clip(select(seen, (tick - z[at + 2]) * TICK, AGE_CAP), 0.0, AGE_CAP)
+            fresh = 0.0
+            for i in range(count):
+                newest = packets[i, PACKET.arrived] == z[at + 3 + VALUES]  # not late, no duplicate
+                if packets[i, PACKET.sensor] == sensor and newest:
+                    fresh = 1.0
+            obs[k + 1] = fresh
+            k += 2
+    obs[k] = clip(refs[0], bounds[0, k], bounds[1, k])
+    obs[k + 1] = clip(refs[1], bounds[0, k + 1], bounds[1, k + 1])
+
+
+@jit
+def write_report(
+    report: Any, z: Any, motion: Any, beta: Any, refs: Any, steer: Any, N_z: Any
+) -> None:
+    """Write what `info` tells; cost, reward and packets are the caller's."""
+    report[REPORT.t] = z[Z.clock + 2] * TICK
+    report[REPORT.beta] = beta
+    report[REPORT.gamma] = motion.gamma
+    report[REPORT.psi] = motion.psi
+    report[REPORT.beta_ref] = refs[0]
+    report[REPORT.gamma_ref] = refs[1]
+    report[REPORT.steer] = steer
+    report[REPORT.yaw_moment] = N_z
+    report[REPORT.failure] = z[Z.clock + 3]
