@@ -7,7 +7,7 @@ Importing this package registers its Gymnasium environments and loads nothing el
 >>> sorted(name for name in gym.registry if name.startswith("sideslip/"))
 ['sideslip/YawGps-v0', 'sideslip/YawVision-v0', 'sideslip/YawVisionUneven-v0']
 
-`rollout`, `make_agent` and `make_estimator` are loaded when they are first asked for.
+`rollout`, `make_agent`, `make_estimator` and the subpackages are loaded when first asked for.
 """
 
 from importlib import import_module
@@ -28,6 +28,7 @@ _HOMES = {
     "make_estimator": ".estimators",
     "rollout": ".agents.rollout",
 }
+_ROOMS = ("envs", "estimators", "agents", "benchmarks")
 _ENVIRONMENTS = {
     "sideslip/YawVision-v0": {"sensors": "vision", "reference": "zero-slip"},
     "sideslip/YawVisionUneven-v0": {"sensors": "vision-uneven", "reference": "zero-slip"},
@@ -43,6 +44,8 @@ for _id, _kwargs in _ENVIRONMENTS.items():
 
 def __getattr__(name: str) -> Any:
     """Load a name of the package's face from the module where it lives."""
+    if name in _ROOMS:
+        return import_module(f".{name}", __name__)
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = globals()[name] = getattr(import_module(_HOMES[name], __name__), name)

@@ -27,7 +27,7 @@ INFO_UNITS = {
 }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Rollout:
     """An episode. Row 0 is the reset, row k the state after the k-th step.
 
@@ -41,7 +41,13 @@ class Rollout:
     log: Log
 
     def __getitem__(self, name: str) -> npt.NDArray[np.float64]:
+        if name not in self.columns:
+            raise KeyError(f"no signal {name!r}; there are: {', '.join(self.columns)}")
         return self.columns[name]
+
+    def __repr__(self) -> str:
+        size = f"{len(self.columns)} signals x {len(self.columns['t'])} rows"
+        return f"<Rollout of {self.log.name}: {size}, cost {self.cost:.4g}>"
 
     @property
     def cost(self) -> float:
@@ -132,11 +138,19 @@ def rollout(
     names += ["action"] if actions.size == 1 else [f"action_{i}" for i in range(actions.size)]
     names += [f"obs_{entry.name}" for entry in layout]
     table = np.array(rows).T
-    units = {name: INFO_UNITS.get(name, "-") for name in names}
+    units = {name: _unit(name) for name in names}
     units |= {f"obs_{entry.name}": entry.unit for entry in layout}
     columns = dict(zip(names, table, strict=True))
     record = concatenate(records)
     return Rollout(columns, units, _log(base, record, columns))
+
+
+def _unit(name: str) -> str:
+    """The unit of a number of `info`; those that wrappers add end like what they speak of."""
+    for ending in ("beta_hat", "beta_std"):
+        if name.endswith(ending):
+            return "rad"
+    return INFO_UNITS.get(name, "-")
 
 
 def _row(info: dict[str, Any], obs: Any, action: Any, reward: float) -> list[float]:

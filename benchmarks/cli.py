@@ -1,5 +1,6 @@
 """The command line: list, run, bench, replay."""
 
+import os
 import platform
 import shlex
 import sys
@@ -9,6 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from gymnasium.error import Error as GymnasiumError
 from rich import box
 from rich.console import Console
 from rich.markup import escape
@@ -18,7 +20,6 @@ from .. import __version__
 from .rows import Row, Suite, write_json, write_parquet
 
 app = typer.Typer(
-    help="Lateral stability of electric vehicles: environments, estimators, controllers.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -29,6 +30,10 @@ Quick = Annotated[bool, typer.Option("--quick", help="Few seeds: a first look in
 Json = Annotated[Path | None, typer.Option("--json", help="Write the rows as JSON.")]
 Parquet = Annotated[Path | None, typer.Option("--parquet", help="Write the rows as Parquet.")]
 Html = Annotated[Path | None, typer.Option("--html", help="Write a self-contained report.")]
+Mapping = Annotated[
+    list[str] | None,
+    typer.Option("--map", help="NAME_UNIT=COLUMN of the log (yaw_rate_degps=r); repeatable."),
+]
 Jobs = Annotated[int | None, typer.Option("--jobs", "-j", min=1, help="Processes.")]
 
 _SHOWN = ("numpy", "scipy", "numba", "gymnasium", "control", "plotly")
@@ -38,11 +43,26 @@ def main() -> None:
     """Entry point of `sideslip`; a user's error is one line and exit status 2."""
     try:
         app()
-    except (ValueError, TypeError, FileNotFoundError, ModuleNotFoundError, OSError) as error:
+    except (ValueError, TypeError, ModuleNotFoundError, OSError, GymnasiumError) as error:
         Console(stderr=True, soft_wrap=True).print(
             "[bold red]error:[/]", escape(str(error)), highlight=False
         )
         sys.exit(2)
+
+
+def _say_version(wanted: bool) -> None:
+    if wanted:
+        console.print(f"sideslip {__version__}", highlight=False)
+        raise typer.Exit
+
+
+@app.callback()
+def face(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_say_version, is_eager=True, help="Say it.")
+    ] = False,
+) -> None:
+    """Lateral stability of electric vehicles: environments, estimators, controllers."""
 
 
 @app.command("list")
@@ -132,6 +152,7 @@ def bench(
     quick: Quick = False,
     log: Annotated[Path | None, typer.Option(help="Replay this recorded drive too.")] = None,
     vehicle: Annotated[Path | None, typer.Option(help="The vehicle of the recorded drive.")] = None,
+    mapping: Mapping = None,
     html: Html = None,
     json: Json = None,
     parquet: Parquet = None,
@@ -148,7 +169,7 @@ def bench(
     if log is not None:  # first: a log that cannot be read should not cost minutes
         from .replay import replay_file
 
-        done.append(replay_file(log, vehicle))
+        done.append(replay_file(log, vehicle, mapping=mapping))
     done += [SUITES[name](quick, jobs) for name in names]
     order = [*names, "replay"]
     done.sort(key=lambda suite: order.index(suite.name))
@@ -186,10 +207,15 @@ def _give(
 
 
 def _writable(*paths: Path | None) -> None:
-    """FileNotFoundError before the work, not after it, where a result has no folder to go to."""
+    """OSError before the work, not after it, where a result cannot be written."""
     for path in paths:
-        if path is not None and not path.absolute().parent.is_dir():
+        if path is None:
+            continue
+        folder = path.absolute().parent
+        if not folder.is_dir():
             raise FileNotFoundError(f"cannot write {path}: there is no such folder")
+        if not os.access(folder, os.W_OK):
+            raise PermissionError(f"cannot write {path}: its folder is read-only")
 
 
 def _command() -> str:
@@ -220,9 +246,7 @@ def _screen(title: str, header: Sequence[str], cells: Sequence[Sequence[str]]) -
 def replay(
     log: Annotated[Path, typer.Argument(help="A recorded drive, CSV or Parquet.")],
     vehicle: Annotated[Path | None, typer.Option(help="The car: TOML or JSON.")] = None,
-    mapping: Annotated[
-        list[str] | None, typer.Option("--map", help="NAME=COLUMN of the log; repeatable.")
-    ] = None,
+    mapping: Mapping = None,
     course_rate: Annotated[float, typer.Option(help="Hz of the emulated course.")] = 10.0,
     course_noise: Annotated[float, typer.Option(help="deg, standard deviation.")] = 0.5,
     course_delay: Annotated[float, typer.Option(help="s the course arrives late.")] = 0.0,

@@ -18,20 +18,11 @@ from .programme import DRAWS_WIDTH
 from .record import FAST_WIDTH, PACKET_WIDTH, SLOW_NAMES, TICK, Record, SlowSensor
 from .restart import reset_vehicle
 from .scenario import Scenario
-from .sensors import IN_FLIGHT, ticks
+from .sensor_sets import SENSOR_SETS, most_packets, with_changes
+from .sensors import ticks
 from .switches import REFUSED, REPORT, RUNNING
 from .template import Template, template_of
 from .vehicle import Vehicle, vehicle_from
-
-CAMERA_33_30 = SlowSensor(period=0.033, delays=(0.030,))
-CAMERA_UNEVEN = SlowSensor(period=0.033, delays=(0.010,), jitter=0.020)
-GPS_5_HZ = SlowSensor(period=0.2)
-
-SENSOR_SETS: dict[str, dict[str, SlowSensor]] = {
-    "vision": {"camera": CAMERA_33_30},
-    "vision-uneven": {"camera": CAMERA_UNEVEN},
-    "gps": {"gps": GPS_5_HZ},
-}
 
 _OPTIONS = ("scenario", "vehicle", "friction", "state", "duration")
 
@@ -124,7 +115,7 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
             raise TypeError(f"unknown render_mode {render_mode!r}; known: none")
         self.render_mode = render_mode
         self.control_period = int(control_period)
-        self._sensors = _with_changes(SENSOR_SETS[sensors], {"camera": camera, "gps": gps})
+        self._sensors = with_changes(SENSOR_SETS[sensors], {"camera": camera, "gps": gps})
         self._reference, self._fast = reference, fast
         self._yaw_first, self._fail_bad = yaw_first, on_bad_action == "fail"
         self._vehicle = vehicle_from(vehicle)
@@ -141,7 +132,7 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
         self.action_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
         self._params, self._state = np.zeros(P.end), np.zeros(Z.end)
         self.rows = np.zeros((n, FAST_WIDTH))
-        room = sum(_most_packets(sensor, n) for sensor in self._sensors.values())
+        room = sum(most_packets(sensor, n) for sensor in self._sensors.values())
         self.packets = np.zeros((room, PACKET_WIDTH))
         self._report = np.zeros(len(REPORT))
         self._drawn = np.zeros(DRAWS_WIDTH)
@@ -372,21 +363,3 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
         self._report[:] = snapshot["report"]
         self.ticks_done, self.delivered, self._over = snapshot["progress"]
         self.np_random = copy.deepcopy(snapshot["rng"])
-
-
-def _with_changes(
-    sensors: dict[str, SlowSensor], changes: dict[str, Mapping[str, Any] | None]
-) -> dict[str, SlowSensor]:
-    changed = dict(sensors)
-    for name, fields in changes.items():
-        if fields is None:
-            continue
-        if name not in sensors:
-            raise ValueError(f"this id has no {name}; it has: {', '.join(sensors)}")
-        changed[name] = dataclasses.replace(sensors[name], **fields)
-    return changed
-
-
-def _most_packets(sensor: SlowSensor, n: int) -> int:
-    """Room for the worst case: all frames of a step and all that were under way."""
-    return 2 * (n // int(ticks(sensor.period)) + 1) + IN_FLIGHT

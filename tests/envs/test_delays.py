@@ -9,8 +9,8 @@ from scipy import stats
 
 from sideslip.envs import SlowSensor, StabilityEnv
 from sideslip.envs.record import CAMERA, GPS, PACKET
+from sideslip.envs.sensor_sets import SENSOR_SETS
 from sideslip.envs.sensors import IN_FLIGHT, link_of
-from sideslip.envs.stability import SENSOR_SETS
 
 from .helpers import IDS, LINEAR, packets, play, unwrapped
 

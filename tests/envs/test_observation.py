@@ -10,7 +10,7 @@ import pytest
 from sideslip.envs import Record, SlowSensor, StabilityEnv
 from sideslip.envs.layout import AGE_CAP, SAMPLED
 from sideslip.envs.record import FAST, PACKET, SLOW_NAMES, SLOW_VALUES, TICK, Fast
-from sideslip.envs.stability import SENSOR_SETS
+from sideslip.envs.sensor_sets import SENSOR_SETS
 
 from .helpers import FULL, IDS, LINEAR, play, unwrapped
 
