@@ -92,7 +92,8 @@ def write_report(
             for link, title in [("summary", "What wins"), *_links(suites)]
         ),
         summary="\n".join(
-            f'<h3><a href="#{link}">{escape(title)}</a></h3>\n{_table(suite.tables[0])}'
+            f'<h3><a href="#{link}">{escape(title)}</a></h3>\n'
+            + "\n".join(map(_table, suite.tables[:2]))  # a suite's main comparisons
             for (link, title), suite in zip(_links(suites), suites, strict=True)
             if suite.tables
         ),
