@@ -1,5 +1,6 @@
 """What every classical controller shares: named inputs, batches, memory outside the object."""
 
+from abc import ABC, abstractmethod
 from typing import Any
 
 import gymnasium as gym
@@ -11,7 +12,7 @@ from ..envs.vehicle import Vehicle
 Array = npt.NDArray[np.float64]
 
 
-class Controller:
+class Controller(ABC):
     """Stable-baselines3's `predict` around a compiled law.
 
     A subclass names its inputs (`needs`, entries of the env's layout), how many numbers it
@@ -44,9 +45,9 @@ class Controller:
         self.full_scale = base.vehicle.yaw_moment_limit
         self.control_period: int = base.control_period
 
+    @abstractmethod
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
         """Fill action (N, 1), a share of full scale, and update state (N, memory) in place."""
-        raise NotImplementedError
 
     def predict(
         self,

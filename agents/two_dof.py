@@ -1,7 +1,7 @@
 """tie-vision's two-degree-of-freedom controller: feedforward (24) and a PI on the sideslip angle.
 
-Both are designed from the nominal vehicle on a grid of speeds and interpolated by the measured
-speed, the mean of the two front wheel speeds.
+Both are designed from the nominal vehicle and scheduled by the measured speed, the mean of the two
+front wheel speeds: the feedforward by its formula, the PI on a grid of speeds.
 """
 
 import math
@@ -11,15 +11,41 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from ..envs.backend import jit
+from ..envs.backend import absolute, jit, maximum, select
 from ..envs.linear import bicycle
 from ..envs.record import TICK
 from ..envs.vehicle import COMS, Vehicle
 from .controller import Array, Controller
 
-SPEEDS = np.arange(2.0, 61.0, 0.5)  # m/s
+SLOWEST = 2.0  # m/s: gains below it are those of this speed
+SPEEDS = np.arange(SLOWEST, 61.0, 0.5)  # m/s
 POLE = 2.0 * math.pi * 2.0  # rad/s: Table II of tie-vision places poles at 2 Hz
 CAMERA_PERIOD = 0.033  # s
+
+
+@jit
+def _static_gain(car: Any, V: Any) -> Any:
+    m, l_f, l_r, C_f, C_r = car[0], car[1], car[2], car[3], car[4]
+    mV2 = m * V * V
+    numerator = 4.0 * l_r * (l_f + l_r) * C_f * C_r - 2.0 * l_f * C_f * mV2
+    denominator = mV2 + 2.0 * (l_f * C_f - l_r * C_r)
+    least = 0.05 * (mV2 + 2.0 * absolute(l_f * C_f - l_r * C_r))
+    if absolute(denominator) < least:
+        denominator = select(denominator < 0.0, -least, least)
+    return numerator / denominator  # tie-vision (24)
+
+
+def _car(vehicle: Vehicle) -> Array:
+    """m, l_f, l_r, C_f, C_r as `_static_gain` takes them."""
+    return np.array(
+        [
+            vehicle.mass,
+            vehicle.front_arm,
+            vehicle.rear_arm,
+            vehicle.front_stiffness,
+            vehicle.rear_stiffness,
+        ]
+    )
 
 
 def feedforward_gain(vehicle: Vehicle, speed: float) -> float:
@@ -28,15 +54,7 @@ def feedforward_gain(vehicle: Vehicle, speed: float) -> float:
     Where the yaw moment has no static effect on beta (m V^2 = 2 (l_r C_r - l_f C_f), which exists
     for understeering cars only) the gain is limited to what 5 % of the terms would give.
     """
-    m, l_f, l_r, l = vehicle.mass, vehicle.front_arm, vehicle.rear_arm, vehicle.wheelbase  # noqa: E741
-    C_f, C_r = vehicle.front_stiffness, vehicle.rear_stiffness
-    mV2 = m * speed * speed
-    numerator = 4.0 * l_r * l * C_f * C_r - 2.0 * l_f * C_f * mV2
-    denominator = mV2 + 2.0 * (l_f * C_f - l_r * C_r)
-    least = 0.05 * (mV2 + 2.0 * abs(l_f * C_f - l_r * C_r))
-    if abs(denominator) < least:
-        denominator = math.copysign(least, denominator)
-    return numerator / denominator  # tie-vision (24)
+    return float(_static_gain(_car(vehicle), float(speed)))
 
 
 @dataclass(frozen=True)
@@ -93,23 +111,23 @@ def _pi_table(vehicle: Vehicle, gain: float) -> Array:
 @jit
 def _scheduled(table: Any, v: Any) -> Any:
     """A column of a table over SPEEDS, interpolated at v and held beyond its ends."""
-    at = min(max((v - 2.0) / 0.5, 0.0), len(table) - 1.000001)
+    at = min(max((v - SLOWEST) / 0.5, 0.0), len(table) - 1.000001)
     i = int(at)
     return table[i] + (at - i) * (table[i + 1] - table[i])
 
 
 @jit
-def _feedforward_law(x: Any, gains: Any, full_scale: float, action: Any) -> None:
+def _feedforward_law(x: Any, car: Any, full_scale: float, action: Any) -> None:
     for n in range(len(x)):
         v = 0.5 * (x[n, 0] + x[n, 1])
-        action[n, 0] = _scheduled(gains, v) * x[n, 2] / full_scale
+        action[n, 0] = _static_gain(car, maximum(v, SLOWEST)) * x[n, 2] / full_scale
 
 
 @jit
 def _two_dof_law(
     x: Any,
     state: Any,
-    gains: Any,
+    car: Any,
     k_p: Any,
     k_i: Any,
     full_scale: float,
@@ -125,7 +143,7 @@ def _two_dof_law(
             continue
         v = 0.5 * (x[n, 0] + x[n, 1])
         error = x[n, 4] - x[n, 3]
-        forward = _scheduled(gains, v) * x[n, 2]
+        forward = _static_gain(car, maximum(v, SLOWEST)) * x[n, 2]
         wanted = forward + _scheduled(k_p, v) * error + state[n, 0]
         held = min(max(wanted, -full_scale), full_scale)
         step = _scheduled(k_i, v) * error * dt  # forward Euler
@@ -143,10 +161,10 @@ class Feedforward(Controller):
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
         super().__init__(env)
-        self.gains = np.array([feedforward_gain(self.nominal, float(v)) for v in SPEEDS])
+        self.car = _car(self.nominal)
 
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
-        _feedforward_law(inputs, self.gains, self.full_scale, action)
+        _feedforward_law(inputs, self.car, self.full_scale, action)
 
 
 class TwoDof(Controller):
@@ -169,14 +187,14 @@ class TwoDof(Controller):
         period = self.control_period * TICK
         self.wait = 1 if rate == "control" else max(1, math.ceil(CAMERA_PERIOD / period - 1e-9))
         self.dt = self.wait * period
-        self.gains = np.array([feedforward_gain(self.nominal, float(v)) for v in SPEEDS])
+        self.car = _car(self.nominal)
         self.k_p, self.k_i = np.ascontiguousarray(_pi_table(self.nominal, gain).T)
 
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
         _two_dof_law(
             inputs,
             state,
-            self.gains,
+            self.car,
             self.k_p,
             self.k_i,
             self.full_scale,

@@ -41,38 +41,26 @@ def test_feedforward_stays_finite_where_the_moment_does_not_move_beta() -> None:
 
 
 @pytest.mark.parametrize("kmh", [10.0, 18.0, 25.0, 32.0, 45.0])
-def test_feedforward_brings_static_slip_to_zero(kmh: float) -> None:
-    """tie-vision (24), exact on the small-angle plant: |beta_ss| < 1e-9 at 0.001 rad."""
-    steer = 0.001
-    env: Any = gym.make(
+def test_the_feedforward_agent_brings_static_slip_to_zero(kmh: float) -> None:
+    """tie-vision (24) through `predict`, on the small-angle plant: |beta| < 1e-9 at 0.001 rad."""
+    env = gym.make(
         "sideslip/YawVision-v0",
         scenario={
-            "base": "tie-vision-fig7",
-            "vehicle": {},
-            "steering": "straight",
+            "base": "tie-vision-fig8",
+            "steering": "step",
+            "amplitude": 0.001,
+            "hold": 100.0,
             "speed": kmh * KMH,
-            "disturbance_force": 0.0,
-            "disturbance_moment": 0.0,
-            "duration": 20.0,
+            "duration": 12.0,
             "half_width": 1e6,
+            "noise": {"wheel": 0.0},
         },
-    ).unwrapped
-    env.reset(seed=0)
-    snapshot = env.get_state()
-    from sideslip.envs.layout import P
-    from sideslip.envs.programme import SINES
-
-    step = P.steering + 5 * SINES
-    snapshot["params"][step : step + 3] = steer, 0.0, 1.0
-    env.set_state(snapshot)
-    moment = feedforward_gain(COMS, kmh * KMH) * steer / COMS.yaw_moment_limit
-    info: dict[str, float] = {}
-    for _ in range(1000):
-        info = env.step(np.array([moment], np.float32))[4]
-    # the action is a float32: its rounding, 6e-8 of the moment, leaves 6e-8 of the slip it cancels
-    static = abs(np.linalg.solve(bicycle(COMS, kmh * KMH).A, bicycle(COMS, kmh * KMH).B)[0, 0])
-    assert abs(info["beta"]) < 1e-9 + 6e-8 * steer * static
-    assert abs(info["gamma"]) > 1e-4
+    )
+    drive = sideslip.rollout(env, make_agent("feedforward", env))
+    assert abs(drive["gamma"][-1]) > 1e-4
+    # the action is a float32, 6e-8 off, of a moment that alone cancels the uncontrolled slip
+    none = sideslip.rollout(env)
+    assert abs(drive["beta"][-1]) < 1e-9 + 6e-8 * abs(none["beta"][-1])
 
 
 @pytest.mark.parametrize("kmh", [15.0, 25.0, 40.0])
