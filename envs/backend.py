@@ -4,6 +4,7 @@ The equations of sideslip are plain scalar functions over tuples. `jit` compiles
 rebuilds the very same functions for Python floats, NumPy arrays or any other table of primitives.
 """
 
+import functools
 import hashlib
 import math
 import os
@@ -20,32 +21,34 @@ from numba.extending import overload
 from numba.np.unsafe.ndarray import to_fixed_tuple
 
 _PACKAGE = Path(__file__).resolve().parent.parent
-_FOLDERS = ("envs", "estimators", "agents", "benchmarks")
-_KEPT_CACHES = 4
+_PREFIX = __name__.removesuffix("envs.backend")
+_LAYERS = ("envs", "estimators", "agents", "benchmarks")  # each calls only those before it
+_KEPT_CACHES = 12
 
 config: Any = numba.config
 F = TypeVar("F", bound=Callable[..., Any])
 
 
-def source_stamp() -> str:
-    """The hash of every source file of the package, which names the folder of compiled kernels.
+def source_stamp(layer: str = _LAYERS[-1]) -> str:
+    """The hash of all source files a layer's kernels may call, which names their folder.
 
     numba watches only the file of the function itself: an edit in a callee's module would
-    otherwise silently give the numbers of the old text.
+    otherwise silently give the numbers of the old text. Calls point one way, so an edit in
+    `benchmarks` leaves the kernels of `envs` alone.
     """
     digest = hashlib.sha256()
-    for folder in _FOLDERS:
+    for folder in _LAYERS[: _LAYERS.index(layer) + 1]:
         for path in sorted((_PACKAGE / folder).glob("*.py")):
             digest.update(path.name.encode())
             digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
 
 
-def _cache_folder() -> str | None:
-    """A writable folder for this version's kernels, or None; older versions' are pruned."""
+def _cache_folder(layer: str = _LAYERS[-1]) -> str | None:
+    """A writable folder for a layer's kernels, or None; older versions' are pruned."""
     home = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
     base = Path(os.environ.get("NUMBA_CACHE_DIR") or Path(home) / "sideslip" / "kernels")
-    folder = base / source_stamp()
+    folder = base / source_stamp(layer)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         os.utime(folder)
@@ -60,15 +63,19 @@ def _cache_folder() -> str | None:
     return str(folder)
 
 
-_CACHE = None if config.DISABLE_JIT else _cache_folder()
+_kept_folder = functools.cache(_cache_folder)
 
 
 def jit(function: F) -> F:
     """Compile with numba: IEEE arithmetic in the order written, cached on disk where possible."""
     options: dict[str, Any] = {"error_model": "numpy", "fastmath": False}
-    if _CACHE is None:
+    layer = function.__module__.removeprefix(_PREFIX).partition(".")[0]
+    folder = (
+        None if config.DISABLE_JIT else _kept_folder(layer if layer in _LAYERS else _LAYERS[-1])
+    )
+    if folder is None:
         return numba.njit(**options)(function)  # type: ignore[no-any-return]
-    before, config.CACHE_DIR = config.CACHE_DIR, _CACHE
+    before, config.CACHE_DIR = config.CACHE_DIR, folder
     try:
         return numba.njit(cache=True, **options)(function)  # type: ignore[no-any-return]
     finally:

@@ -18,6 +18,7 @@ _ANGLE_RATE = {"radps": 1.0, "degps": np.pi / 180.0}
 _ACCELERATION = {"mps2": 1.0, "g": GRAVITY}
 _LENGTH = {"m": 1.0}
 _TORQUE = {"nm": 1.0}
+_NUMBER = {"count": 1.0}
 
 COLUMNS: dict[str, dict[str, float]] = {
     "time": {"s": 1.0, "ms": 1e-3},
@@ -26,6 +27,7 @@ COLUMNS: dict[str, dict[str, float]] = {
     "yaw_rate": _ANGLE_RATE,
     "accel_x": _ACCELERATION,
     "accel_y": _ACCELERATION,
+    "roll_rate": _ANGLE_RATE,
     "steer": _ANGLE,
     "sideslip": _ANGLE,
     "wheel_left": _SPEED,
@@ -38,6 +40,8 @@ COLUMNS: dict[str, dict[str, float]] = {
     "gps_speed": _SPEED,
     "gps_x": _LENGTH,
     "gps_y": _LENGTH,
+    "gps_hdop": _NUMBER,
+    "gps_satellites": _NUMBER,
     "camera_psi": _ANGLE,
     "camera_y_l": _LENGTH,
 }

@@ -108,6 +108,7 @@ def sense(
     row[FAST.gyro] = motion.gamma + noise.gyro_bias + noise.gyro * n_fast[0]
     row[FAST.accel_y] = accel[1] + noise.accel_y_bias + noise.accel * n_fast[1]
     row[FAST.accel_x] = accel[0] + noise.accel * n_fast[2]
+    row[FAST.roll_rate] = noise.roll_rate * n_fast[3]
     row[FAST.wheel_left] = motion.v_x - half + noise.wheel * wheels[0]
     row[FAST.wheel_right] = motion.v_x + half + noise.wheel * wheels[1]
     store(row, FAST.steer, inputs)
@@ -118,12 +119,13 @@ def sense(
         road = Road(*fixed_tuple(p[P.road :], _ROAD))
         n = normals(key[0], key[1], int(tick), CHANNELS.camera)
         psi, y_l = camera_sample(motion, road, p[P.car + 11], noise, n)
-        _capture(z, CAMERA, Z.camera, link, tick, key, (psi, y_l, 0.0, 0.0), 1.0)
+        _capture(z, CAMERA, Z.camera, link, tick, key, (psi, y_l, 0.0, 0.0, 0.0, 0.0), 1.0)
     if tick == z[Z.gps + 1]:
         link = Link(*fixed_tuple(p[P.gps :], _LINK))
         n = normals(key[0], key[1], int(tick), CHANNELS.gps)
-        course, speed, X, Y, quality = gps_sample(motion, beta, noise, n)
-        _capture(z, GPS, Z.gps, link, tick, key, (course, speed, X, Y), quality)
+        course, speed, X, Y, hdop, satellites, quality = gps_sample(motion, beta, noise, n)
+        values = (course, speed, X, Y, hdop, satellites)
+        _capture(z, GPS, Z.gps, link, tick, key, values, quality)
     if tick >= z[Z.clock + 5]:
         count = _deliver(z, tick, packets, count)
     return count

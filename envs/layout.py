@@ -70,6 +70,8 @@ class Slow(NamedTuple):
     v_1: Any
     v_2: Any
     v_3: Any
+    v_4: Any
+    v_5: Any
     arrived: Any  # tick of its delivery
 
 
@@ -150,10 +152,10 @@ class Entry(NamedTuple):
     high: float
 
 
-SAMPLED = 5  # the first columns of a fast row are sensors; the policy sees last and mean of each
+SAMPLED = 6  # the first columns of a fast row are sensors; the policy sees last and mean of each
 AGE_CAP = 10.0  # s
 
-_FAST_BOUNDS = (10.0, 50.0, 50.0, 100.0, 100.0, 1.0, 2000.0, 2000.0, 1.0, 50.0)
+_FAST_BOUNDS = (10.0, 50.0, 50.0, 10.0, 100.0, 100.0, 1.0, 2000.0, 2000.0, 1.0, 50.0)
 _SLOW_BOUNDS = {
     "psi": float(np.pi),
     "y_l": 200.0,
@@ -161,6 +163,8 @@ _SLOW_BOUNDS = {
     "speed": 100.0,
     "X": 1e5,
     "Y": 1e5,
+    "hdop": 100.0,
+    "satellites": 50.0,
 }
 
 

@@ -30,13 +30,14 @@ _SAMPLED = {  # column of the record: quantity of the log
     "gyro": "yaw_rate",
     "accel_y": "accel_y",
     "accel_x": "accel_x",
+    "roll_rate": "roll_rate",
     "wheel_left": "wheel_left",
     "wheel_right": "wheel_right",
 }
 _INPUTS = ("steer", "torque_left", "torque_right", "steer_command", "accel_command")
 _SLOW = {  # the values of a packet, as in SLOW_VALUES; the first tells where there is a sample
     "camera": ("camera_psi", "camera_y_l"),
-    "gps": ("course", "gps_speed", "gps_x", "gps_y"),
+    "gps": ("course", "gps_speed", "gps_x", "gps_y", "gps_hdop", "gps_satellites"),
 }
 _GAPS = {"sideslip", "speed_y", *_SLOW["camera"], *_SLOW["gps"]}
 _GAP = 1.5  # steps of time

@@ -21,13 +21,14 @@ class Fast(NamedTuple):
     gyro: int = 0  # rad/s
     accel_y: int = 1  # m/s2, specific force
     accel_x: int = 2  # m/s2
-    wheel_left: int = 3  # m/s, left front wheel
-    wheel_right: int = 4  # m/s
-    steer: int = 5  # rad, applied front steering angle
-    torque_left: int = 6  # N m, applied
-    torque_right: int = 7  # N m, applied
-    steer_command: int = 8  # rad, the driver's
-    accel_command: int = 9  # m/s2, the driver's
+    roll_rate: int = 3  # rad/s
+    wheel_left: int = 4  # m/s, left front wheel
+    wheel_right: int = 5  # m/s
+    steer: int = 6  # rad, applied front steering angle
+    torque_left: int = 7  # N m, applied
+    torque_right: int = 8  # N m, applied
+    steer_command: int = 9  # rad, the driver's
+    accel_command: int = 10  # m/s2, the driver's
 
 
 class Packet(NamedTuple):
@@ -38,19 +39,28 @@ class Packet(NamedTuple):
     arrived: int = 2  # tick
     quality: int = 3  # 1 good; 0 do not use the course (too slow)
     sequence: int = 4
-    value: int = 5  # the first of four values
+    value: int = 5  # the first of six values
 
 
 FAST, PACKET = Fast(), Packet()
-FAST_UNITS = ("rad/s", "m/s2", "m/s2", "m/s", "m/s", "rad", "N m", "N m", "rad", "m/s2")
-FAST_WIDTH, VALUES = len(FAST), 4
+FAST_UNITS = (
+    "rad/s", "m/s2", "m/s2", "rad/s", "m/s", "m/s", "rad", "N m", "N m", "rad", "m/s2",
+)  # fmt: skip
+FAST_WIDTH, VALUES = len(FAST), 6
 PACKET_WIDTH = PACKET.value + VALUES
 
 CAMERA, GPS = 0, 1
 SLOW_NAMES = ("camera", "gps")
 SLOW_VALUES: dict[str, tuple[tuple[str, str], ...]] = {
     "camera": (("psi", "rad"), ("y_l", "m")),
-    "gps": (("course", "rad"), ("speed", "m/s"), ("X", "m"), ("Y", "m")),
+    "gps": (
+        ("course", "rad"),
+        ("speed", "m/s"),
+        ("X", "m"),
+        ("Y", "m"),
+        ("hdop", "-"),
+        ("satellites", "-"),
+    ),
 }
 
 

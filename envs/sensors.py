@@ -22,6 +22,7 @@ class Noise(NamedTuple):
     gyro_bias: Any = 0.0
     accel: Any = 0.1  # m/s2, both axes
     accel_y_bias: Any = 0.0
+    roll_rate: Any = 0.005  # rad/s
     wheel: Any = 0.02  # m/s
     camera_psi: Any = 3.5e-3  # rad
     camera_y: Any = 0.02  # m
@@ -120,7 +121,7 @@ def camera_sample(motion: Any, road: Any, l_pre: Any, noise: Any, n: Any) -> Any
 
 @jit
 def gps_sample(motion: Any, beta: Any, noise: Any, n: Any) -> Any:
-    """(course, speed, X, Y, quality); course = psi + beta, dakf-stability (3)."""
+    """(course, speed, X, Y, hdop, satellites, quality); course = psi + beta, dakf-stability (3)."""
     v = sqrt(motion.v_x * motion.v_x + motion.v_y * motion.v_y)
     course = wrap(motion.psi + beta + noise.course / maximum(v, SLOW) * n[0])
     quality = select(v < COURSE_SPEED, 0.0, 1.0)
@@ -129,6 +130,8 @@ def gps_sample(motion: Any, beta: Any, noise: Any, n: Any) -> Any:
         v + noise.gps_speed * n[1],
         motion.X + noise.gps_position * n[2],
         motion.Y + noise.gps_position * n[3],
+        1.0,
+        12.0,
         quality,
     )
 

@@ -42,12 +42,13 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
 
     | entries | unit | meaning |
     |---|---|---|
-    | gyro, accel_y, accel_x, wheel_left, wheel_right | rad/s, m/s2, m/s | last sample of the step |
+    | gyro, roll_rate, accel_y, accel_x, wheel_left, wheel_right | rad/s, m/s2, m/s | last sample |
     | ..._mean | | mean over the step (`fast="all"`: every sample instead of last and mean) |
     | steer, torque_left, torque_right | rad, N m | applied, in the last tick |
     | steer_command | rad | the driver's |
     | camera_psi, camera_y_l | rad, m | newest camera sample (where the id has a camera) |
     | gps_course, gps_speed, gps_X, gps_Y | rad, m/s, m | newest GPS sample |
+    | gps_hdop, gps_satellites | - | its dilution of precision and satellites |
     | ..._age, ..._fresh | s, - | its age, at most 10 s; 1 if it arrived in this step |
     | beta_ref, gamma_ref | rad, rad/s | reference from driver and nominal vehicle |
 
