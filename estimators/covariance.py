@@ -68,8 +68,8 @@ def _condition(f: Any, variance: Any, residual: Any) -> None:
 
 
 @jit
-def measure_state(f: Any, row: Any, r: Any, residual: Any) -> None:
-    """Use the residual of a measurement `row` (n,) of the states with noise variance r."""
+def project(f: Any, row: Any) -> Any:
+    """f.ph = P C^T of a measurement `row` (n,) of the states; returns C P C^T."""
     n, N, P, ph = f.n, f.total, f.P, f.ph
     for i in range(N):
         ph[i] = 0.0
@@ -78,32 +78,39 @@ def measure_state(f: Any, row: Any, r: Any, residual: Any) -> None:
         if h != 0.0:
             for i in range(N):
                 ph[i] += h * P[k, i]
-    s = r
+    own = 0.0
     for k in range(n):
-        s += row[k] * ph[k]
-    _condition(f, s, residual)
+        own += row[k] * ph[k]
+    return own
+
+
+@jit
+def project_clone(f: Any, clone: int) -> Any:
+    """The same for a measurement of one clone."""
+    for i in range(f.total):
+        f.ph[i] = f.P[clone, i]
+    return f.ph[clone]
+
+
+@jit
+def measure_state(f: Any, row: Any, r: Any, residual: Any) -> None:
+    """Use the residual of a measurement `row` (n,) of the states with noise variance r."""
+    own = project(f, row)
+    _condition(f, own + r, residual)
 
 
 @jit
 def measure_clone(f: Any, clone: int, r: Any, residual: Any) -> None:
     """Use the residual of a measurement of one clone with noise variance r."""
-    for i in range(f.total):
-        f.ph[i] = f.P[clone, i]
-    _condition(f, f.ph[clone] + r, residual)
+    own = project_clone(f, clone)
+    _condition(f, own + r, residual)
 
 
 @jit
 def clone_covariance(f: Any, row: Any, clone: int) -> None:
     """Make a clone of the combination `row` of the states."""
-    n, N, P, ph = f.n, f.total, f.P, f.ph
-    for i in range(N):
-        total = 0.0
-        for k in range(n):
-            total += row[k] * P[k, i]
-        ph[i] = total
-    own = 0.0
-    for k in range(n):
-        own += row[k] * ph[k]
+    own = project(f, row)
+    N, P, ph = f.total, f.P, f.ph
     for i in range(N):
         P[clone, i] = ph[i]
         P[i, clone] = ph[i]

@@ -1,12 +1,17 @@
-"""Late samples: clones of what a slow sensor captured, held until the sample arrives.
+"""Late samples: what a filter holds of the moment of capture, and which sample it may still use.
 
-At each capture the measured combinations of the states are cloned; a late sample is a measurement
-of its clones, so it is used exactly. The delayed states of tie-vision (12)-(13), held between the
-camera's triggers, are these clones: one algorithm under two names. The clones of frame i lie in
-slot i mod frames. They are made in the step *after* the capture, as (12) has it, when everything
-that is known at the captured tick has been used.
-
-The rule "ignore" takes late samples for fresh ones and needs no clones.
+clone: at each capture the measured combinations of the states are cloned; a late sample is a
+measurement of its clones, so it is used exactly. The delayed states of tie-vision (12)-(13), held
+between the camera's triggers, are these clones: one algorithm under two names. The clones of frame
+i lie in slot i mod frames. They are made in the step *after* the capture, as (12) has it, when
+everything that is known at the captured tick has been used.
+buffer: the window is told again from the capture on (`rewind`): exact for any clock.
+larsen: the covariance takes the sample at its capture, the states when it arrives (Larsen 1998);
+exact where exactly one sample is under way and none is lost.
+stored: its residual is taken against the prediction stored at the capture and used as if it were
+fresh: uneven-delay (15)-(16). constant: the same, for an assumed delay instead of the stamp.
+literal, lag: the model has late states that follow at every step, by one step (tie-vision (12) read
+literally at 1 ms) or by a first-order lag of the delay. ignore: late samples are taken for fresh.
 """
 
 import math
@@ -14,56 +19,102 @@ from typing import Any
 
 from ..envs.backend import jit
 from ..envs.record import SLOW_NAMES, SlowSensor
-from .covariance import clone_covariance
-from .memory import CORE, COUNTERS, FRAMES, SEEN, SLOW
+from .covariance import clone_covariance, measure_state
+from .memory import COUNTERS, FRAMES, SEEN, SLOW, WIDTH, WINDOW
 
-RULES = ("clone", "ignore")
+RULES = ("clone", "ignore", "stored", "constant", "larsen", "buffer", "literal", "lag")
+CLONE, IGNORE, STORED, CONSTANT, LARSEN, BUFFER = range(6)
 
 DIRECT = -1
 DROPPED = -2
+HELD = -3
+
+
+def rule_code(rule: str) -> int:
+    """The number of a rule; "literal" and "lag" are models whose samples count as fresh."""
+    return IGNORE if rule in ("literal", "lag") else RULES.index(rule)
 
 
 def frames_held(sensor: SlowSensor, rule: str) -> int:
-    """Frames whose clones must be held at once for the sensor's longest delay."""
-    if rule == "ignore":
+    """Frames that must be held at once for the sensor's longest delay."""
+    if rule not in ("clone", "larsen"):
         return 0
     return math.ceil(sensor.longest_delay / sensor.period - 1e-9)
 
 
 def place_clones(f: Any, sensors: dict[str, SlowSensor], rule: str, who: str) -> None:
     """Lay the clones of every sensor behind the states; ValueError if there are too many."""
-    f.ignore = int(rule == "ignore")
+    f.late = rule_code(rule)
     f.total = f.n
     for name, sensor in sensors.items():
         s, frames = SLOW_NAMES.index(name), frames_held(sensor, rule)
-        if frames > FRAMES:
+        most = 1 if rule == "larsen" else FRAMES
+        if frames > most:
             raise ValueError(
                 f"{who}: the {name} can be {sensor.longest_delay:g} s late, {frames} of its periods"
-                f" of {sensor.period:g} s; at most {FRAMES} frames can be held"
+                f" of {sensor.period:g} s; delay={rule!r} can hold {most}"
             )
-        f.frames[s], f.home[s] = frames, f.total
-        f.total += frames * f.rows[s]
-    assert f.n <= CORE
+        f.frames[s] = frames
+        if rule == "clone":
+            f.home[s] = f.total
+            f.total += frames * f.rows[s]
+    if rule == "larsen" and f.frames.sum() > 1:
+        raise ValueError(f"{who}: delay='larsen' is for one late sensor")
+    if f.total > WIDTH:
+        raise ValueError(
+            f"{who}: {f.n} states and {f.total - f.n} clones are more than there is room for "
+            f"({WIDTH}); delay='buffer' needs no clones"
+        )
 
 
 @jit
-def latch(f: Any, s: int) -> None:
+def _clone(f: Any, s: int, slot: int) -> None:
     """Clone what sensor s captured at the last tick: tie-vision (12) at a trigger."""
-    captured = f.next[s]
-    slot = ((captured - f.phase[s]) // f.period[s]) % f.frames[s]
-    n = f.n
     for i in range(f.rows[s]):
         clone = f.home[s] + slot * f.rows[s] + i
         row = f.row[s, i]
         value, error = 0.0, 0.0
-        for k in range(n):
+        for k in range(f.n):
             value += row[k] * f.x[k]
             error += row[k] * f.e[k]
         f.x[clone] = value
         f.e[clone] = error
         if f.periodic == 0:
             clone_covariance(f, row, clone)
-    f.stamp[s, slot] = captured
+
+
+@jit
+def _promise(f: Any, s: int) -> None:
+    """Larsen's update at the capture: the covariance now, the states when the sample is here."""
+    for i in range(f.rows[s]):
+        row, value = f.row[s, i], 0.0
+        for k in range(f.n):
+            value += row[k] * f.x[k]
+        f.promised[s, i] = value
+        measure_state(f, row, f.r[s, i], 0.0)
+        for j in range(i):
+            keep_promise(f, s, j, row)
+        for k in range(f.n):
+            f.promise[s, i, k] = f.gain[k]
+
+
+@jit
+def keep_promise(f: Any, s: int, i: int, row: Any) -> None:
+    """A measurement `row` with the gain f.gain came: promise <- (I - K C) promise."""
+    along = 0.0
+    for k in range(f.n):
+        along += row[k] * f.promise[s, i, k]
+    for k in range(f.n):
+        f.promise[s, i, k] -= f.gain[k] * along
+
+
+@jit
+def keep_promises(f: Any, row: Any) -> None:
+    """`keep_promise` for every sample under way."""
+    for s in range(SLOW):
+        if f.stamp[s, 0] >= 0:
+            for i in range(f.rows[s]):
+                keep_promise(f, s, i, row)
 
 
 @jit
@@ -71,35 +122,62 @@ def latch_due(f: Any, last: int) -> None:
     """Latch every sensor that captured at the tick `last`, and set its clock on."""
     for s in range(SLOW):
         if f.period[s] > 0 and last >= f.next[s]:
-            if f.frames[s] > 0 and last == f.next[s]:
-                latch(f, s)
+            frame = (f.next[s] - f.phase[s]) // f.period[s]
+            if f.frames[s] > 0 and last == f.next[s] and f.seen[s, frame % SEEN] != last:
+                slot = frame % f.frames[s]
+                if f.late == LARSEN:
+                    _promise(f, s)
+                else:
+                    _clone(f, s, slot)
+                f.stamp[s, slot] = last
             f.next[s] += f.period[s]
 
 
 @jit
-def find(f: Any, s: int, captured: int) -> Any:
-    """The first clone that a sample measures, DIRECT for the states, or DROPPED (and counted)."""
+def _known(f: Any, s: int, captured: int) -> bool:
+    """Whether a sample of a sensor on its clock came before or is refused; it is counted."""
     frame = (captured - f.phase[s]) // f.period[s]
-    if captured > f.tick:
-        f.counts[COUNTERS.future] += 1
-        return DROPPED
     if f.phase[s] + frame * f.period[s] != captured:
         f.counts[COUNTERS.unknown] += 1
-        return DROPPED
+        return True
     remembered = f.seen[s, frame % SEEN]
     if remembered == captured:
         f.counts[COUNTERS.duplicates] += 1
+        return True
+    if captured < remembered:
+        f.counts[COUNTERS.refused] += 1
+        return True
+    return False
+
+
+@jit
+def find(f: Any, s: int, captured: int) -> Any:
+    """The first clone that a sample measures, DIRECT for the states, HELD for what else is held of
+    its capture, or DROPPED (and counted)."""
+    if captured > f.tick:
+        f.counts[COUNTERS.future] += 1
         return DROPPED
-    if captured < f.start or captured < remembered:
+    if captured < f.start:
         f.counts[COUNTERS.refused] += 1
         return DROPPED
-    f.seen[s, frame % SEEN] = captured
-    if f.ignore == 1 or captured == f.tick:
+    if _known(f, s, captured):
+        return DROPPED
+    frame = (captured - f.phase[s]) // f.period[s]
+    if f.late == CONSTANT:
+        f.seen[s, frame % SEEN] = captured
+        return HELD
+    if f.late == IGNORE or captured == f.tick:
+        f.seen[s, frame % SEEN] = captured
         return DIRECT
-    if f.frames[s] > 0:
+    if f.late == STORED:
+        if f.tick - captured < WINDOW:
+            f.seen[s, frame % SEEN] = captured
+            return HELD
+    elif f.frames[s] > 0:
         slot = frame % f.frames[s]
         if f.stamp[s, slot] == captured:
+            f.seen[s, frame % SEEN] = captured
             f.stamp[s, slot] = -1
-            return f.home[s] + slot * f.rows[s]
+            return HELD if f.late == LARSEN else f.home[s] + slot * f.rows[s]
     f.counts[COUNTERS.refused] += 1
     return DROPPED

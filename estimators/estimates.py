@@ -23,6 +23,7 @@ class Estimates:
     x: Array
     std: Array
     names: tuple[str, ...]
+    nis: Array
 
     def __getitem__(self, name: str) -> Array:
         """One state by name, (K,)."""

@@ -7,16 +7,18 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy.linalg import block_diag
 
-from ..envs.record import FAST_WIDTH, PACKET_WIDTH, SLOW_NAMES, Log, Record, SlowSensor
+from ..envs.record import FAST, FAST_WIDTH, PACKET_WIDTH, SLOW_NAMES, Log, Record, SlowSensor
 from .compiled import entries
-from .core import begin_filter
+from .core import begin_all
 from .estimates import Estimates, UnobservableWarning
 from .memory import Counters
 from .models import UNITS
 from .periodic import design, table_shape
 from .schedule import Schedule, whole_ticks
 from .stability import MARGINAL, error_map, spectral_radius, unobservable
+from .transition import KINEMATIC, LATERAL, VELOCITY_ROLL
 
 Array = npt.NDArray[np.float64]
 
@@ -24,6 +26,7 @@ CHECKED_SPEEDS = (3.0, 7.0, 14.0)  # m/s, where a filter without a fixed speed i
 
 
 _NOTHING = np.zeros((0, 0))
+_NO_NIS = np.zeros(0)
 _NO_PACKETS = np.zeros((0, PACKET_WIDTH))
 
 
@@ -35,7 +38,8 @@ class Estimator:
     cycle. `dt`: seconds of a tick. `needs`: the fast columns it reads. `filters`, `gains`: its
     memory and its tables, as compiled code takes them.
     Counters of what was skipped: `refused` (older than the filter's window), `duplicates`,
-    `future`, `invalid` (not finite), `poor` (quality 0), `unknown` (sensor or stamp).
+    `future`, `invalid` (not finite), `poor` (quality 0, too few satellites), `unknown` (sensor or
+    stamp), `gated` (an innovation that the gate does not believe).
     """
 
     def __init__(
@@ -46,14 +50,14 @@ class Estimator:
         filters: Any,
         sensors: Mapping[str, SlowSensor],
         schedules: tuple[Schedule, ...],
-        kind: str,
+        wish: Any,
         allow_unstable: bool,
     ) -> None:
         self.allow_unstable = allow_unstable
         self.name, self.names, self.dt = name, names, dt
         self.units = tuple(UNITS[state] for state in names)
         self.sensors = dict(sensors)
-        self.filters, self._schedules, self._kind = filters, schedules, kind
+        self.filters, self._schedules, self._wish = filters, schedules, wish
         f = self._f
         cells = round((f.high - f.low) / f.spacing) + 1 if f.spacing > 0.0 else 1
         shape = (cells, *table_shape(f, schedules[-1])) if f.periodic else (1, 1, 1)
@@ -69,21 +73,31 @@ class Estimator:
     @property
     def needs(self) -> tuple[str, ...]:
         """The fast columns that a record must have."""
-        wheels = ("wheel_left",) if self._f.measured else ()
-        return ("gyro", "steer", *wheels)
+        read = {int(c) for f in self.filters for c in f.u_column[: f.inputs, 0]}
+        read |= {int(c) for f in self.filters for c in f.y_column[: f.fasts, 0]}
+        read -= {FAST.torque_left, FAST.torque_right}  # a log without them had no yaw moment
+        if any(f.kind in (KINEMATIC, VELOCITY_ROLL) for f in self.filters):
+            read.add(FAST.gyro)
+        if self._f.measured and (self._f.kind == LATERAL or self._f.speed_state >= 0):
+            read.add(FAST.wheel_left)
+        return tuple(FAST._fields[column] for column in sorted(read))
 
-    def check(self, f: Any) -> None:
+    def check(self, filters: Any) -> None:
         """Refuse a filter that diverges; name what it cannot see.
 
-        f: the filter's record, or that of the same filter with its first slow sensor alone.
+        filters: its records, or those of the same filter with its first slow sensor alone.
         """
-        speeds = CHECKED_SPEEDS if f.measured else (float(f.speed),)
-        for speed, schedule in itertools.product(speeds, self._schedules):
-            M = self._designed(f, schedule, speed)[1]
-            radius = spectral_radius(M)
-            self.spectral_radius = max(radius, self.spectral_radius)
-            if abs(radius - 1.0) <= MARGINAL and not self.unobservable:
-                self.unobservable = unobservable(M, self.names)
+        first = 0
+        for f in filters:
+            names = self.names[first : first + int(f.n)]
+            speeds = CHECKED_SPEEDS if f.measured else (float(f.speed),)
+            for speed, schedule in itertools.product(speeds, self._schedules):
+                M = self._designed(f, schedule, speed)[1]
+                radius = spectral_radius(M)
+                self.spectral_radius = max(radius, self.spectral_radius)
+                if abs(radius - 1.0) <= MARGINAL and not self.unobservable:
+                    self.unobservable = unobservable(M, names)
+            first += int(f.n)
         if self.unobservable:
             warnings.warn(
                 f"{self.name} cannot see: {'; '.join(self.unobservable)}",
@@ -93,7 +107,7 @@ class Estimator:
 
     def _designed(self, f: Any, schedule: Schedule, speed: float) -> tuple[Array, Array]:
         """The table of gains at a speed and the map of the error; ValueError if that grows."""
-        table, G = design(f, schedule, speed, self._kind)
+        table, G = design(f, schedule, speed, self._wish)
         M = error_map(f, table, G, schedule)
         radius = spectral_radius(M)
         if radius > 1.0 + MARGINAL and not self.allow_unstable:
@@ -119,7 +133,6 @@ class Estimator:
         sensors: slow sensors whose clocks have a new phase. Raises ValueError if anything but the
         phase differs from what the filter was built for.
         """
-        f = self._f
         for name, sensor in self.sensors.items():
             told = sensor if sensors is None else sensors.get(name)
             if told is None or _clockless(told) != _clockless(sensor):
@@ -127,9 +140,10 @@ class Estimator:
                     f"{self.name} was built for the {name} {sensor}, the reset tells {told}"
                 )
             s = SLOW_NAMES.index(name)
-            f.phase[s] = whole_ticks(told.phase or 0.0, self.dt, f"the {name}'s phase")
-            f.origin = f.phase[s]
-        begin_filter(self.filters, first)
+            phase = whole_ticks(told.phase or 0.0, self.dt, f"the {name}'s phase")
+            for f in self.filters:
+                f.phase[s] = f.origin = phase
+        begin_all(self.filters, first)
 
     def step(self, fast: Array, packets: Array, count: int | None = None) -> None:
         """Take fast rows (k, FAST_WIDTH) and the first `count` packets (all if None).
@@ -150,16 +164,18 @@ class Estimator:
         count: int,
         X: Array = _NOTHING,
         S: Array = _NOTHING,
+        nis: Array = _NO_NIS,
     ) -> None:
         """`step` without any checks: the first rows and packets of C-contiguous float64 arrays.
 
-        X, S: (rows, n), to be filled with states and standard deviations, or empty.
+        X, S: (rows, n), to be filled with states and standard deviations, or empty. nis: (count,),
+        to be filled with the normalised innovation squared of each packet, or empty.
         """
-        advance = entries()[0]
-        done = advance(self.filters, self.gains, fast, rows, packets, count, 0, X, S)
+        advance, filters, gains = entries()[0], self.filters, self.gains
+        done = advance(filters, gains, fast, rows, packets, count, 0, X, S, nis)
         while done < rows:
             self.design_missing()
-            done = advance(self.filters, self.gains, fast, rows, packets, count, done, X, S)
+            done = advance(filters, gains, fast, rows, packets, count, done, X, S, nis)
 
     def predict(self, fast_row: npt.ArrayLike) -> None:
         """Take one fast row: from the last tick to this one, with the gyro."""
@@ -191,10 +207,14 @@ class Estimator:
         fast = np.ascontiguousarray(record.fast, np.float64)
         packets = np.ascontiguousarray(record.packets, np.float64)
         n = len(self.names)
-        X, S = np.empty((len(fast), n)), np.empty((len(fast), n))
-        self.take(fast, len(fast), packets, len(packets), X, S)
+        X, S, nis = (
+            np.empty((len(fast), n)),
+            np.empty((len(fast), n)),
+            np.full(len(packets), np.nan),
+        )
+        self.take(fast, len(fast), packets, len(packets), X, S, nis)
         time = np.asarray(record.ticks * record.dt, np.float64)
-        return Estimates(time, X, S, self.names)
+        return Estimates(time, X, S, self.names, nis)
 
     def get_state(self) -> Any:
         """A snapshot that `set_state` continues from, bit for bit."""
@@ -207,18 +227,21 @@ class Estimator:
     @property
     def x(self) -> Array:
         """The states now, (n,)."""
-        return np.array(self._f.x[: len(self.names)])
+        return np.concatenate([f.x[: f.n] for f in self.filters])
 
     @property
     def P(self) -> Array:
         """Their covariance now, (n, n); with periodic gains that of the settled cycle."""
-        f, n = self._f, len(self.names)
+        return np.asarray(block_diag(*(self._covariance(f) for f in self.filters)), np.float64)
+
+    def _covariance(self, f: Any) -> Array:
+        n = int(f.n)
         if not f.periodic:
             return np.array(f.P[:n, :n])
         if self.gains[f.cell, 0, 0] == 0.0:
             self._design(int(f.cell))
         P = np.zeros((n, n))
-        P[np.triu_indices(n)] = self.gains[f.cell, 1 + f.at, f.total :]
+        P[np.triu_indices(n)] = self.gains[f.cell, 1 + f.at * max(int(f.fasts), 1), f.total :]
         return P + np.triu(P, 1).T
 
     @property
@@ -230,6 +253,12 @@ class Estimator:
     def counts(self) -> dict[str, int]:
         """All counters by name."""
         return dict(zip(Counters._fields, map(int, self._f.counts), strict=True))
+
+    @property
+    def nis(self) -> float:
+        """The normalised innovation squared of the last packet; NaN where it was not used or the
+        gains are precomputed."""
+        return float(self._f.nis)
 
     def __getattr__(self, name: str) -> int:
         if name in Counters._fields:

@@ -1,8 +1,11 @@
-"""Between slow samples: pseudo-residuals stand in for the measurement that is not there.
+"""Between slow samples: what stands in for the measurement that is not there.
 
-tie-vision (19)-(22), which uneven-delay (20)-(22), dual-rate (31) and Oh's (35) repeat. One
-constant gain K serves every tick, its columns in the order gyro, slow rows. The gyro's residual is
-always the real one; the slow rows' is the propagated estimate of the error until a sample comes.
+predict: nothing. pseudo-residual: tie-vision (19)-(22), which uneven-delay (20)-(22), double-layer
+(28)-(29), dual-rate (31) and Oh's (35) repeat: the propagated estimate of the error. The fast
+sensors' residuals are always the real ones. One constant gain K serves every tick, its columns in
+the order fast rows, slow rows; where gains are not precomputed, the share of the last sample's.
+hold, from-29: dual-rate's rivals, whose corrections after a sample are a table of shares of its
+innovation (`dual_rate`).
 """
 
 from typing import Any
@@ -10,39 +13,47 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..envs.backend import jit
-from ..envs.elementary import wrap
+from ..envs.backend import jit, maximum
+from .covariance import measure_clone, measure_state
+from .innovation import noise_of
 from .kalman import gain
 
 Array = npt.NDArray[np.float64]
 
-RULES = ("predict", "pseudo-residual", "single-rate")
-INVERSES = ("moore-penrose", "p-weighted", "tikhonov")
+RULES = ("predict", "pseudo-residual", "single-rate", "spread")
+NONE, PSEUDO, SPREAD = range(3)
+"""Codes of what happens between samples in compiled code."""
+
+INVERSES = ("moore-penrose", "p-weighted", "tikhonov", "bayes")
 RIDGE = 1e-3  # lambda of Tikhonov's inverse, in SI units squared
 
 
-def inverse(kind: str, C: Array, P: Array) -> Array:
+def inverse(kind: str, C: Array, P: Array, R: Array) -> Array:
     """The generalised inverse of C (p, n) that (20) needs; (n, p).
 
     C has full row rank only, so C^T C of the printed (20) is singular; the Moore-Penrose inverse is
-    C^T (C C^T)^-1. "p-weighted" weighs by the covariance P (n, n), "tikhonov" is regularised.
+    C^T (C C^T)^-1. "p-weighted" weighs by the covariance P (n, n), "tikhonov" is regularised,
+    "bayes" is the mean of the error given the residual, P C^T (C P C^T + R)^-1: for an optimal gain
+    it leaves nothing to correct between the samples.
     """
     I, zero = np.eye(C.shape[1]), np.zeros((len(C), len(C)))  # noqa: E741
     if kind == "moore-penrose":
         return gain(I, C, zero)
     if kind == "p-weighted":
         return gain(P, C, zero)
+    if kind == "bayes":
+        return gain(P, C, R)
     return gain(I, C, RIDGE * np.eye(len(C)))
 
 
 def constant_gain(K_fast: Array, K_slow: Array, steps: int) -> Array:
-    """One gain for every tick from the multirate filter's gains over a period, (N, 1 + p).
+    """One gain for every tick from the multirate filter's gains over a period, (N, m + p).
 
-    K_fast: (steps, N) gyro gains. K_slow: (p, N), gains of the slow rows at a sample. Every
-    tick of the frame corrects by a pseudo-residual, so each takes its even share of the gain that
-    the multirate filter applies at once.
+    K_fast: (steps, m, N) gains of the fast rows. K_slow: (p, N), gains of the slow rows at a
+    sample. Every tick of the frame corrects by a pseudo-residual, so each takes its even share of
+    the gain that the multirate filter applies at once.
     """
-    return np.column_stack([K_fast.mean(0), K_slow.T / steps])
+    return np.column_stack([K_fast.mean(0).T, K_slow.T / steps])
 
 
 @jit
@@ -57,48 +68,130 @@ def _slow_row(f: Any, s: int, i: int, v: Any) -> Any:
 
 
 @jit
-def correct_between(f: Any, gains: Any, s: int, residual: Any) -> None:
-    """Correct x and e, both already predicted, by the gyro's and the pseudo-residuals.
+def expect(f: Any, s: int) -> None:
+    """What the slow rows are expected to be, and their pseudo-residuals: tie-vision (22)."""
+    for i in range(f.rows[s]):
+        f.expected[i] = _slow_row(f, s, i, f.x)
+        f.eps[f.fasts + i] = _slow_row(f, s, i, f.e)  # C G e
+
+
+@jit
+def correct_between(f: Any, gains: Any, s: int) -> None:
+    """Correct x and e, both predicted, by the fast residuals in f.eps and the pseudo-residuals.
 
     gains: in the present table, rows of K^T and then of the inverse's transpose stand behind those
     of the steps and frames.
     """
-    x, e, N, cell = f.x, f.e, f.total, f.cell
-    first, rows = 1 + f.cycle + f.rows[s] * f.pattern, f.rows[s]
-    f.eps[0] = residual
-    ahead = 0.0
-    for k in range(f.n):
-        ahead += f.gyro[k] * e[k]
-    for i in range(rows):
-        f.expected[i] = _slow_row(f, s, i, x)
-        f.eps[1 + i] = _slow_row(f, s, i, e)  # tie-vision (22): C G e
-    for j in range(N):
-        K = gains[cell, first, j]
-        x[j] += K * residual
-        e[j] -= K * ahead  # (21): (I - K C) G e
-    for i in range(rows):
-        eps = f.eps[1 + i]
+    x, e, N, m = f.x, f.e, f.total, f.fasts
+    first = _constant_row(f, s)
+    for i in range(m):
+        ahead = 0.0
+        for k in range(f.n):
+            ahead += f.y_row[i, k] * e[k]
+        f.residual[i] = ahead
+    for i in range(m):
+        K = gains[f.cell, first + i]
         for j in range(N):
-            K = gains[cell, first + 1 + i, j]
-            x[j] += K * eps
-            e[j] -= K * eps
+            x[j] += K[j] * f.eps[i]
+            e[j] -= K[j] * f.residual[i]  # (21): (I - K C) G e
+    for i in range(m, m + f.rows[s]):
+        K = gains[f.cell, first + i]
+        for j in range(N):
+            x[j] += K[j] * f.eps[i]
+            e[j] -= K[j] * f.eps[i]
 
 
 @jit
-def correct_sample(f: Any, gains: Any, s: int, values: Any) -> None:
-    """A sample has come in this tick: real residuals replace the pseudo ones, and e starts anew."""
-    N, rows, cell = f.total, f.rows[s], f.cell
-    first = 1 + f.cycle + rows * f.pattern
+def _constant_row(f: Any, s: int) -> Any:
+    """The row of the table at which K^T, or the shares of an innovation, start."""
+    return 1 + f.cycle * maximum(f.fasts, 1) + f.rows[s] * f.pattern
+
+
+@jit
+def correct_sample(f: Any, gains: Any, s: int) -> None:
+    """A sample has come in this tick: its residuals replace the pseudo ones, and e starts anew."""
+    m, N, rows = f.fasts, f.total, f.rows[s]
+    first = _constant_row(f, s)
     for i in range(rows):
-        real = values[i] - f.expected[i]  # tie-vision (19)
-        if f.angle[s, i] == 1:
-            real = wrap(real)
+        K, real = gains[f.cell, first + m + i], f.residual[i]  # tie-vision (19)
         for j in range(N):
-            f.x[j] += gains[cell, first + 1 + i, j] * (real - f.eps[1 + i])
-        f.eps[1 + i] = real
+            f.x[j] += K[j] * (real - f.eps[m + i])
+        f.eps[m + i] = real
     for j in range(N):  # (20): e = (C^+ - K) eps
         total = 0.0
-        for i in range(1 + rows):
-            inverse, K = gains[cell, first + 1 + rows + i, j], gains[cell, first + i, j]
-            total += (inverse - K) * f.eps[i]
+        for i in range(m + rows):
+            pinv, K = gains[f.cell, first + m + rows + i, j], gains[f.cell, first + i, j]
+            total += (pinv - K) * f.eps[i]
         f.e[j] = total
+
+
+@jit
+def share_fast(f: Any, i: int, residual: Any) -> None:
+    """A fast row's gain was used on x: the same for e."""
+    ahead = 0.0
+    for k in range(f.n):
+        ahead += f.y_row[i, k] * f.e[k]
+    f.eps[i] = residual
+    for j in range(f.total):
+        f.e[j] -= f.share[i, j] * ahead
+
+
+@jit
+def share_between(f: Any, s: int) -> None:
+    """Correct x and e by the pseudo-residuals with the share of the last sample's gain."""
+    for i in range(f.fasts, f.fasts + f.rows[s]):
+        for j in range(f.total):
+            f.x[j] += f.share[i, j] * f.eps[i]
+            f.e[j] -= f.share[i, j] * f.eps[i]
+
+
+@jit
+def share_sample(f: Any, s: int, first: int, packet: Any) -> None:
+    """`correct_sample` with the covariance's gain of this very sample, spread over a period."""
+    m, N, rows = f.fasts, f.total, f.rows[s]
+    steps = f.period[s] // f.stride
+    for i in range(rows):
+        for j in range(N):
+            f.x[j] -= f.share[m + i, j] * f.eps[m + i]
+    for i in range(rows):
+        r = noise_of(f, s, i, packet)
+        if first >= 0:
+            measure_clone(f, first + i, r, 0.0)
+        else:
+            measure_state(f, f.row[s, i], r, 0.0)
+        f.eps[m + i] = f.residual[i]
+        for j in range(N):
+            f.share[m + i, j] = f.gain[j] / steps
+            f.x[j] += f.share[m + i, j] * f.residual[i]
+    for j in range(N):
+        f.e[j] = 0.0
+        for i in range(m + rows):
+            f.e[j] += (f.inverse[i, j] - f.share[i, j]) * f.eps[i]
+
+
+@jit
+def _spread(f: Any, gains: Any, s: int) -> None:
+    """x += the share of the last innovation that is due now."""
+    first = _constant_row(f, s) + f.since * f.rows[s]
+    for i in range(f.rows[s]):
+        K = gains[f.cell, first + i]
+        for j in range(f.total):
+            f.x[j] += K[j] * f.eps[f.fasts + i]
+
+
+@jit
+def spread_sample(f: Any, gains: Any, s: int) -> None:
+    """A sample has come: keep its innovation and use its first share."""
+    for i in range(f.rows[s]):
+        f.eps[f.fasts + i] = f.residual[i]
+    f.since = 0
+    _spread(f, gains, s)
+
+
+@jit
+def spread_between(f: Any, gains: Any, s: int) -> None:
+    """The next share, as long as there is one."""
+    if f.since >= 0:
+        f.since += 1
+        if f.since < f.cycle:
+            _spread(f, gains, s)

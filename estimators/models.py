@@ -1,7 +1,7 @@
-"""Which states a filter has and what its sensors measure; the model at a speed, compiled.
+"""Which states a filter has, what drives them and what its sensors measure.
 
 States stand in the order of `ORDER`, as many of them as the model has. The first ones follow the
-bicycle model and what it moves ("dense"), the disturbances behind them decay by themselves.
+physical model ("dense"), the disturbances behind them decay by themselves.
 """
 
 import math
@@ -12,65 +12,128 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..envs.backend import jit, maximum
-from ..envs.linear import bicycle_coefficients
-from ..envs.record import CAMERA, GPS, SLOW_NAMES
+from ..envs.record import CAMERA, FAST, GPS, SLOW_NAMES
 from ..envs.vehicle import Vehicle
-from .memory import CORE
+from .transition import FORCES, KINEMATIC, LATERAL, ROLL, VELOCITY_ROLL, YAW
 
 Array = npt.NDArray[np.float64]
 
-SLOWEST = 1.5  # m/s: below it the model stays that of this speed
 SMOOTHING_TIME = 0.2  # s, of the measured speed
 COURSE_SPEED = 60.0 / 3.6  # m/s at which the receivers' course noise is quoted
 
-
-@dataclass(frozen=True)
-class Model:
-    """States by name and what drives the disturbances among them.
-
-    states: "beta", "gamma", then any of "psi", "y_l" in this order. disturbances: none, "walk"
-    (d_1, d_2 of dakf-stability (8)-(9), (14)) or "forces" (an Ornstein-Uhlenbeck force and moment).
-    """
-
-    states: tuple[str, ...]
-    disturbances: str = "none"
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of all states."""
-        return self.states + DISTURBANCES[self.disturbances]
-
-
-DISTURBANCES = {"none": (), "walk": ("d1", "d2"), "forces": ("F_d", "N_d")}
 UNITS = {
     "beta": "rad",
     "gamma": "rad/s",
     "psi": "rad",
     "y_l": "m",
+    "psi_late": "rad",
+    "y_l_late": "m",
+    "v_x": "m/s",
+    "v_y": "m/s",
+    "phi": "rad",
+    "phi_rate": "rad/s",
+    "F_yf": "N",
+    "F_yr": "N",
     "d1": "rad/s",
     "d2": "rad/s2",
+    "d3": "rad/s",
+    "d": "rad/s2",
     "F_d": "N",
     "N_d": "N m",
 }
 
-BICYCLE = Model(("beta", "gamma"))
-COURSE = Model(("beta", "gamma", "psi"))
-VISION = Model(("beta", "gamma", "psi", "y_l"))
+
+@dataclass(frozen=True)
+class Model:
+    """States by name, what drives them and what is measured.
+
+    kind: of `transition`. states: those that follow the model. disturbances: name of each state
+    behind them and the state that it pushes, or, for "forces", an Ornstein-Uhlenbeck force and
+    moment. late: the states that lag behind the camera's (tie-vision (12)). inputs, fast: names of
+    `SIGNALS`.
+    """
+
+    kind: int
+    states: tuple[str, ...]
+    inputs: tuple[str, ...] = ("steer", "N_z")
+    fast: tuple[str, ...] = ("gyro",)
+    disturbances: tuple[tuple[str, str], ...] = ()
+    forces: bool = False
+    late: tuple[str, ...] = ()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of all states."""
+        behind = ("F_d", "N_d") if self.forces else tuple(name for name, _ in self.disturbances)
+        return self.states + self.late + behind
+
+
+ORDER = ("beta", "gamma", "psi", "y_l")
+WALK = (("d1", "beta"), ("d2", "gamma"))  # dakf-stability (8)-(9), (14)
+WALK_ALL = (*WALK, ("d3", "psi"))  # dual-rate (4): one for every state of (37)
+
+MODELS: dict[str, Model] = {
+    "roll": Model(ROLL, ("phi", "phi_rate"), ("accel_y",), ("roll_rate",)),
+    "kinematic": Model(KINEMATIC, ("v_x", "v_y"), ("accel_x", "accel_y"), ("wheel",)),
+    "velocity-roll": Model(
+        VELOCITY_ROLL,
+        ("v_x", "v_y", "phi", "phi_rate"),
+        ("accel_x", "accel_y"),
+        ("roll_rate",),
+        (("d", "phi_rate"),),
+    ),
+    "yaw-moment": Model(YAW, ("gamma",), ("N_z",), ("gyro",), (("N_d", "gamma"),)),
+    "tyre-forces": Model(
+        FORCES, ("gamma",), ("N_z",), ("gyro", "accel_y"), (("F_yf", "gamma"), ("F_yr", "gamma"))
+    ),
+}
+"""Models other than the bicycle's, by name."""
+
 ROWS: dict[str, tuple[tuple[str, ...], ...]] = {
     "camera": (("psi",), ("y_l",)),
     "gps": (("beta", "psi"),),
 }
-"""What each slow sensor measures: sums of states, one a row."""
+"""What each slow sensor measures of a bicycle: sums of states, one a row."""
 
-_ANGLES = {"camera": (1, 0), "gps": (1, 0)}
+VELOCITY_ROWS = (("v_x",), ("v_y",))  # double-layer-gps (41)
+_ANGLES = {"camera": (1, 0, 0, 0), "gps": (1, 0, 0, 0)}
 _NEEDS = {"camera": ("psi", "y_l"), "gps": ("psi",)}
+_LATE = {"psi": "psi_late", "y_l": "y_l_late"}
+
+Signal = tuple[tuple[int, float], tuple[int, float]]
+
+
+def signals(vehicle: Vehicle) -> dict[str, Signal]:
+    """Sums of two columns of a fast row, as (column, factor), by name."""
+    arm = vehicle.rear_track / (2.0 * vehicle.wheel_radius)  # N_z = arm (T_r - T_l)
+    single = ("gyro", "accel_y", "accel_x", "roll_rate", "steer")
+    table: dict[str, Signal] = {
+        name: ((getattr(FAST, name), 1.0), (getattr(FAST, name), 0.0)) for name in single
+    }
+    table["N_z"] = ((FAST.torque_right, arm), (FAST.torque_left, -arm))
+    table["wheel"] = ((FAST.wheel_left, 0.5), (FAST.wheel_right, 0.5))
+    return table
 
 
 def states_for(sensors: tuple[str, ...]) -> tuple[str, ...]:
-    """The smallest set of states that the given slow sensors measure."""
+    """The smallest set of a bicycle's states that the given slow sensors measure."""
     needed = {state for sensor in sensors for state in _NEEDS[sensor]}
-    return BICYCLE.states + tuple(state for state in ("psi", "y_l") if state in needed)
+    return ORDER[:2] + tuple(state for state in ORDER[2:] if state in needed)
+
+
+def bicycle_model(
+    sensors: tuple[str, ...], fast: tuple[str, ...], disturbances: str, late: bool
+) -> Model:
+    """The bicycle with what the given slow sensors need.
+
+    disturbances: "none", "walk" (d_1, d_2), "walk-all" (every state's) or "forces".
+    late: the camera measures states that lag (tie-vision (12)-(13)).
+    """
+    walks = {"walk": WALK, "walk-all": WALK_ALL}.get(disturbances, ())
+    states = states_for(sensors)
+    lagging = tuple(_LATE[s] for s in states if s in _LATE) if late and "camera" in sensors else ()
+    walks = tuple((name, state) for name, state in walks if state in states)
+    return Model(LATERAL, states, ("steer", "N_z"), fast, walks, disturbances == "forces", lagging)
 
 
 def write_model(
@@ -78,15 +141,16 @@ def write_model(
 ) -> None:
     """Write everything about the model and its rows into a filter's record.
 
-    step: s. noise: standard deviations "gyro", "psi", "y_l", "course" (at 60 km/h, growing as
-    1/V) or "course_fixed" (at any speed), and of disturbances "force", "moment", "time".
-    Q: (n, n), process noise per second on top of them.
+    step: s. noise: standard deviations "gyro", "accel_y", "roll_rate", "wheel", "psi", "y_l",
+    "course" (at 60 km/h, growing as 1/V) or "course_fixed" (at any speed), and of disturbances
+    "force", "moment", "time". Q: (n, n), process noise per second on top of them.
     """
-    names, dense = model.names, len(model.states)
+    names, dense = model.names, len(model.states) + len(model.late)
     n = len(names)
-    f.n = f.total = n
-    f.dense = dense
-    f.forces = int(model.disturbances == "forces")
+    f.kind, f.n, f.total, f.dense, f.delayed = model.kind, n, n, dense, len(model.late)
+    f.forces = int(model.forces)
+    for j, (_, pushed) in enumerate(model.disturbances):
+        f.pushed[j] = names.index(pushed)
     f.car[:] = [
         vehicle.mass,
         vehicle.yaw_inertia,
@@ -95,121 +159,58 @@ def write_model(
         vehicle.front_stiffness,
         vehicle.rear_stiffness,
     ]
+    f.roll[:] = [
+        vehicle.roll_stiffness / vehicle.roll_inertia,
+        vehicle.roll_damping / vehicle.roll_inertia,
+        vehicle.sprung_mass * vehicle.roll_arm / vehicle.roll_inertia,
+    ]
     f.preview = vehicle.preview
-    f.moment_arm = vehicle.rear_track / (2.0 * vehicle.wheel_radius)
     f.step = step
     f.Q[:n, :n] = Q * step
     f.decay[:] = 1.0
-    if model.disturbances == "forces":  # exact discretisation of the process
+    if model.forces:  # exact discretisation of the process
         keep = math.exp(-step / noise["time"])
         f.decay[dense:n] = keep
         f.Q[dense, dense] += (1.0 - keep * keep) * noise["force"] ** 2
         f.Q[dense + 1, dense + 1] += (1.0 - keep * keep) * noise["moment"] ** 2
-    f.gyro[1] = 1.0
-    f.r_gyro = noise["gyro"] ** 2
-    for sensor in SLOW_NAMES:
-        s = SLOW_NAMES.index(sensor)
+    f.speed_state = names.index("v_x") if "v_x" in names else -1
+    _write_signals(f, model, vehicle, noise)
+    _write_rows(f, model, noise)
+
+
+def _write_signals(f: Any, model: Model, vehicle: Vehicle, noise: Mapping[str, float]) -> None:
+    """Inputs and fast measurements; rows that depend on the speed are `transition.build`'s."""
+    table, names = signals(vehicle), model.names
+    f.inputs, f.fasts = len(model.inputs), len(model.fast)
+    for i, name in enumerate(model.inputs):
+        f.u_column[i], f.u_factor[i] = zip(*table[name], strict=True)
+    state_of = {"gyro": "gamma", "roll_rate": "phi_rate", "wheel": "v_x"}
+    for i, name in enumerate(model.fast):
+        f.y_column[i], f.y_factor[i] = zip(*table[name], strict=True)
+        f.r_fast[i] = noise[name] ** 2
+        if name in state_of:
+            f.y_row[i, names.index(state_of[name])] = 1.0
+    if model.kind == FORCES:  # m a_y = F_yf + F_yr
+        f.y_row[1, 1] = f.y_row[1, 2] = 1.0 / vehicle.mass
+
+
+def _write_rows(f: Any, model: Model, noise: Mapping[str, float]) -> None:
+    names = model.names
+    for s, sensor in enumerate(SLOW_NAMES):
         if f.period[s] == 0:
             continue
-        f.rows[s] = len(ROWS[sensor])
-        f.angle[s] = _ANGLES[sensor]
-        for i, summed in enumerate(ROWS[sensor]):
+        velocity = model.kind == VELOCITY_ROLL
+        rows = VELOCITY_ROWS if velocity else ROWS[sensor]
+        f.rows[s] = len(rows)
+        f.angle[s] = 0 if velocity else _ANGLES[sensor]
+        for i, summed in enumerate(rows):
             for state in summed:
-                f.row[s, i, names.index(state)] = 1.0
-    f.r[CAMERA] = noise["psi"] ** 2, noise["y_l"] ** 2
+                late = _LATE.get(state)
+                f.row[s, i, names.index(late if late in model.late else state)] = 1.0
+    f.r[CAMERA, :2] = noise["psi"] ** 2, noise["y_l"] ** 2
     fixed = noise.get("course_fixed")
     f.r[GPS, 0] = 0.0 if fixed is None else fixed**2
     f.r_course = 0.0 if fixed is not None else (noise["course"] * COURSE_SPEED) ** 2
-
-
-@jit
-def continuous(f: Any, V: Any) -> None:
-    """A and B = [inputs, disturbances] at the speed V: tie-vision (8), dakf-stability (5)-(11)."""
-    m, I, l_f, l_r, C_f, C_r = f.car[0], f.car[1], f.car[2], f.car[3], f.car[4], f.car[5]  # noqa: E741
-    a11, a12, a21, a22, b11, b21, b22 = bicycle_coefficients(m, I, l_f, l_r, C_f, C_r, V)
-    A, B = f.A, f.B
-    for i in range(CORE):
-        for j in range(CORE):
-            A[i, j] = 0.0
-            B[i, j] = 0.0
-    A[0, 0], A[0, 1], A[1, 0], A[1, 1] = a11, a12, a21, a22
-    B[0, 0], B[1, 0], B[1, 1] = b11, b21, b22
-    if f.dense > 2:
-        A[2, 1] = 1.0  # psi' = gamma, tie-vision (7)
-    if f.dense > 3:
-        A[3, 0], A[3, 1], A[3, 2] = V, f.preview, V  # tie-vision (6)
-    if f.n > f.dense:
-        B[0, 2] = 1.0 / (m * V) if f.forces == 1 else 1.0
-        B[1, 3] = b22 if f.forces == 1 else 1.0
-
-
-@jit
-def _product(a: Any, b: Any, c: Any, n: int, m: int) -> None:
-    """c = a b for a (n, n) and b (n, m)."""
-    for i in range(n):
-        for j in range(m):
-            c[i, j] = 0.0
-        for k in range(n):
-            for j in range(m):
-                c[i, j] += a[i, k] * b[k, j]
-
-
-@jit
-def discretise(f: Any) -> None:
-    """G and H of tie-vision (9): exact for inputs and disturbances held over the step.
-
-    Phi = integral of e^(A t) over the step by its Taylor series, after halving the step until
-    ||A h|| <= 1/2 and doubling back; G = I + A Phi. Accurate to rounding (relative 1e-14).
-    """
-    n, m = f.dense, 2 + f.n - f.dense
-    E, Phi, T = f.work[0], f.work[1], f.work[2]
-    norm = 0.0
-    for i in range(n):
-        total = 0.0
-        for j in range(n):
-            total += abs(f.A[i, j])
-        norm = maximum(norm, total * f.step)
-    h, doublings = f.step, 0
-    while norm > 0.5:
-        norm *= 0.5
-        h *= 0.5
-        doublings += 1
-    for i in range(n):
-        for j in range(n):
-            Phi[i, j] = 0.0
-        Phi[i, i] = h
-    for order in range(15, 1, -1):  # Horner: Phi = h (I + A h / 2 (I + A h / 3 (...)))
-        _product(f.A, Phi, T, n, n)
-        for i in range(n):
-            for j in range(n):
-                Phi[i, j] = T[i, j] * (h / order)
-            Phi[i, i] += h
-    for _ in range(doublings):  # the integral over 2 h is (I + e^(A h)) times that over h
-        _product(f.A, Phi, E, n, n)
-        for i in range(n):
-            E[i, i] += 2.0
-        _product(E, Phi, T, n, n)
-        for i in range(n):
-            for j in range(n):
-                Phi[i, j] = T[i, j]
-    _product(f.A, Phi, E, n, n)
-    _product(Phi, f.B, T, n, m)
-    for i in range(n):
-        E[i, i] += 1.0
-        for j in range(n):
-            f.G[i, j] = E[i, j]
-        for j in range(2):
-            f.H[i, j] = T[i, j]
-        for j in range(2, m):
-            f.G[i, n + j - 2] = T[i, j]
-
-
-@jit
-def build(f: Any, speed: Any) -> None:
-    """The model at a speed in m/s, and the course's variance there."""
-    V = maximum(speed, SLOWEST)
-    continuous(f, V)
-    discretise(f)
-    f.model_speed = V
-    if f.r_course > 0.0:
-        f.r[GPS, 0] = f.r_course / (V * V)
+    if model.kind == VELOCITY_ROLL:  # layer 2 is told its noise with each packet
+        f.r_course = 0.0
+        f.r[GPS, :2] = noise["gps_speed"] ** 2

@@ -59,7 +59,7 @@ def observe(
     standard deviation and the nees. Returns the rows done, as `advance` does.
     """
     f = filters[0]
-    done = advance(f, gains, fast, rows, packets, count, start, fast[:0], fast[:0])
+    done = advance(filters, gains, fast, rows, packets, count, start, fast[:0], fast[:0], said[:0])
     if done < rows:
         return done
     for i in range(kept):

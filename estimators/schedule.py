@@ -39,20 +39,20 @@ NO_SENSOR = Schedule(1, ())
 
 
 def schedules(
-    name: str, sensor: SlowSensor, dt: float, stride: int, frames: int
+    name: str, sensor: SlowSensor, dt: float, stride: int, pace: int, frames: int
 ) -> tuple[Schedule, ...]:
     """What the sensor's schedule can be: one where it repeats, else its two extremes.
 
-    stride: ticks of a filter's step; a filter at the sensor's rate uses a sample in the first step
-    at or after its arrival. frames: held clones, whose slots take turns; 0 for a filter that does
-    not look at the lag.
+    stride: ticks of a filter's step. pace: ticks between steps that listen; a sample is used in the
+    first of them at or after its arrival. frames: held clones, whose slots take turns; 0 for a
+    filter that does not look at the lag.
     """
     period = whole_ticks(sensor.period, dt, f"the {name}'s period") // stride
     late = [whole_ticks(delay, dt, f"a delay of the {name}") for delay in sensor.delays]
     jitter = whole_ticks(sensor.jitter, dt, f"the {name}'s jitter")
 
     def lagging(extra: int) -> Schedule:
-        lags = [math.ceil((lag + extra) / stride) for lag in late]
+        lags = [math.ceil((lag + extra) / pace) * pace // stride for lag in late]
         if len(set(lags)) == 1:
             lags = lags[:1]
         return Schedule(period, tuple(lags * (math.lcm(len(lags), max(1, frames)) // len(lags))))

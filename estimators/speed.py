@@ -3,7 +3,7 @@
 from typing import Any
 
 from ..envs.backend import absolute, jit, maximum, minimum
-from .models import SLOWEST
+from .transition import SLOWEST
 
 MOVED = 0.005  # the model is built anew where the speed moved by this share
 

@@ -9,8 +9,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from .delay import CLONE, CONSTANT, STORED
+from .intersample import PSEUDO, SPREAD
 from .periodic import measured_rows, slow_index
+from .placed import whole
 from .schedule import Schedule
+from .spread import frame_map
 
 Array = npt.NDArray[np.float64]
 
@@ -36,22 +40,36 @@ def unobservable(M: Array, names: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def error_map(f: Any, table: Array, G: Array, schedule: Schedule) -> Array:
-    """The error after one cycle over that before it, (size, size); for pseudo-residuals the
-    estimated error e stands behind the error, (2 size, 2 size).
+    """The error after one cycle over that before it, (size, size); what else a rule carries on
+    (the estimated error e, the last innovation, stored predictions) stands behind it.
 
     f: the filter's record. table, G: from `periodic.design`.
     """
-    n, size, s = int(f.n), int(f.total), slow_index(f)
+    size, s = int(f.total), slow_index(f)
     F = np.eye(size)
-    F[: len(G), :n] = G
-    F[range(len(G), n), range(len(G), n)] = f.decay[len(G) : n]
-    correct = _pseudo_correction if f.pseudo else _correction
-    total: Array = np.eye(2 * size if f.pseudo else size)
+    F[: f.n, : f.n] = whole(f, G)
+    if f.between == SPREAD:
+        return _spread_map(f, table, F, s, schedule)
+    stored = schedule.cycle // schedule.period if f.late in (STORED, CONSTANT) and s >= 0 else 0
+    rows = int(f.rows[s]) if s >= 0 else 0
+    twice = 2 if f.between == PSEUDO else 1
+    width = twice * size + stored * rows
+    total: Array = np.eye(width)
     for step in range(schedule.cycle):
-        move: Array = F @ _latched(f, s, schedule, step)
-        if f.pseudo:
-            move = np.asarray(np.kron(np.eye(2), move), np.float64)
-        total = np.asarray(correct(f, s, table, schedule, step) @ move @ total, np.float64)
+        move = np.eye(width)
+        one = F @ _latched(f, s, schedule, step)
+        for k in range(twice):
+            move[k * size : (k + 1) * size, k * size : (k + 1) * size] = one
+        frame, rest = divmod(step, schedule.period)
+        if stored and rest == 0:  # the prediction of what is captured now
+            at = twice * size + frame * rows
+            store = np.eye(width)
+            store[at : at + rows] = 0.0
+            store[at : at + rows, : f.n] = f.row[s, :rows, : f.n]
+            move = store @ move
+        correct = _pseudo_correction if f.between == PSEUDO else _correction
+        held = twice * size if stored else -1
+        total = np.asarray(correct(f, s, table, schedule, step, width, held) @ move @ total)
     return total
 
 
@@ -59,7 +77,7 @@ def _latched(f: Any, s: int, schedule: Schedule, step: int) -> Array:
     """Clones of what was captured in the step before."""
     L = np.eye(int(f.total))
     frame, rest = divmod((step - 1) % schedule.cycle, schedule.period)
-    if s >= 0 and f.frames[s] > 0 and rest == 0:
+    if s >= 0 and f.late == CLONE and f.frames[s] > 0 and rest == 0:
         rows = int(f.rows[s])
         first = int(f.home[s]) + frame % int(f.frames[s]) * rows
         L[first : first + rows] = 0.0
@@ -67,27 +85,78 @@ def _latched(f: Any, s: int, schedule: Schedule, step: int) -> Array:
     return L
 
 
-def _correction(f: Any, s: int, table: Array, schedule: Schedule, step: int) -> Array:
-    """(I - K C) of the gyro and of the frames that arrive in a step."""
-    size = int(f.total)
-    I = np.eye(size)  # noqa: E741
-    M = I - np.outer(table[1 + step, :size], measured_rows(f, s, 0)[0])
+def _seen(f: Any, s: int, schedule: Schedule, frame: int, width: int, held: int) -> Array:
+    """What the residuals of a step see of the whole error, (m + p, width)."""
+    C = np.zeros((int(f.fasts) + (int(f.rows[s]) if s >= 0 else 0), width))
+    lag = schedule.lags[frame] if schedule.lags else 0
+    own = measured_rows(f, s, frame, lag)
+    C[:, : own.shape[1]] = own
+    if held >= 0:
+        m, p = int(f.fasts), int(f.rows[s])
+        C[m:] = 0.0
+        C[m:, held + frame * p : held + (frame + 1) * p] = np.eye(p)
+    return C
+
+
+def _correction(
+    f: Any, s: int, table: Array, schedule: Schedule, step: int, width: int, held: int
+) -> Array:
+    """(I - K C) of the fast rows and of the frames that arrive in a step."""
+    size, m = int(f.total), int(f.fasts)
+    I = np.eye(width)  # noqa: E741
+    M = I.copy()
+    fast = _seen(f, s, schedule, 0, width, held)[:m]
+    joint = np.zeros((width, width))
+    for i in range(m):
+        K = np.zeros(width)
+        K[:size] = table[1 + step * max(m, 1) + i, :size]
+        if f.joint:
+            joint += np.outer(K, fast[i])
+        else:
+            M = (I - np.outer(K, fast[i])) @ M
+    M = (I - joint) @ M
     for frame in schedule.arriving(step):
-        C = measured_rows(f, s, frame, schedule.lags[frame])
-        for i in range(1, len(C)):
-            K = table[schedule.cycle + frame * (len(C) - 1) + i, :size]
-            M = (I - np.outer(K, C[i])) @ M
+        C = _seen(f, s, schedule, frame, width, held)[m:]
+        own = measured_rows(f, s, frame, 0 if held >= 0 else schedule.lags[frame])[m:]
+        first = 1 + schedule.cycle * max(m, 1) + frame * len(C)
+        total, passed = np.zeros((width, len(C))), np.eye(len(C))
+        for i in range(len(C)):  # row i's correction changes the residuals of those behind it
+            K = np.zeros(width)
+            K[:size] = table[first + i, :size]
+            total += np.outer(K, passed[i])
+            passed -= np.outer(own @ K[:size], passed[i]) * (np.arange(len(C)) > i)[:, None]
+        M = (I - total @ C) @ M
     return M
 
 
-def _pseudo_correction(f: Any, s: int, table: Array, schedule: Schedule, step: int) -> Array:
-    """(error, e) -> (error, e): tie-vision (19)-(22)."""
-    size, C = int(f.total), measured_rows(f, s, 0)
-    first = 1 + schedule.cycle + (len(C) - 1) * len(schedule.lags)
+def _pseudo_correction(
+    f: Any, s: int, table: Array, schedule: Schedule, step: int, width: int, held: int
+) -> Array:
+    """(error, e, ...) -> (error, e, ...): tie-vision (19)-(22)."""
+    size, m = int(f.total), int(f.fasts)
+    C = measured_rows(f, s, 0)
+    first = 1 + schedule.cycle * max(m, 1) + (len(C) - m) * len(schedule.lags)
     K = table[first : first + len(C), :size].T
     inverse = table[first + len(C) : first + 2 * len(C), :size].T
-    I, zero = np.eye(size), np.zeros((size, size))  # noqa: E741
-    if schedule.arriving(step):
-        return np.block([[I - K @ C, zero], [(inverse - K) @ C, zero]])  # (19)-(20)
-    fast = np.outer(K[:, 0], C[0])
-    return np.block([[I - fast, fast - K @ C], [zero, I - K @ C]])  # (21)-(22)
+    M, error, e = np.eye(width), slice(0, size), slice(size, 2 * size)
+    arriving = schedule.arriving(step)
+    if arriving:
+        see = np.zeros((len(C), width))
+        see[:, :size] = C
+        if held >= 0:
+            see = _seen(f, s, schedule, arriving[-1], width, held)
+        M[error] -= K @ see  # (19)
+        M[e] = (inverse - K) @ see  # (20)
+        return M
+    M[error, error] -= K[:, :m] @ C[:m]  # the fast rows' residuals are real
+    M[error, e] -= K[:, m:] @ C[m:]  # (22)
+    M[e, e] -= K @ C  # (21)
+    return M
+
+
+def _spread_map(f: Any, table: Array, F: Array, s: int, schedule: Schedule) -> Array:
+    """From sample to sample, with the shares in the table."""
+    n, q, r = int(f.n), int(f.rows[s]), schedule.period
+    first = 1 + schedule.cycle + q * len(schedule.lags)
+    B = table[first : first + r * q, :n].reshape(r, q, n).transpose(0, 2, 1)
+    return frame_map(F[:n, :n], f.row[s, :q, :n], B)

@@ -133,6 +133,8 @@ def _packets(
                 row[PACKET.value : PACKET.value + 2] = x[k, 2:] + n * (3.5e-3, 0.02)
             else:
                 row[PACKET.value] = x[k, 0] + x[k, 2] + course_sd * n[0]
+                row[PACKET.value + 1] = drive.speed + 0.05 * n[1]
+                row[PACKET.value + 4 :] = 1.0, 12.0  # HDOP, satellites
                 if drive.outage[0] <= k * 1e-3 < drive.outage[1]:
                     continue
             if k + late <= K:

@@ -5,8 +5,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.envs.record import FAST, PACKET, Log, Record, SlowSensor
+from sideslip.envs.record import FAST, FAST_WIDTH, PACKET, PACKET_WIDTH, Log, Record, SlowSensor
 from sideslip.estimators import FILTERS, make_estimator
+from sideslip.estimators.memory import COUNTERS
 from tests.estimators.simulation import CAMERA, FIG7, GPS, simulate
 
 pytestmark = pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning")
@@ -72,7 +73,7 @@ def test_constructor_errors_name_the_thing(
     [
         (SlowSensor(0.033, (0.01,), jitter=0.02), "multirate-kf", {"gains": "periodic"}, "random"),
         (SlowSensor(0.033, (0.05,)), "multirate-residual-kf", {}, "before the next one"),
-        (SlowSensor(0.033, (0.3,)), "exact-kf", {}, "at most 8 frames"),
+        (SlowSensor(0.033, (0.3,)), "exact-kf", {}, "can hold 8"),
     ],
 )
 def test_schedules_that_a_filter_cannot_hold(
@@ -109,25 +110,25 @@ def test_logs_that_cannot_be_filtered(log: Any) -> None:
         filter_.run(Record(record.fast, record.packets, dt=0.01))
     with pytest.raises(ValueError, match=r"built for the camera .* the reset tells"):
         filter_.run(Log(record, {"camera": SlowSensor(0.05)}))
-    with pytest.raises(ValueError, match=r"fast rows have shape \(k, 10\), got \(1, 3\)"):
+    with pytest.raises(ValueError, match=r"fast rows have shape \(k, 11\), got \(1, 3\)"):
         filter_.predict(np.zeros(3))
-    with pytest.raises(ValueError, match=r"packet has shape \(9,\), got \(3,\)"):
+    with pytest.raises(ValueError, match=r"packet has shape \(11,\), got \(3,\)"):
         filter_.update(np.zeros(3))
 
 
 def packet(
     sensor: Any = 0, captured: Any = 0, arrived: Any = None, quality: Any = 1.0, value: Any = 0.01
 ) -> Any:
-    row = np.zeros(9)
+    row = np.zeros(PACKET_WIDTH)
     row[:5] = sensor, captured, captured if arrived is None else arrived, quality, 0
-    row[5:] = value
+    row[5:7] = value
     return row
 
 
 def counted(filter_: Any, *packets: Any) -> Any:
     """What the counters say after 100 quiet ticks and these packets, apart from zeros."""
     filter_.reset()
-    filter_.step(np.zeros((100, 10)), np.zeros((0, 9)))
+    filter_.step(np.zeros((100, FAST_WIDTH)), np.zeros((0, PACKET_WIDTH)))
     before = filter_.x
     for row in packets:
         filter_.update(row)
@@ -163,7 +164,7 @@ def test_a_duplicate_changes_nothing(log: Any) -> None:
     filter_ = make_estimator("exact-kf", sensors=log.slow, speed=7.0)
     once = filter_.run(log)
     packets = np.repeat(log.record.packets, 2, 0)
-    packets[1::2, 5:] += 1.0  # the first counts
+    packets[1::2, 5:9] += 1.0  # the first counts
     twice = filter_.run(Record(log.record.fast, packets))
     np.testing.assert_array_equal(once.x, twice.x)
     assert filter_.duplicates == len(log.record.packets)
@@ -179,24 +180,26 @@ def test_packets_beyond_the_record_are_from_the_future(log: Any) -> None:
 @pytest.mark.parametrize("name", list(FILTERS))
 def test_rows_that_are_not_finite_are_skipped(name: Any) -> None:
     log = simulate(SHORT, BOTH, 0)
-    for column in (FAST.gyro, FAST.steer, FAST.torque_left, FAST.wheel_left):
+    for column in range(FAST.steer_command):
         rows = log.record.fast.copy()
         rows[150, column] = np.nan
         rows[160, column] = np.inf
         filter_ = make_estimator(name, sensors=BOTH)
         found = filter_.run(Record(rows, log.record.packets))
         assert np.isfinite(found.x).all() and np.isfinite(found.std).all()
-        expected = 0 if column == FAST.wheel_left else 2
-        if name == "single-rate-kf" and column == FAST.gyro:
-            expected = 0  # it samples the gyro every 33 ms
-        assert filter_.invalid == expected
+        expected = 0
+        for f in filter_.filters:  # the driver's inputs once a row, each fast sensor once
+            expected += 2 * (column in f.u_column[: f.inputs])
+            heard = f.pace == 1  # a single-rate filter samples its gyro every 33 ms
+            expected += 2 * heard * (column in f.y_column[: f.fasts])
+        assert sum(f.counts[COUNTERS.invalid] for f in filter_.filters) == expected
 
 
 def test_the_first_course_far_off_sets_the_heading() -> None:
     """A log whose heading does not start at zero; courses are wrapped."""
     for name in ("multirate-kf", "multirate-residual-kf", "course-kf"):
         filter_ = make_estimator(name, sensors={"gps": GPS}, speed=7.0)
-        rows = np.zeros((1001, 10))
+        rows = np.zeros((1001, FAST_WIDTH))
         for heading in (2.0, -3.0):
             courses = [
                 packet(1, k, value=(heading + 0.01 * (-1) ** k + np.pi) % (2 * np.pi) - np.pi)

@@ -11,7 +11,7 @@ from sideslip.envs.linear import course, vision
 from sideslip.envs.record import SlowSensor
 from sideslip.envs.vehicle import COMS, PASSENGER_CAR
 from sideslip.estimators import make_estimator
-from sideslip.estimators.models import discretise
+from sideslip.estimators.transition import discretise
 from tests.estimators.simulation import CAMERA, GPS
 
 STEPS = (0.001, 0.01, 0.033, 0.1, 0.2)
@@ -23,7 +23,7 @@ def model_of(name: Any, vehicle: Any, speed: Any, step: Any, sensors: Any) -> An
     f = filter_.filters[0]
     f.step = step
     discretise(f)
-    return f.G[: f.dense, : f.n].copy(), f.H[: f.dense].copy()
+    return f.G[: f.dense, : f.n].copy(), f.H[: f.dense, :2].copy()
 
 
 @pytest.mark.parametrize("step", STEPS)
@@ -62,9 +62,9 @@ def test_dakf_is_the_papers_discrete_model() -> None:
         filter_ = make_estimator("dakf", vehicle=stiff, sensors={"gps": GPS}, speed=V)
     f = filter_.filters[0]
     np.testing.assert_allclose(f.G[:3, :5], np.hstack([A_nd, D_nd]), atol=1e-9)
-    np.testing.assert_allclose(f.H[:3], B_nd, atol=1e-9)
+    np.testing.assert_allclose(f.H[:3, :2], B_nd, atol=1e-9)
     np.testing.assert_array_equal(f.decay[3:5], [1.0, 1.0])  # (14): a random walk
-    np.testing.assert_array_equal(f.gyro[:5], [0, 1, 0, 0, 0])  # (19)
+    np.testing.assert_array_equal(f.y_row[0, :5], [0, 1, 0, 0, 0])  # (19)
     np.testing.assert_array_equal(f.row[1, 0, :5], [1, 0, 1, 0, 0])
     assert filter_.names == ("beta", "gamma", "psi", "d1", "d2")
 

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.envs.record import FAST, Record, SlowSensor
+from sideslip.envs.record import FAST, FAST_WIDTH, PACKET_WIDTH, Record, SlowSensor
 from sideslip.estimators import make_estimator
 from tests.estimators.simulation import CAMERA, FIG7, GPS, simulate
 
@@ -56,12 +56,12 @@ def test_gains_are_made_for_each_speed_when_it_is_reached() -> None:
 
 
 def test_a_changing_speed_rebuilds_the_model_by_half_a_percent() -> None:
-    rows = np.zeros((4000, 10))
+    rows = np.zeros((4000, FAST_WIDTH))
     rows[:, FAST.wheel_left] = rows[:, FAST.wheel_right] = np.linspace(3.0, 12.0, 4000)
     filter_ = make_estimator("multirate-kf", sensors={"camera": CAMERA})
     speeds = []
     for row in rows[::10]:
-        filter_.step(np.repeat(row[None], 10, 0), np.zeros((0, 9)))
+        filter_.step(np.repeat(row[None], 10, 0), np.zeros((0, PACKET_WIDTH)))
         speeds.append(float(filter_.filters[0].model_speed))
     lowpass = 3.0
     for k, row in enumerate(np.repeat(rows[::10, FAST.wheel_left], 10)):

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.envs.record import SlowSensor
+from sideslip.envs.record import FAST, FAST_WIDTH, PACKET_WIDTH, SlowSensor
 from sideslip.envs.vehicle import COMS
 from sideslip.estimators import UnobservableWarning, make_estimator
 from sideslip.estimators.periodic import design
@@ -41,7 +41,7 @@ def test_without_noise_every_error_dies_out_as_its_spectral_radius_says(
     )
     assert filter_.spectral_radius < 1.0
     n = len(filter_.names)
-    filter_.take(log.record.fast, 1, np.zeros((0, 9)), 0)
+    filter_.take(log.record.fast, 1, np.zeros((0, PACKET_WIDTH)), 0)
     wrong = filter_.get_state()
     wrong["x"][0, :n] += np.where(np.array(filter_.units) == "N", 10.0, 0.05)
     filter_.set_state(wrong)
@@ -61,12 +61,12 @@ def test_the_error_map_is_what_the_compiled_filter_does() -> None:
         filter_ = make_estimator(name, vehicle=COMS, sensors=sensors, speed=7.0)
         filter_.P  # noqa: B018  designs the table
         f, schedule = filter_.filters[0], filter_._schedules[0]
-        table, G = design(f, schedule, 7.0, "moore-penrose")
+        table, G = design(f, schedule, 7.0, filter_._wish)
         M = error_map(f, table, G, schedule)
         N, n = int(f.total), int(f.n)
         cycle = schedule.cycle
-        rows = np.zeros((5 * cycle, 10))
-        packets = np.zeros((10, 9))
+        rows = np.zeros((5 * cycle, FAST_WIDTH))
+        packets = np.zeros((10, PACKET_WIDTH))
         for i in range(10):
             packets[i, :5] = 0, 33 * i, 33 * i + (20, 10)[i % 2], 1, i
         due = packets[packets[:, 2] < 2 * cycle]
@@ -92,10 +92,10 @@ def test_a_filter_whose_error_grows_is_refused_with_the_number() -> None:
 
 def test_one_that_starts_to_diverge_on_the_way_is_refused_there() -> None:
     filter_ = make_estimator("multirate-residual-kf", sensors={"camera": CAMERA})
-    rows = np.zeros((10, 10))
-    rows[:, 3:5] = 40.0
+    rows = np.zeros((10, FAST_WIDTH))
+    rows[:, [FAST.wheel_left, FAST.wheel_right]] = 40.0
     with pytest.raises(ValueError, match="error grows"):
-        filter_.step(rows, np.zeros((0, 9)))
+        filter_.step(rows, np.zeros((0, PACKET_WIDTH)))
 
 
 def test_the_unobservable_direction_is_named_and_warned_about() -> None:

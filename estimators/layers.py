@@ -1,0 +1,38 @@
+"""The second layer of double-layer-gps: velocities and roll, told by the first what the GPS saw."""
+
+from typing import Any
+
+from ..envs.backend import jit, maximum
+from ..envs.elementary import sincos
+from ..envs.record import GPS, PACKET
+from .arrivals import receive
+from .memory import WINDOW
+
+SPEED = 1  # value of a GPS packet
+
+
+@jit
+def pass_on(first: Any, second: Any, gains: Any, packet: Any) -> None:
+    """Give the second layer a GPS packet as a velocity: v_x = V cos(beta), v_y = V sin(beta).
+
+    double-layer-gps (8)-(9), with the first layer's sideslip angle at the captured tick. The noise
+    across is that of the angle (V sigma_beta)^2 and of the speed (sigma_V sin(beta))^2.
+    """
+    if not (packet[PACKET.sensor] == GPS and packet[PACKET.captured] <= first.tick):
+        receive(second, gains, packet)  # drops and counts what is not for it
+        return
+    captured = int(packet[PACKET.captured])
+    beta = first.x[0]
+    if captured >= maximum(first.start, first.tick - WINDOW + 1) and captured < first.tick:
+        beta = first.trail[captured % WINDOW, 0]
+    s, c = sincos(beta)
+    V = packet[PACKET.value + SPEED]
+    told = second.waiting[0]  # its place for packets that wait, which it never uses
+    for i in range(len(packet)):
+        told[i] = packet[i]
+    told[PACKET.value] = V * c
+    told[PACKET.value + 1] = V * s
+    speed = second.r_speed
+    second.r[GPS, 0] = speed
+    second.r[GPS, 1] = V * V * first.P[0, 0] + speed * s * s
+    receive(second, gains, told)

@@ -1,0 +1,160 @@
+"""dual-rate's corrections between slow samples, as shares of the last innovation.
+
+At fixed speed and ratio r, every rule of the paper is x_{k+i} = F x_{k+i-1} + H u + B_i eps_k for
+i = 0 .. r-1: B_i = L G_i with the gain L and the matrix G_i of the pseudo measurement (14).
+"""
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from . import kalman
+from .intersample import inverse
+from .placed import observer_gain, whole
+
+Array = npt.NDArray[np.float64]
+
+RULES = ("predict", "hold", "oh", "pseudo")
+GAINS = ("constant", "from-29", "placed")
+_CYCLES = 400
+
+
+def sampled_gain(F: Array, Q: Array, C: Array, R: Array, steps: int) -> Array:
+    """The Kalman gain (n, q) of a sample every `steps`, prediction alone in between: its limit."""
+    n = len(F)
+    over, noise = np.eye(n), np.zeros((n, n))
+    for _ in range(steps):
+        over, noise = F @ over, F @ noise @ F.T + Q
+    P, K = noise.copy(), np.zeros((n, len(C)))
+    for _ in range(_CYCLES):
+        before, K = K, kalman.gain(P, C, R)
+        P = over @ kalman.joseph(P, K, C, R) @ over.T + noise
+        if np.abs(K - before).max() <= 1e-12 * np.abs(K).max():
+            break
+    return K
+
+
+def hold(F: Array, Q: Array, C: Array, R: Array, steps: int) -> Array:
+    """Hara: the innovation is held, B_i = L for all i; (steps, n, q).
+
+    L gives the error from sample to sample the poles, and the very map, of the single-rate filter
+    with the low-rate measurement: F^r - sum_{i=1}^{r} F^i L C = F^r (I - K C).
+    """
+    K = sampled_gain(F, Q, C, R, steps)
+    over, total = np.eye(len(F)), np.zeros_like(F)
+    for _ in range(steps):
+        over = F @ over
+        total = total + over
+    L = np.linalg.solve(total, over @ K)
+    return np.repeat(L[None], steps, axis=0)
+
+
+def pseudo(F: Array, C: Array, L: Array, first: Array, steps: int) -> Array:
+    """B_i of the pseudo measurement with one gain L (n, q): dual-rate (31) and Oh's (35).
+
+    B_i = L C F [(I - L C) F]^(i-1) E, with E = `first` (n, q), the estimated error after the
+    sample over its innovation: C^+ - L. Returns (steps, n, q).
+    """
+    shares, e = [L], first
+    for _ in range(1, steps):
+        ahead = F @ e
+        shares.append(L @ C @ ahead)
+        e = ahead - L @ C @ ahead
+    return np.array(shares)
+
+
+def from_29(F: Array, Q: Array, C: Array, R: Array, steps: int, cycles: int = 50) -> Array:
+    """B_i = L_i G_i with G_i of (31) and L_i the Kalman gain for the pseudo noise of (29).
+
+    The covariance recursion is the paper's, which takes pseudo measurements for independent ones;
+    its error grows (spectral radius above 1). Returns (steps, n, q).
+    """
+    n, q = len(F), len(C)
+    pinv = inverse("moore-penrose", C, np.eye(n), R)
+    P, shares = Q.copy(), np.zeros((steps, n, q))
+    for _ in range(cycles):
+        P = F @ P @ F.T + Q
+        for i in range(steps):
+            if i == 0:
+                G, noise = np.eye(q), R
+                Psi, Upsilon, Lambda = np.eye(n), np.zeros((n, n)), np.zeros((n, q))
+            else:  # (26)-(28), one step on: all that came before is moved by F
+                Psi = F @ (Psi - shares[i - 1] @ C)
+                Upsilon = F @ Upsilon @ F.T + Q
+                Lambda = F @ (Lambda + shares[i - 1])
+                G = C @ Psi @ pinv  # (31)
+                v = G + C @ Lambda
+                noise = C @ Upsilon @ C.T + v @ R @ v.T  # (29)
+                P = F @ P @ F.T + Q
+            L = kalman.gain(P, C, noise)
+            P = kalman.joseph(P, L, C, noise)
+            shares[i] = L @ G
+    return shares
+
+
+def shares_of(
+    rule: str, gains: str, poles: Array | None, F: Array, Q: Array, C: Array, R: Array, steps: int
+) -> Array:
+    """B_i (steps, n, q) of a rule of `RULES` with gains of `GAINS`.
+
+    poles: (n,) of the z-plane, for gains "placed".
+    """
+    if rule == "hold":
+        return hold(F, Q, C, R, steps)
+    if gains == "from-29" and rule == "pseudo":
+        return from_29(F, Q, C, R, steps)
+    if gains == "placed":
+        assert poles is not None
+        L = observer_gain(F, C, poles)
+    elif rule == "predict":
+        L = sampled_gain(F, Q, C, R, steps)
+    else:
+        L = sampled_gain(F, Q, C, R, steps) / steps
+    if rule == "predict":
+        return np.concatenate([L[None], np.zeros((steps - 1, *L.shape))])
+    return pseudo(F, C, L, inverse("moore-penrose", C, np.eye(len(F)), R) - L, steps)
+
+
+def frame_map(F: Array, C: Array, shares: Array) -> Array:
+    """The error before a sample over that before the last one, (n, n)."""
+    M, eps = np.eye(len(F)), C
+    for B in shares:
+        M = F @ (M - B @ eps)
+    return M
+
+
+def shares(f: Any, G: Array, schedule: Any, wish: Any, table: Array) -> None:
+    """Write the shares and the error's covariance after each step into a table of gains."""
+    n, q, r = int(f.n), int(f.rows.max()), int(schedule.period)
+    s = int(np.argmax(f.period > 0))
+    F, C, Q = whole(f, G), f.row[s, :q, :n], f.Q[:n, :n]
+    R = np.diag(f.r[s, :q])
+    poles = np.exp(np.array(wish.poles) * float(f.step)) if wish.poles else None
+    B = shares_of(wish.rule, wish.gains, poles, F, Q, C, R, r)
+    first = 1 + schedule.cycle + q * len(schedule.lags)
+    table[first : first + r * q, :n] = B.transpose(0, 2, 1).reshape(r * q, n)
+    _covariances(F, Q, C, R, B, table, int(f.total))
+
+
+def _covariances(
+    F: Array, Q: Array, C: Array, R: Array, B: Array, table: Array, behind: int
+) -> None:
+    """The covariance of the error after each step, from what is left of a long recursion."""
+    n, q = F.shape[0], len(C)
+    upper = np.triu_indices(n)
+    P = np.zeros((n + q, n + q))  # of the error and the last innovation
+    move = np.eye(n + q)
+    move[:n, :n] = F
+    for _ in range(30):
+        for i, share in enumerate(B):
+            P = move @ P @ move.T
+            P[:n, :n] += Q
+            if i == 0:
+                see = np.block([[np.eye(n), np.zeros((n, q))], [C, np.zeros((q, q))]])
+                P = see @ P @ see.T
+                P[n:, n:] += R
+            take = np.eye(n + q)
+            take[:n, n:] = -share
+            P = take @ P @ take.T
+            table[1 + i, behind:] = P[:n, :n][upper]
