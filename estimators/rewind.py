@@ -57,7 +57,7 @@ def _keep(f: Any, packet: Any) -> int:
     place = f.recents % RECENT
     f.recents += 1
     f.recent[place, :] = packet[:PACKET_WIDTH]
-    return place
+    return int(place)
 
 
 @jit
