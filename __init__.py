@@ -4,8 +4,12 @@ Importing this package registers its Gymnasium environments and loads nothing el
 
 >>> import gymnasium as gym
 >>> import sideslip
->>> sorted(name for name in gym.registry if name.startswith("sideslip/"))
-['sideslip/YawGps-v0', 'sideslip/YawVision-v0', 'sideslip/YawVisionUneven-v0']
+>>> for name in sorted(name for name in gym.registry if name.startswith("sideslip/")):
+...     print(name)
+sideslip/AfsYawFusion-v0
+sideslip/YawGps-v0
+sideslip/YawVision-v0
+sideslip/YawVisionUneven-v0
 
 `rollout`, `make_agent`, `make_estimator` and the subpackages are loaded when first asked for.
 """
@@ -29,10 +33,11 @@ _HOMES = {
     "rollout": ".agents.rollout",
 }
 _ROOMS = ("envs", "estimators", "agents", "benchmarks")
-_ENVIRONMENTS = {
+_ENVIRONMENTS: dict[str, dict[str, Any]] = {
     "sideslip/YawVision-v0": {"sensors": "vision", "reference": "zero-slip"},
     "sideslip/YawVisionUneven-v0": {"sensors": "vision-uneven", "reference": "zero-slip"},
     "sideslip/YawGps-v0": {"sensors": "gps", "reference": "model"},
+    "sideslip/AfsYawFusion-v0": {"sensors": "fusion", "reference": "model", "steering": True},
 }
 
 # This file runs again under the checkout's own name (pytest) and in every worker process, so the

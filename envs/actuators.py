@@ -1,4 +1,4 @@
-"""Torque distribution, and first-order lags solved exactly."""
+"""Torque distribution, added steering, and first-order lags solved exactly."""
 
 import math
 from typing import Any, NamedTuple
@@ -45,6 +45,21 @@ def distribute(N_z: Any, a_x: Any, car: Any, yaw_first: Any) -> Any:
     drive = yaw_first * drive_kept + (1.0 - yaw_first) * drive
     turn = yaw_first * turn + (1.0 - yaw_first) * turn_kept
     return drive - turn, drive + turn  # tie-vision (3)
+
+
+@jit
+def slewed(value: Any, wanted: Any, most: Any) -> Any:
+    """The value moved towards the wanted one by at most `most`."""
+    return value + minimum(maximum(wanted - value, 0.0 - most), most)
+
+
+@jit
+def within_stop(added: Any, driver: Any, stop: Any) -> Any:
+    """The part of an added steering angle (rad) that leaves the sum with the driver's in the stop.
+
+    Where the driver's alone is beyond it, nothing is added to that side.
+    """
+    return minimum(maximum(added, minimum(0.0 - stop - driver, 0.0)), maximum(stop - driver, 0.0))
 
 
 @jit

@@ -7,7 +7,7 @@ ticks k+1 .. k+n; a reset returns tick 0 alone.
 
 from typing import Any
 
-from .actuators import Lag, distribute, lagged, yaw_moment
+from .actuators import Lag, distribute, lagged, slewed, within_stop, yaw_moment
 from .backend import absolute, fixed_tuple, jit, select
 from .delivery import sense, store
 from .dynamics import Car, Inputs, Motion, Push, Road, load_of, rk4, sideslip_angle
@@ -61,10 +61,13 @@ def step_vehicle(
 ) -> int:
     """n ticks of one vehicle, fewer where the episode ends; returns how many.
 
+    action: the share of the yaw moment and, if there are two, that of the added steering.
     A non-finite action does nothing and returns REFUSED, or fails the episode (`fail_bad`).
     """
     share = float(action[0])  # in plain Python a float32 would make float32 of all that follows
-    if share - share != 0.0:  # NaN or infinite
+    turn = float(action[1]) if len(action) > 1 else 0.0
+    both = share + turn
+    if both - both != 0.0:  # NaN or infinite
         if switches[5] == 0:
             return REFUSED
         z[Z.clock + 3] = BAD_ACTION
@@ -86,10 +89,11 @@ def step_vehicle(
     task = Task(*fixed_tuple(p[P.task :], _TASK))
     programme = fixed_tuple(p[P.steering :], STEERING_WIDTH)
     motion = Motion(*fixed_tuple(z[Z.motion :], _MOTION))
-    T_l, T_r, delta, integral, F_d, N_d = fixed_tuple(z[Z.drive :], _DRIVE)
+    T_l, T_r, delta, integral, F_d, N_d, slewing, added = fixed_tuple(z[Z.drive :], _DRIVE)
     key_low, key_high, tick = int(z[Z.clock]), int(z[Z.clock + 1]), z[Z.clock + 2]
     limit = 2.0 * car.T_max / (car.m * car.r)
     N_z = share * task.yaw_scale
+    wanted = clip(turn, -1.0, 1.0) * task.authority
     cost, count, failure, delivered = 0.0, 0, RUNNING, 0.0
     refs, beta = (0.0, 0.0), 0.0
     left, right, steer_acted = T_l, T_r, delta
@@ -97,8 +101,11 @@ def step_vehicle(
     lagging = motor.start + steering.start > 0.0
     both_lag = motor.start * steering.start > 0.0
     start = load_of(Inputs(delta, T_l, T_r), car, small_angle)
-    command = steering_at(tick, programme)
+    driver = steering_at(tick, programme)
     for j in range(n):
+        slewing = slewed(slewing, wanted, task.slew)
+        extra = within_stop(slewing, driver, task.stop)
+        command = driver + extra
         a_x, integral = acceleration_command(tick, motion.v_x, integral, pace, limit)
         to_l, to_r = distribute(N_z, a_x, car, task.yaw_first)
         F_w, N_w = wind_at(tick, wind)
@@ -139,8 +146,10 @@ def step_vehicle(
         motion = rk4(before, (start, middle, end), push, car, road, TICK, small_angle, law)
         start = end
         steer_acted = lagged(command, delta, steering.mean)
+        added_acted = lagged(extra, added, steering.mean)
         left, right = lagged(to_l, T_l, motor.mean), lagged(to_r, T_r, motor.mean)
         delta = lagged(command, delta, steering.end)
+        added = lagged(extra, added, steering.end)
         T_l, T_r = lagged(to_l, T_l, motor.end), lagged(to_r, T_r, motor.end)
         tick = tick + 1.0
         z[Z.clock + 2] = tick
@@ -156,13 +165,14 @@ def step_vehicle(
         F_d = ou.keep * F_d + ou.fresh * ou.force * wheels[2]
         N_d = ou.keep * N_d + ou.fresh * ou.moment * wheels[3]
         beta = sideslip_angle(motion.v_x, motion.v_y, small_angle)
-        acted = (steer_acted, left, right, command, a_x)
+        acted = (steer_acted, left, right, driver, a_x)
         count = sense(p, z, motion, beta, accel, acted, rows, j, packets, count, fast, wheels)
         v = 0.5 * (rows[j, FAST.wheel_left] + rows[j, FAST.wheel_right])
-        command = steering_at(tick, programme)
-        refs = reference(command, v, target, kind)
+        driver = steering_at(tick, programme)
+        refs = reference(driver, v, target, kind)
         delivered = yaw_moment(left, right, car)
-        c = cost_rate(beta - refs[0], motion.gamma - refs[1], delivered / task.yaw_scale, 0.0, kind)
+        effort = delivered / task.yaw_scale
+        c = cost_rate(beta - refs[0], motion.gamma - refs[1], effort, added_acted, kind)
         cost = cost + c * TICK
         done = j + 1
         v_x, v_y, gamma = motion.v_x, motion.v_y, motion.gamma
@@ -177,7 +187,7 @@ def step_vehicle(
         if failure != RUNNING or tick >= task.duration:
             break
     store(z, Z.motion, motion)
-    store(z, Z.drive, (T_l, T_r, delta, integral, F_d, N_d))
+    store(z, Z.drive, (T_l, T_r, delta, integral, F_d, N_d, slewing, added))
     z[Z.clock + 3] = failure
     if failure != RUNNING:  # the rest of the episode is charged: failing never pays
         cost = cost + COST_CAP * (task.duration - tick) * TICK

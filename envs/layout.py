@@ -36,6 +36,9 @@ class Task(NamedTuple):
     yaw_scale: Any  # N m of action 1
     yaw_first: Any  # 1: yaw moment before acceleration
     spin: Any  # rad of sideslip
+    authority: Any  # rad of added steering, of action 1
+    slew: Any  # rad a tick, of added steering
+    stop: Any  # rad, of the whole steering angle
 
 
 class Drive(NamedTuple):
@@ -47,6 +50,8 @@ class Drive(NamedTuple):
     integral: Any
     F_d: Any
     N_d: Any
+    slewing: Any  # rad, the added steering that is asked for, within its rate
+    added: Any  # rad, the added steering that acts
 
 
 class Clock(NamedTuple):

@@ -15,6 +15,7 @@ SENSOR_SETS: dict[str, dict[str, SlowSensor]] = {
     "vision": {"camera": CAMERA_33_30},
     "vision-uneven": {"camera": CAMERA_UNEVEN},
     "gps": {"gps": GPS_5_HZ},
+    "fusion": {"camera": CAMERA_33_30, "gps": GPS_5_HZ},
 }
 
 

@@ -1,4 +1,4 @@
-"""StabilityEnv: the Gymnasium environment of a car that is kept stable by its yaw moment."""
+"""StabilityEnv: the Gymnasium environment of a car that its yaw moment and steering stabilise."""
 
 import copy
 import dataclasses
@@ -28,13 +28,16 @@ _OPTIONS = ("scenario", "vehicle", "friction", "state", "duration")
 
 
 class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
-    """Keep a car's sideslip angle where it should be, with the torque difference of two motors.
+    """Keep a car's sideslip angle where it should be, by two motors and, if asked, by steering.
 
     ## Action
     `Box(-1, 1, (1,), float32)`: the yaw moment as a share of its full scale (372.7 N m for the
-    COMS; positive turns left and drives the right wheel). Zero is the uncontrolled car. Values
-    outside are clipped. A non-finite action or a wrong shape raises ValueError and steps nothing;
-    with `on_bad_action="fail"` a non-finite action ends the episode as a failure.
+    COMS; positive turns left and drives the right wheel). With `steering` it is
+    `Box(-1, 1, (2,), float32)`: the second entry is the steering angle *added* to the driver's,
+    as a share of its full scale (0.1 rad, positive to the left; at most 0.8 rad/s, and within the
+    stop of the front wheels). Zero is the uncontrolled car. Values outside are clipped. A
+    non-finite action or a wrong shape raises ValueError and steps nothing; with
+    `on_bad_action="fail"` a non-finite action ends the episode as a failure.
 
     ## Observation
     A float32 summary whose length does not depend on the control period. `layout` gives name,
@@ -60,9 +63,10 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
 
     ## Reward
     Minus the integral over the step of
-    c = (e_beta/0.02)^2 + (e_gamma/0.1)^2 + 0.01 (N_z/N_max)^2, capped at 100 per second; with the
-    reference "zero-slip" the yaw rate is not judged. On failure the rest of the episode is
-    charged at 100 per second.
+    c = (e_beta/0.02)^2 + (e_gamma/0.1)^2 + 0.01 (N_z/N_max)^2 + 0.01 (steering added/0.05)^2,
+    capped at 100 per second; N_z and the added steering are those delivered; with the reference
+    "zero-slip" the yaw rate is not judged. On failure the rest of the episode is charged at 100
+    per second.
 
     ## Episode end
     `terminated`: the car spun (sideslip above 0.5 rad) or left the ground. `truncated`: the
@@ -77,12 +81,12 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
     theta`), `duration` (s), for that episode; unknown keys raise ValueError.
 
     ## Arguments
-    All JSON-able. sensors: "vision", "vision-uneven" or "gps". scenario: a name or a mapping.
-    vehicle: the true one; nominal: what estimators and controllers are told (default: the
-    vehicle). control_period: ticks of 1 ms. reference: "zero-slip", "model" (the nominal steady
-    state) or "limited" (by friction). fast: "summary" or "all". camera, gps: fields of
-    `SlowSensor` that replace the id's. yaw_first: yaw moment before acceleration where both pass
-    the motors' limit.
+    All JSON-able. sensors: "vision", "vision-uneven", "gps" or "fusion" (camera and GPS).
+    scenario: a name or a mapping. vehicle: the true one; nominal: what estimators and controllers
+    are told (default: the vehicle). control_period: ticks of 1 ms. reference: "zero-slip", "model"
+    (the nominal steady state) or "limited" (by friction). fast: "summary" or "all". camera, gps:
+    fields of `SlowSensor` that replace the id's. yaw_first: yaw moment before acceleration where
+    both pass the motors' limit. steering: the action may steer too.
     """
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012  Gymnasium's convention
@@ -99,6 +103,7 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
         camera: Mapping[str, Any] | None = None,
         gps: Mapping[str, Any] | None = None,
         yaw_first: bool = True,
+        steering: bool = False,
         on_bad_action: str = "raise",
         render_mode: str | None = None,
     ) -> None:
@@ -110,6 +115,8 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
             raise ValueError(f"control_period is 1 to 1000 ticks, got {control_period}")
         if fast not in ("summary", "all"):
             raise ValueError(f"fast is 'summary' or 'all', got {fast!r}")
+        if not isinstance(steering, bool):
+            raise TypeError(f"steering is True or False, got {steering!r}")
         if on_bad_action not in ("raise", "fail"):
             raise ValueError(f"on_bad_action is 'raise' or 'fail', got {on_bad_action!r}")
         if render_mode is not None:  # stable-baselines3 tries "rgb_array" and minds TypeError only
@@ -130,7 +137,8 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
         self._bounds = np.array([[entry[2], entry[3]] for entry in self.layout]).T.copy()
         low, high = self._bounds.astype(np.float32)
         self.observation_space = gym.spaces.Box(low, high, dtype=np.float32)
-        self.action_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
+        self._action_shape = (2,) if steering else (1,)
+        self.action_space = gym.spaces.Box(-1.0, 1.0, self._action_shape, np.float32)
         self._params, self._state = np.zeros(P.end), np.zeros(Z.end)
         self.rows = np.zeros((n, FAST_WIDTH))
         room = sum(most_packets(sensor, n) for sensor in self._sensors.values())
@@ -220,9 +228,10 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
         """Hold the action for one control period."""
         if self._over:
             raise ResetNeeded("the episode is over or was never started: call reset() first")
-        force = np.asarray(action, np.float32)
-        if force.shape != (1,):
-            raise ValueError(f"an action has shape (1,), got shape {force.shape}")
+        force = np.array(action, np.float32)  # a copy: contiguous whatever came
+        if force.shape != self._action_shape:
+            expected = self._action_shape
+            raise ValueError(f"an action has shape {expected}, got shape {force.shape}")
         obs = np.empty(len(self.layout), np.float32)
         done = step_vehicle(
             self._params,

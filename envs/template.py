@@ -111,6 +111,9 @@ def template_of(
             vehicle.yaw_moment_limit,
             float(yaw_first),
             SPIN_ANGLE,
+            vehicle.steering_authority,
+            vehicle.steering_rate * TICK,
+            vehicle.steering_stop,
         ),
         (0.0,) * STEERING_WIDTH,
     )

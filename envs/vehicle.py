@@ -48,6 +48,9 @@ class Vehicle:
     motor_torque: float = _unit("N m", "T_max, limit of one motor")
     motor_lag: float = _unit("s", "time constant of the motors", 0.005)
     steering_lag: float = _unit("s", "time constant of the steering actuator", 0.03)
+    steering_stop: float = _unit("rad", "largest angle that steering adds up to", 0.6)
+    steering_authority: float = _unit("rad", "largest angle added to the driver's", 0.1)
+    steering_rate: float = _unit("rad/s", "how fast the added angle may change", 0.8)
     preview: float = _unit("m", "l_pre, the camera's preview distance", 5.135)
     friction: float = _unit("-", "mu, tyre to road (a scenario has its own)", 0.9)
 

@@ -55,10 +55,11 @@ def unwrapped(name: str, **changes: Any) -> StabilityEnv:
 
 
 def play(env: StabilityEnv, actions: Iterable[Any]) -> list[Moment]:
-    """One Moment for each action, up to the end of the episode."""
+    """One Moment for each action, up to the end of the episode; a number stands for every entry."""
     moments = []
     for action in actions:
-        moments.append(Moment(*env.step(np.atleast_1d(np.float32(action))), env.record))
+        filled = np.full(env.action_space.shape, action, np.float32)
+        moments.append(Moment(*env.step(filled), env.record))
         if moments[-1].terminated or moments[-1].truncated:
             break
     return moments

@@ -36,6 +36,7 @@ ARGUMENTS: list[tuple[Arguments, type[Exception], str]] = [
     ({"control_period": 1001}, ValueError, "control_period is 1 to 1000 ticks, got 1001"),
     ({"control_period": 10.0}, TypeError, "control_period is a number of ticks, got 10.0"),
     ({"control_period": True}, TypeError, "control_period is a number of ticks, got True"),
+    ({"steering": "yes"}, TypeError, "steering is True or False, got 'yes'"),
     (
         {"reference": "slip"},
         ValueError,

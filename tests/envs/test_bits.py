@@ -129,7 +129,8 @@ def test_whole_steps(name: str, arguments: dict[str, Any], monkeypatch: pytest.M
         start = env.reset(seed=11)
         first = env.record
         rng = np.random.default_rng(3)
-        moments = play(env, rng.uniform(-1.2, 1.2, 400 // env.control_period))
+        shape = 400 // env.control_period, *(env.action_space.shape or ())
+        moments = play(env, rng.uniform(-1.2, 1.2, shape))
         assert sum(len(moment.record.packets) for moment in moments) > 0
         return bits((start, first, moments, env.get_state()["state"], env.get_state()["params"]))
 

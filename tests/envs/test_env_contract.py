@@ -86,7 +86,8 @@ def test_episodes_without_a_seed_go_on_from_the_generator(name: str) -> None:
 def test_observations_are_fresh_arrays_inside_the_space(name: str) -> None:
     env = unwrapped(name, scenario="slalom")
     obs, _ = env.reset(seed=2)
-    moments = play(env, np.random.default_rng(0).uniform(-1.0, 1.0, 300))
+    shape = 300, *(env.action_space.shape or ())
+    moments = play(env, np.random.default_rng(0).uniform(-1.0, 1.0, shape))
     every = [obs, *[moment.obs for moment in moments]]
     assert all(env.observation_space.contains(each) for each in every)
     assert len({each.ctypes.data for each in every}) == len(every)
@@ -122,7 +123,7 @@ def test_a_snapshot_continues_bit_for_bit(name: str, way: str) -> None:
     else:
         twin = copy.deepcopy(env) if way == "deepcopy" else pickle.loads(pickle.dumps(env))
     assert bits(twin.record) == bits(env.record)
-    actions = np.random.default_rng(1).uniform(-1.0, 1.0, 100)
+    actions = np.random.default_rng(1).uniform(-1.0, 1.0, (100, *(env.action_space.shape or ())))
     expected = bits((play(env, actions), env.reset(), play(env, actions)))
     assert bits((play(twin, actions), twin.reset(), play(twin, actions))) == expected
 
@@ -147,7 +148,7 @@ def test_a_snapshot_of_a_finished_episode_is_finished(name: str) -> None:
     twin.reset(seed=1)
     twin.set_state(env.get_state())
     with pytest.raises(gymnasium.error.ResetNeeded):
-        twin.step(np.zeros(1, np.float32))
+        twin.step(np.zeros(twin.action_space.shape, np.float32))
 
 
 @pytest.mark.smoke

@@ -16,7 +16,8 @@ import gymnasium, numpy
 def drive(env, name):
     env = env or gymnasium.make(name)  # an id of the form "module:id" imports the package
     obs, info = env.reset(seed=3)
-    rewards = [float(env.step(numpy.array([0.2], "f"))[1]) for _ in range(20)]
+    action = numpy.full(env.action_space.shape, 0.2, "f")
+    rewards = [float(env.step(action)[1]) for _ in range(20)]
     return obs.tobytes(), rewards, sys.modules["sideslip.envs"].__name__
 
 def work(sender, env, name):
@@ -48,7 +49,8 @@ def drive(name, kind, how):
     env = make_vec_env("sideslip:" + name, n_envs=2, seed=5, vec_env_cls=kind, vec_env_kwargs=how)
     rows = [env.reset()]
     for k in range(30):
-        obs, rewards, dones, infos = env.step(numpy.full((2, 1), 0.1 * k - 1.0, "f"))
+        actions = numpy.full((2, *env.action_space.shape), 0.1 * k - 1.0, "f")
+        obs, rewards, dones, infos = env.step(actions)
         rows += [obs, rewards.astype("f"), dones]  # one of the two keeps rewards in 32 bits
     assert env.get_attr("control_period") == [10, 10]
     env.close()
