@@ -6,15 +6,25 @@ from typing import Any
 import gymnasium as gym
 
 from .controller import Controller, NoControl
+from .model_following import ModelFollowing
 from .two_dof import Feedforward, TwoDof
 
 AGENTS: dict[str, Callable[..., Controller]] = {
     "none": NoControl,
     "feedforward": Feedforward,
     "two-dof": TwoDof,
+    "model-following": ModelFollowing,
 }
 
-__all__ = ["AGENTS", "Controller", "Feedforward", "NoControl", "TwoDof", "make_agent"]
+__all__ = [
+    "AGENTS",
+    "Controller",
+    "Feedforward",
+    "ModelFollowing",
+    "NoControl",
+    "TwoDof",
+    "make_agent",
+]
 
 
 def make_agent(name: str, env: gym.Env[Any, Any], **options: Any) -> Controller:

@@ -44,10 +44,15 @@ class Controller(ABC):
         self.nominal: Vehicle = base.nominal
         self.full_scale = base.vehicle.yaw_moment_limit
         self.control_period: int = base.control_period
+        self.width: int = base.action_space.shape[0]
 
     @abstractmethod
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
-        """Fill action (N, 1), a share of full scale, and update state (N, memory) in place."""
+        """Fill action (N, width), which is zero, and update state (N, memory) in place.
+
+        Its first column is the yaw moment as a share of full scale, its second, where the env has
+        one, the added steering as a share of the vehicle's authority.
+        """
 
     def predict(
         self,
@@ -68,7 +73,7 @@ class Controller(ABC):
         memory = np.zeros((len(batch), self.memory)) if state is None else np.array(state)
         if episode_start is not None:
             memory[np.asarray(episode_start, bool)] = 0.0
-        action = np.zeros((len(batch), 1))
+        action = np.zeros((len(batch), self.width))
         self._law(batch[:, self._columns].astype(np.float64), memory, action)
         shares = np.clip(action, -1.0, 1.0).astype(np.float32)
         return (shares[0] if obs.ndim == 1 else shares), memory
@@ -78,4 +83,4 @@ class NoControl(Controller):
     """The uncontrolled car."""
 
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
-        action[:] = 0.0
+        pass

@@ -124,7 +124,7 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
         self.render_mode = render_mode
         self.control_period = int(control_period)
         self._sensors = with_changes(SENSOR_SETS[sensors], {"camera": camera, "gps": gps})
-        self._reference, self._fast = reference, fast
+        self.reference, self._fast = reference, fast
         self._yaw_first, self._fail_bad = yaw_first, on_bad_action == "fail"
         self._vehicle = vehicle_from(vehicle)
         self._nominal = self._vehicle if nominal is None else vehicle_from(nominal)
@@ -159,7 +159,7 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
             vehicle,
             self._nominal,
             slow,
-            self._reference,
+            self.reference,
             self._fast == "all",
             self._yaw_first,
             self._fail_bad,

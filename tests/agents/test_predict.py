@@ -12,6 +12,8 @@ import sideslip
 from sideslip.agents import AGENTS, make_agent
 from sideslip.estimators import EstimateObservation
 
+STATES = ["beta", "gamma", "d1", "d2"]
+
 
 @pytest.fixture
 def env() -> gym.Env[Any, Any]:
@@ -20,9 +22,19 @@ def env() -> gym.Env[Any, Any]:
     )
 
 
+@pytest.fixture
+def steered() -> gym.Env[Any, Any]:
+    """An env with all that any agent needs, whose action steers."""
+    return EstimateObservation(
+        gym.make("sideslip/AfsYawFusion-v0", scenario="lane-change"), "dakf", outputs=STATES
+    )
+
+
 @pytest.mark.parametrize("name", AGENTS)
-def test_single_and_batch_agree_and_memory_is_outside(name: str, env: gym.Env[Any, Any]) -> None:
-    agent = make_agent(name, env)
+def test_single_and_batch_agree_and_memory_is_outside(
+    name: str, steered: gym.Env[Any, Any]
+) -> None:
+    env, agent = steered, make_agent(name, steered)
     rng = np.random.default_rng(0)
     observations = rng.normal(size=(40, 3, env.observation_space.shape[0])).astype(np.float32)  # type: ignore[index]
     together: Any = None
@@ -35,7 +47,7 @@ def test_single_and_batch_agree_and_memory_is_outside(name: str, env: gym.Env[An
         together = after
         for i in range(3):
             action, alone[i] = agent.predict(obs[i], alone[i])
-            assert action.shape == (1,) and env.action_space.contains(action)
+            assert action.shape == (2,) and env.action_space.contains(action)
             assert (action == actions[i]).all()
 
 
@@ -53,9 +65,11 @@ def test_episode_start_clears_the_memory(env: gym.Env[Any, Any]) -> None:
 
 
 @pytest.mark.parametrize("name", AGENTS)
-def test_stable_baselines3_evaluates_them(name: str, env: gym.Env[Any, Any]) -> None:
-    agent: Any = make_agent(name, env)
-    reward, _ = evaluate_policy(agent, DummyVecEnv([lambda: env]), n_eval_episodes=2, warn=False)
+def test_stable_baselines3_evaluates_them(name: str, steered: gym.Env[Any, Any]) -> None:
+    agent: Any = make_agent(name, steered)
+    reward, _ = evaluate_policy(
+        agent, DummyVecEnv([lambda: steered]), n_eval_episodes=2, warn=False
+    )
     assert np.isfinite(reward) and float(np.mean(reward)) < 0.0
 
 
@@ -65,6 +79,15 @@ def test_rollout_and_evaluate_policy_agree(env: gym.Env[Any, Any]) -> None:
     vec.seed(3)
     reward, _ = evaluate_policy(agent, vec, n_eval_episodes=1, warn=False)
     assert -sideslip.rollout(env, agent, seed=3).cost == pytest.approx(reward, rel=1e-6)
+
+
+def test_moment_controllers_leave_the_steering_alone(steered: gym.Env[Any, Any]) -> None:
+    rng = np.random.default_rng(1)
+    obs = rng.normal(size=steered.observation_space.shape).astype(np.float32)
+    for name in ("none", "feedforward", "two-dof"):
+        action, _ = make_agent(name, steered).predict(obs)
+        assert action[1] == 0.0
+        assert (action[0] == 0.0) == (name == "none")
 
 
 def test_bad_input(env: gym.Env[Any, Any]) -> None:

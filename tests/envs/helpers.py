@@ -58,7 +58,7 @@ def play(env: StabilityEnv, actions: Iterable[Any]) -> list[Moment]:
     """One Moment for each action, up to the end of the episode; a number stands for every entry."""
     moments = []
     for action in actions:
-        filled = np.full(env.action_space.shape, action, np.float32)
+        filled = np.full(env.action_space.shape or (), action, np.float32)
         moments.append(Moment(*env.step(filled), env.record))
         if moments[-1].terminated or moments[-1].truncated:
             break
