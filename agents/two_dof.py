@@ -20,6 +20,7 @@ from .controller import Array, Controller
 SLOWEST = 2.0  # m/s: gains below it are those of this speed
 SPEEDS = np.arange(SLOWEST, 61.0, 0.5)  # m/s
 POLE = 2.0 * math.pi * 2.0  # rad/s: Table II of tie-vision places poles at 2 Hz
+PLACEMENTS = ("radius", "real")
 CAMERA_PERIOD = 0.033  # s
 
 
@@ -65,17 +66,22 @@ class PI:
     k_i: float
 
 
-def design_pi(vehicle: Vehicle, speed: float, pole: float = POLE) -> PI:
+def design_pi(vehicle: Vehicle, speed: float, pole: float = POLE, placement: str = "radius") -> PI:
     """A PI whose zero lies on the plant's slow pole, with closed-loop poles at `pole` rad/s.
 
     With G = k / ((s + p_1)(s + p_2)), p_1 < p_2, and C = k_p (s + p_1) / s the closed loop is
-    s^2 + p_2 s + k k_p: k k_p = pole^2 puts both poles on the circle of that radius. They are
-    kept at a damping of a half at least, which a slow plant reaches at a smaller radius, and are
-    real where p_2 > 2 pole. Gains are capped at the full yaw moment for 0.01 rad (near the speed
-    where the yaw moment does not move beta, k is nearly zero).
+    s^2 + p_2 s + k k_p. placement "radius": k k_p = pole^2 puts both poles on the circle of that
+    radius. They are kept at a damping of a half at least, which a slow plant reaches at a smaller
+    radius, and are real where p_2 > 2 pole. placement "real": k k_p = pole (p_2 - pole) puts one
+    of two real poles there (both at p_2 / 2 where pole is beyond p_2). Gains are capped at the full
+    yaw moment for 0.01 rad (near the speed where the yaw moment does not move beta, k is nearly
+    zero).
 
-    Raises ModuleNotFoundError without python-control (the extra `design`).
+    Raises ValueError for another placement, ModuleNotFoundError without python-control (the extra
+    `design`).
     """
+    if placement not in PLACEMENTS:
+        raise ValueError(f"placement is one of {', '.join(PLACEMENTS)}, got {placement!r}")
     import control
 
     model = bicycle(vehicle, speed)
@@ -84,9 +90,12 @@ def design_pi(vehicle: Vehicle, speed: float, pole: float = POLE) -> PI:
     k = float(transfer.num[0][0][-1] / transfer.den[0][0][0])
     slow_first = sorted(-float(p.real) for p in plant.poles())
     p_1, p_2 = max(slow_first[0], 0.0), slow_first[1]
-    radius = min(pole, p_2)
+    if placement == "radius":
+        product = min(pole, p_2) ** 2
+    else:
+        product = pole * (p_2 - pole) if pole < p_2 else 0.25 * p_2 * p_2
     most = vehicle.yaw_moment_limit / 0.01
-    k_p = np.clip(radius * radius / k, -most, most) if k != 0.0 else 0.0
+    k_p = np.clip(product / k, -most, most) if k != 0.0 else 0.0
     return PI(float(k_p), float(k_p) * p_1)
 
 
