@@ -7,6 +7,7 @@ Importing this package registers its Gymnasium environments and loads nothing el
 >>> for name in sorted(name for name in gym.registry if name.startswith("sideslip/")):
 ...     print(name)
 sideslip/AfsYawFusion-v0
+sideslip/YawFusion-v0
 sideslip/YawGps-v0
 sideslip/YawVision-v0
 sideslip/YawVisionUneven-v0
@@ -37,6 +38,7 @@ _ENVIRONMENTS: dict[str, dict[str, Any]] = {
     "sideslip/YawVision-v0": {"sensors": "vision", "reference": "zero-slip"},
     "sideslip/YawVisionUneven-v0": {"sensors": "vision-uneven", "reference": "zero-slip"},
     "sideslip/YawGps-v0": {"sensors": "gps", "reference": "model"},
+    "sideslip/YawFusion-v0": {"sensors": "fusion", "reference": "model"},
     "sideslip/AfsYawFusion-v0": {"sensors": "fusion", "reference": "model", "steering": True},
 }
 

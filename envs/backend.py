@@ -68,7 +68,19 @@ _kept_folder = functools.cache(_cache_folder)
 
 def jit(function: F) -> F:
     """Compile with numba: IEEE arithmetic in the order written, cached on disk where possible."""
-    options: dict[str, Any] = {"error_model": "numpy", "fastmath": False}
+    return _compiled(function, {"error_model": "numpy", "fastmath": False})
+
+
+def inlined(function: F) -> F:
+    """The same, and the text goes into its callers: what takes many numbers and is called often.
+
+    A call of a plant's function passes some sixty numbers through memory, which costs as much as
+    the function itself.
+    """
+    return _compiled(function, {"error_model": "numpy", "fastmath": False, "forceinline": True})
+
+
+def _compiled(function: F, options: dict[str, Any]) -> F:
     layer = function.__module__.removeprefix(_PREFIX).partition(".")[0]
     folder = (
         None if config.DISABLE_JIT else _kept_folder(layer if layer in _LAYERS else _LAYERS[-1])

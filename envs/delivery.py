@@ -5,15 +5,27 @@ Packets are delivered in the order (captured tick, sensor); what is under way li
 
 from typing import Any
 
-from .backend import fixed_tuple, jit, minimum
+from .backend import fixed_tuple, inlined, jit, minimum
 from .dynamics import Road
+from .elementary import exp
 from .layout import P, Z
 from .noise import CHANNELS, normals
 from .record import CAMERA, FAST, GPS, PACKET, PACKET_WIDTH, VALUES
-from .sensors import IN_FLIGHT, NEVER, Link, Noise, arrivals, camera_sample, gps_sample
+from .sensors import (
+    IN_FLIGHT,
+    NEVER,
+    Link,
+    Noise,
+    Sky,
+    arrivals,
+    camera_sample,
+    gps_sample,
+    sky_deviation,
+)
 
 FAR = 1e15
 _LINK, _NOISE, _ROAD = len(Link._fields), len(Noise._fields), len(Road._fields)
+_SKY = len(Sky._fields)
 
 
 @jit
@@ -83,12 +95,12 @@ def _deliver(z: Any, tick: Any, packets: Any, count: int) -> int:
         count += 1
 
 
-@jit
+@inlined
 def sense(
     p: Any,
     z: Any,
     motion: Any,
-    beta: Any,
+    small_angle: int,
     accel: Any,
     inputs: Any,
     rows: Any,
@@ -108,7 +120,7 @@ def sense(
     row[FAST.gyro] = motion.gamma + noise.gyro_bias + noise.gyro * n_fast[0]
     row[FAST.accel_y] = accel[1] + noise.accel_y_bias + noise.accel * n_fast[1]
     row[FAST.accel_x] = accel[0] + noise.accel * n_fast[2]
-    row[FAST.roll_rate] = noise.roll_rate * n_fast[3]
+    row[FAST.roll_rate] = motion.phi_dot + noise.roll_rate * n_fast[3]
     row[FAST.wheel_left] = motion.v_x - half + noise.wheel * wheels[0]
     row[FAST.wheel_right] = motion.v_x + half + noise.wheel * wheels[1]
     store(row, FAST.steer, inputs)
@@ -123,7 +135,13 @@ def sense(
     if tick == z[Z.gps + 1]:
         link = Link(*fixed_tuple(p[P.gps :], _LINK))
         n = normals(key[0], key[1], int(tick), CHANNELS.gps)
-        course, speed, X, Y, hdop, satellites, quality = gps_sample(motion, beta, noise, n)
+        sky = Sky(*fixed_tuple(p[P.sky :], _SKY))
+        seen = normals(key[0], key[1], int(tick), CHANNELS.sky)
+        z[Z.sky] = sky_deviation(z[Z.sky], sky, link, tick, seen)
+        hdop = exp(sky.median + z[Z.sky])
+        course, speed, X, Y, hdop, satellites, quality = gps_sample(
+            motion, p[P.car + 17], p[P.car + 18], hdop, sky.weight, noise, n, small_angle
+        )
         values = (course, speed, X, Y, hdop, satellites)
         _capture(z, GPS, Z.gps, link, tick, key, values, quality)
     if tick >= z[Z.clock + 5]:

@@ -1,18 +1,22 @@
 """The plant's equations, written once.
 
-A single-track model with two driven rear wheels, in ISO 8855 axes (x forward, y left, yaw to the
-left), SI units. The functions are scalar, over tuples, without branches on values; `small_angle`
-and `tyre_law` are integers that choose the text, not the values.
+A single-track model with two driven rear wheels and a body that rolls, in ISO 8855 axes (x
+forward, y left, z up; yaw to the left and roll with the left side up are positive), SI units.
+v_y is that of the roll axis below the centre of gravity. The functions are scalar, over tuples,
+without branches on values; `small_angle`, `law` (of the tyres) and `roll` are integers that choose
+the text, not the values.
+
+A turn to the left (a_y > 0) rolls the body to the right (phi > 0), whose centre of gravity then
+lags the roll axis: M (v_y' + v_x gamma) - M_s h_s phi'' = F_y. Accelerometers measure specific
+force, a_y = v_y' + v_x gamma + g phi, and a road banked by b adds g sin b.
 """
 
 from typing import Any, NamedTuple
 
-from .backend import absolute, jit, maximum, minimum, select, sqrt
-from .elementary import atan, atan2, sincos
+from .backend import inlined, jit, maximum, minimum, select
+from .elementary import atan2, sincos
+from .tyres import SLOW, tyre_forces
 from .vehicle import GRAVITY
-
-LINEAR, FIALA = 0, 1
-SLOW = 0.5  # m/s: below it slip is computed as at this speed, and beta is zero
 
 
 class Car(NamedTuple):
@@ -30,6 +34,13 @@ class Car(NamedTuple):
     T_max: Any
     mu: Any
     l_pre: Any
+    S: Any  # kg m, M_s h_s
+    I_x: Any
+    K_x: Any
+    C_x: Any
+    h: Any
+    ahead: Any  # m, the GPS antenna from the centre of gravity
+    left: Any  # m
 
 
 class Motion(NamedTuple):
@@ -44,28 +55,50 @@ class Motion(NamedTuple):
     s: Any  # m, along the road
     y: Any  # m, left of the road's centre line
     theta: Any  # rad, the road's direction at the car
-
-
-class Inputs(NamedTuple):
-    """What the actuators do at one instant."""
-
-    delta_f: Any  # rad, front steering angle
-    T_l: Any  # N m, left motor
-    T_r: Any  # N m, right motor
+    phi: Any = 0.0  # rad, roll of the body against the road
+    phi_dot: Any = 0.0  # rad/s
 
 
 class Road(NamedTuple):
-    """A road that is straight up to `start` and bends to `curvature` over `ramp` metres."""
+    """A road that is straight and flat up to `start`; what follows comes in over `ramp` metres."""
 
     curvature: Any  # 1/m, left positive
     start: Any  # m
     ramp: Any  # m, positive
+    across: Any = 0.0  # m/s2, g sin(bank), left side up positive
+    along: Any = 0.0  # m/s2, g sin(grade), uphill positive
+
+
+@jit
+def _ramped(road: Any, s: Any) -> Any:
+    return minimum(maximum((s - road.start) * (1.0 / road.ramp), 0.0), 1.0)
 
 
 @jit
 def curvature_at(road: Any, s: Any) -> Any:
     """Curvature of the road in 1/m at the distance s."""
-    return road.curvature * minimum(maximum((s - road.start) * (1.0 / road.ramp), 0.0), 1.0)
+    return road.curvature * _ramped(road, s)
+
+
+@inlined
+def gravity_felt(road: Any, s: Any, sin_r: Any, cos_r: Any) -> Any:
+    """(x, y) in m/s2 of what accelerometers in a car that does not roll feel of gravity.
+
+    The car itself is accelerated by as much the other way. sin_r, cos_r: of its heading relative
+    to the road.
+    """
+    share = _ramped(road, s)
+    along, across = road.along * share, road.across * share
+    return along * cos_r + across * sin_r, across * cos_r - along * sin_r
+
+
+@jit
+def gravity_at(motion: Any, road: Any, small_angle: int) -> Any:
+    """`gravity_felt` at a Motion; the small-angle car heads along the road."""
+    if small_angle:
+        return gravity_felt(road, motion.s, 0.0, 1.0)
+    sin_r, cos_r = sincos(motion.psi - motion.theta)
+    return gravity_felt(road, motion.s, sin_r, cos_r)
 
 
 class Push(NamedTuple):
@@ -73,22 +106,7 @@ class Push(NamedTuple):
 
     F_d: Any  # N, lateral force at the centre of gravity
     N_d: Any  # N m, yaw moment
-
-
-class Load(NamedTuple):
-    """What one instant's inputs mean for the tyres; computed once, used by several stages."""
-
-    sin_d: Any  # of the front steering angle
-    cos_d: Any
-    steer: Any  # rad
-    F_x: Any  # N, drive force
-    N_z: Any  # N m, yaw moment of the motors
-    limit_f: Any  # N, lateral capacity of one front tyre, of the left and of the right rear tyre
-    limit_l: Any
-    limit_r: Any
-    slope_f: Any  # C / 3 F_max of the same tyres, 1/tan
-    slope_l: Any
-    slope_r: Any
+    N_x: Any = 0.0  # N m, roll moment on the body
 
 
 class Frame(NamedTuple):
@@ -111,70 +129,6 @@ def frame_of(motion: Any) -> Any:
 
 
 @jit
-def _capacity(limit: Any, drive: Any) -> Any:
-    """Lateral capacity of a tyre in N that also drives: the friction circle, never below 5 %."""
-    return sqrt(maximum(limit * limit - drive * drive, 0.0025 * limit * limit))
-
-
-@jit
-def load_of(inputs: Any, car: Any, small_angle: int) -> Any:
-    """The Load of the Inputs of one instant."""
-    weight = car.m * GRAVITY / (2.0 * (car.l_f + car.l_r))
-    front, rear = car.mu * weight * car.l_r, car.mu * weight * car.l_f
-    F_l, F_r = inputs.T_l * (1.0 / car.r), inputs.T_r * (1.0 / car.r)
-    s, c = sincos(inputs.delta_f)
-    left, right = rear, rear
-    if not small_angle:
-        F_l = minimum(maximum(F_l, 0.0 - rear), rear)
-        F_r = minimum(maximum(F_r, 0.0 - rear), rear)
-        left, right = _capacity(rear, F_l), _capacity(rear, F_r)
-    return Load(
-        s,
-        c,
-        inputs.delta_f,
-        F_l + F_r,
-        0.5 * car.d_r * (F_r - F_l),
-        front,
-        left,
-        right,
-        car.C_f / (3.0 * front),
-        car.C_r / (3.0 * left),
-        car.C_r / (3.0 * right),
-    )
-
-
-@jit
-def lateral_force(tangent: Any, limit: Any, slope: Any, law: int) -> Any:
-    """Lateral force of one tyre in N from the tangent of its slip angle (linear: the angle).
-
-    Fiala: z = clip(C t / 3 F_max, -1, 1), F_y = F_max z (3 - 3 |z| + z^2), which needs neither
-    branch nor arctangent.
-    """
-    z = slope * tangent
-    if law == LINEAR:
-        return 3.0 * limit * z
-    z = minimum(maximum(z, -1.0), 1.0)
-    return limit * z * (3.0 - 3.0 * absolute(z) + z * z)
-
-
-@jit
-def slips(motion: Any, load: Any, car: Any, small_angle: int, law: int) -> Any:
-    """Tangents of the front and rear slip angle (the angles themselves for linear tyres)."""
-    front = motion.v_y + car.l_f * motion.gamma
-    rear = motion.v_y - car.l_r * motion.gamma
-    if small_angle:
-        v = maximum(motion.v_x, SLOW)
-        # delta_f - beta - l_f gamma / V_x and l_r gamma / V_x - beta of tie-vision (1)
-        return (motion.v_x * load.steer - front) / v, (0.0 - rear) / v
-    along = maximum(absolute(motion.v_x * load.cos_d + front * load.sin_d), SLOW)
-    t_f = (motion.v_x * load.sin_d - front * load.cos_d) / along
-    t_r = (0.0 - rear) / maximum(absolute(motion.v_x), SLOW)
-    if law == LINEAR:
-        return atan(t_f), atan(t_r)
-    return t_f, t_r
-
-
-@jit
 def _turned(sine: Any, cosine: Any, angle: Any) -> Any:
     """(sin, cos) after a further turn by a small angle; error below 1e-13 for 0.02 rad."""
     z = angle * angle
@@ -183,7 +137,18 @@ def _turned(sine: Any, cosine: Any, angle: Any) -> Any:
     return sine * c + cosine * s, cosine * c - sine * s
 
 
-@jit
+@inlined
+def _roll_acceleration(motion: Any, F_y: Any, N_x: Any, car: Any, per_m: Any) -> Any:
+    """phi'' from (1) and (3) of double-layer-gps, solved for it: a_y depends on phi''.
+
+    F_y: N, without gravity, whose pull on the body and on the whole car cancel in (3).
+    """
+    rest = N_x - car.C_x * motion.phi_dot - car.K_x * motion.phi
+    lever = car.S * (F_y * per_m + GRAVITY * motion.phi)
+    return (lever + rest) / (car.I_x - car.S * car.S * per_m)
+
+
+@inlined
 def derivative(
     motion: Any,
     load: Any,
@@ -193,36 +158,48 @@ def derivative(
     frame: Any,
     small_angle: int,
     law: int,
+    roll: int = 0,
 ) -> Any:
     """d(motion)/dt as a Motion; `frame` is that of the tick's start (`frame_of`)."""
     per_m, per_I = 1.0 / car.m, 1.0 / car.I
     v_x, v_y, gamma = motion.v_x, motion.v_y, motion.gamma
-    t_f, t_r = slips(motion, load, car, small_angle, law)
-    F_yf = 2.0 * lateral_force(t_f, load.limit_f, load.slope_f, law)
-    F_yr = lateral_force(t_r, load.limit_l, load.slope_l, law) + lateral_force(
-        t_r, load.limit_r, load.slope_r, law
-    )
     kappa = curvature_at(road, motion.s)
+    phi_dot, phi_ddot = 0.0, 0.0
     if small_angle:
-        dv_x = load.F_x * per_m
-        dv_y = (F_yf + F_yr + push.F_d) * per_m - v_x * gamma  # tie-vision (1)
-        dgamma = (car.l_f * F_yf - car.l_r * F_yr + load.N_z + push.N_d) * per_I  # (2)
+        g_x, g_y = gravity_felt(road, motion.s, 0.0, 1.0)
+        F_yf, F_yr, F_x, N_z = tyre_forces(motion, load, car, g_y, 1, law, roll)
+        F_y = F_yf + F_yr + push.F_d
+        dv_x = F_x * per_m - g_x
+        if roll:
+            dv_x = dv_x + v_y * gamma  # double-layer-gps (4)
+            phi_dot = motion.phi_dot
+            phi_ddot = _roll_acceleration(motion, F_y, push.N_x, car, per_m)
+            F_y = F_y + car.S * phi_ddot  # double-layer-gps (1)
+        dv_y = F_y * per_m - v_x * gamma - g_y  # tie-vision (1)
+        dgamma = (car.l_f * F_yf - car.l_r * F_yr + N_z + push.N_d) * per_I  # (2)
         dY = v_x * motion.psi + v_y  # tie-vision (5), V_x (psi + beta)
         dy = v_x * (motion.psi - motion.theta) + v_y
-        return Motion(dv_x, dv_y, dgamma, gamma, v_x, dY, v_x, dy, v_x * kappa)
-    F_yc = F_yf * load.cos_d
-    dv_x = (load.F_x - F_yf * load.sin_d) * per_m + v_y * gamma
-    dv_y = (F_yc + F_yr + push.F_d) * per_m - v_x * gamma
-    dgamma = (car.l_f * F_yc - car.l_r * F_yr + load.N_z + push.N_d) * per_I
+        return Motion(dv_x, dv_y, dgamma, gamma, v_x, dY, v_x, dy, v_x * kappa, phi_dot, phi_ddot)
     turn = motion.theta - frame.theta
     s_r, c_r = _turned(frame.sin_r, frame.cos_r, motion.psi - frame.psi - turn)
     s_t, c_t = _turned(frame.sin_t, frame.cos_t, turn)
+    g_x, g_y = gravity_felt(road, motion.s, s_r, c_r)
+    F_yf, F_yr, F_x, N_z = tyre_forces(motion, load, car, g_y, 0, law, roll)
+    F_yc = F_yf * load.cos_d
+    F_y = F_yc + F_yr + push.F_d
+    if roll:
+        phi_dot = motion.phi_dot
+        phi_ddot = _roll_acceleration(motion, F_y, push.N_x, car, per_m)
+        F_y = F_y + car.S * phi_ddot  # double-layer-gps (1)
+    dv_x = (F_x - F_yf * load.sin_d) * per_m + v_y * gamma - g_x
+    dv_y = F_y * per_m - v_x * gamma - g_y
+    dgamma = (car.l_f * F_yc - car.l_r * F_yr + N_z + push.N_d) * per_I
     along = v_x * c_r - v_y * s_r  # in road axes
     across = v_x * s_r + v_y * c_r
     ds = along / maximum(1.0 - kappa * motion.y, 0.1)
     dX = along * c_t - across * s_t
     dY = along * s_t + across * c_t
-    return Motion(dv_x, dv_y, dgamma, gamma, dX, dY, ds, across, ds * kappa)
+    return Motion(dv_x, dv_y, dgamma, gamma, dX, dY, ds, across, ds * kappa, phi_dot, phi_ddot)
 
 
 @jit
@@ -238,6 +215,8 @@ def _ahead(motion: Any, h: Any, d: Any) -> Any:
         motion.s + h * d.s,
         motion.y + h * d.y,
         motion.theta + h * d.theta,
+        motion.phi + h * d.phi,
+        motion.phi_dot + h * d.phi_dot,
     )
 
 
@@ -246,7 +225,7 @@ def _weighted(a: Any, b: Any, c: Any, d: Any) -> Any:
     return (a + 2.0 * (b + c) + d) * (1.0 / 6.0)
 
 
-@jit
+@inlined
 def rk4(
     motion: Any,
     load: tuple[Any, Any, Any],
@@ -256,16 +235,20 @@ def rk4(
     h: Any,
     small_angle: int,
     law: int,
+    roll: int = 0,
 ) -> Any:
     """One step of h seconds of the classical Runge-Kutta method.
 
     load: the Load at the start, the middle and the end of the step.
     """
     frame = frame_of(motion)
-    a = derivative(motion, load[0], push, car, road, frame, small_angle, law)
-    b = derivative(_ahead(motion, 0.5 * h, a), load[1], push, car, road, frame, small_angle, law)
-    c = derivative(_ahead(motion, 0.5 * h, b), load[1], push, car, road, frame, small_angle, law)
-    d = derivative(_ahead(motion, h, c), load[2], push, car, road, frame, small_angle, law)
+    half = 0.5 * h
+    a = derivative(motion, load[0], push, car, road, frame, small_angle, law, roll)
+    middle = _ahead(motion, half, a)
+    b = derivative(middle, load[1], push, car, road, frame, small_angle, law, roll)
+    middle = _ahead(motion, half, b)
+    c = derivative(middle, load[1], push, car, road, frame, small_angle, law, roll)
+    d = derivative(_ahead(motion, h, c), load[2], push, car, road, frame, small_angle, law, roll)
     slope = Motion(
         _weighted(a.v_x, b.v_x, c.v_x, d.v_x),
         _weighted(a.v_y, b.v_y, c.v_y, d.v_y),
@@ -276,6 +259,8 @@ def rk4(
         _weighted(a.s, b.s, c.s, d.s),
         _weighted(a.y, b.y, c.y, d.y),
         _weighted(a.theta, b.theta, c.theta, d.theta),
+        _weighted(a.phi, b.phi, c.phi, d.phi),
+        _weighted(a.phi_dot, b.phi_dot, c.phi_dot, d.phi_dot),
     )
     return _ahead(motion, h, slope)
 

@@ -8,9 +8,9 @@ ticks k+1 .. k+n; a reset returns tick 0 alone.
 from typing import Any
 
 from .actuators import Lag, distribute, lagged, slewed, within_stop, yaw_moment
-from .backend import absolute, fixed_tuple, jit, select
+from .backend import absolute, fixed_tuple, inlined, jit, select
 from .delivery import sense, store
-from .dynamics import Car, Inputs, Motion, Push, Road, load_of, rk4, sideslip_angle
+from .dynamics import Car, Motion, Push, Road, gravity_at, rk4, sideslip_angle
 from .layout import Disturbance, Drive, P, Task, Z
 from .noise import CHANNELS, normals
 from .programme import STEERING_WIDTH, Pace, Wind, acceleration_command, steering_at, wind_at
@@ -18,6 +18,8 @@ from .record import FAST, TICK
 from .reference import COST_CAP, Target, cost_rate, reference
 from .summary import clip, observe, write_report
 from .switches import BAD_ACTION, NOT_FINITE, OFF_ROAD, REFUSED, REPORT, RUNNING, SPIN
+from .tyres import Inputs, load_of
+from .vehicle import GRAVITY
 
 _CAR, _MOTION, _ROAD, _LAG = (len(each._fields) for each in (Car, Motion, Road, Lag))
 _WIND, _PACE, _TARGET = (len(each._fields) for each in (Wind, Pace, Target))
@@ -44,6 +46,23 @@ def _load_at(
         lagged(to_r, T_r, torque_rest),
     )
     return load_of(inputs, car, small_angle)
+
+
+@inlined
+def _specific_force(before: Any, after: Any, road: Any, small_angle: int, roll: int) -> Any:
+    """(a_x, a_y) in m/s2, mean over a tick: v', the turning of the axes, and gravity."""
+    turn_x = 0.5 * (before.gamma * before.v_y + after.gamma * after.v_y)
+    turn_y = 0.5 * (before.gamma * before.v_x + after.gamma * after.v_x)
+    turns_x = (small_angle == 0) | (roll == 1)  # tie-vision holds v_x; double-layer-gps (4)
+    a_x = (after.v_x - before.v_x) / TICK - select(turns_x, turn_x, 0.0)
+    a_y = (after.v_y - before.v_y) / TICK + turn_y
+    if roll:
+        a_y = a_y + 0.5 * GRAVITY * (before.phi + after.phi)  # double-layer-gps (5)
+    if road.along != 0.0 or road.across != 0.0:
+        first = gravity_at(before, road, small_angle)
+        last = gravity_at(after, road, small_angle)
+        a_x, a_y = a_x + 0.5 * (first[0] + last[0]), a_y + 0.5 * (first[1] + last[1])
+    return a_x, a_y
 
 
 @jit
@@ -77,7 +96,7 @@ def step_vehicle(
         report[REPORT.packets] = 0.0
         return 0
     share = clip(share, -1.0, 1.0)
-    small_angle, law, kind = switches[0], switches[1], switches[2]
+    small_angle, law, kind, roll = switches[0], switches[1], switches[2], switches[6]
     car = Car(*fixed_tuple(p, _CAR))
     road = Road(*fixed_tuple(p[P.road :], _ROAD))
     motor = Lag(*fixed_tuple(p[P.motor :], _LAG))
@@ -108,7 +127,7 @@ def step_vehicle(
         command = driver + extra
         a_x, integral = acceleration_command(tick, motion.v_x, integral, pace, limit)
         to_l, to_r = distribute(N_z, a_x, car, task.yaw_first)
-        F_w, N_w = wind_at(tick, wind)
+        F_w, N_w, N_x = wind_at(tick, wind)
         if lagging:  # actuators that lag move continuously: a tick starts where the last one ended
             if not both_lag:  # the other one jumps
                 start = _load_at(
@@ -142,8 +161,8 @@ def step_vehicle(
             start = load_of(Inputs(command, to_l, to_r), car, small_angle)
             middle, end = start, start
         before = motion
-        push = Push(F_d + F_w, N_d + N_w)
-        motion = rk4(before, (start, middle, end), push, car, road, TICK, small_angle, law)
+        push = Push(F_d + F_w, N_d + N_w, N_x)
+        motion = rk4(before, (start, middle, end), push, car, road, TICK, small_angle, law, roll)
         start = end
         steer_acted = lagged(command, delta, steering.mean)
         added_acted = lagged(extra, added, steering.mean)
@@ -155,18 +174,14 @@ def step_vehicle(
         z[Z.clock + 2] = tick
         fast = normals(key_low, key_high, int(tick), CHANNELS.inertial)
         wheels = normals(key_low, key_high, int(tick), CHANNELS.wheels)
-        # specific force, mean over the tick: v' and the turning of the axes
-        turn_x = 0.5 * (before.gamma * before.v_y + motion.gamma * motion.v_y)
-        turn_y = 0.5 * (before.gamma * before.v_x + motion.gamma * motion.v_x)
-        accel = (
-            (motion.v_x - before.v_x) / TICK - select(small_angle == 1, 0.0, turn_x),
-            (motion.v_y - before.v_y) / TICK + turn_y,
-        )
+        accel = _specific_force(before, motion, road, small_angle, roll)
         F_d = ou.keep * F_d + ou.fresh * ou.force * wheels[2]
         N_d = ou.keep * N_d + ou.fresh * ou.moment * wheels[3]
         beta = sideslip_angle(motion.v_x, motion.v_y, small_angle)
         acted = (steer_acted, left, right, driver, a_x)
-        count = sense(p, z, motion, beta, accel, acted, rows, j, packets, count, fast, wheels)
+        count = sense(
+            p, z, motion, small_angle, accel, acted, rows, j, packets, count, fast, wheels
+        )
         v = 0.5 * (rows[j, FAST.wheel_left] + rows[j, FAST.wheel_right])
         driver = steering_at(tick, programme)
         refs = reference(driver, v, target, kind)
@@ -176,7 +191,7 @@ def step_vehicle(
         cost = cost + c * TICK
         done = j + 1
         v_x, v_y, gamma = motion.v_x, motion.v_y, motion.gamma
-        finite = v_x * v_x + v_y * v_y + gamma * gamma + motion.psi + motion.Y
+        finite = v_x * v_x + v_y * v_y + gamma * gamma + motion.psi + motion.Y + motion.phi
         if finite - finite != 0.0:  # squares: the references take them too
             failure = NOT_FINITE
             motion, beta, refs = before, 0.0, (0.0, 0.0)  # the last that is fit for `info`

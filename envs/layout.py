@@ -14,7 +14,7 @@ from .dynamics import Car, Motion, Road
 from .programme import STEERING_WIDTH, Pace, Wind
 from .record import FAST, FAST_UNITS, PACKET_WIDTH, SLOW_NAMES, SLOW_VALUES
 from .reference import Target
-from .sensors import IN_FLIGHT, Link, Noise
+from .sensors import IN_FLIGHT, Link, Noise, Sky
 
 Array = npt.NDArray[np.float64]
 
@@ -100,6 +100,7 @@ _PARAMS = _offsets(
         "disturbance": len(Disturbance._fields),
         "task": len(Task._fields),
         "steering": STEERING_WIDTH,
+        "sky": len(Sky._fields),
     }
 )
 _STATE = _offsets(
@@ -110,6 +111,7 @@ _STATE = _offsets(
         "camera": len(Slow._fields),
         "gps": len(Slow._fields),
         "queue": 2 * IN_FLIGHT * PACKET_WIDTH,
+        "sky": 1,  # deviation of log HDOP from its median
     }
 )
 
@@ -130,6 +132,7 @@ class ParamsAt(NamedTuple):
     disturbance: int
     task: int
     steering: int
+    sky: int
     end: int
 
 
@@ -142,6 +145,7 @@ class StateAt(NamedTuple):
     camera: int
     gps: int
     queue: int
+    sky: int
     end: int
 
 

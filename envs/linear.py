@@ -8,7 +8,7 @@ import numpy.typing as npt
 from scipy.linalg import expm
 
 from .backend import jit
-from .vehicle import Vehicle
+from .vehicle import GRAVITY, Vehicle
 
 if TYPE_CHECKING:
     from control import StateSpace
@@ -124,3 +124,46 @@ def course(vehicle: Vehicle, speed: float) -> LinearModel:
     B = np.vstack([steer, np.zeros(2)])
     C = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 1.0]])
     return LinearModel(A, B, C, ("beta", "gamma", "psi"), ("delta_f", "N_z"), ("gamma", "course"))
+
+
+def roll(vehicle: Vehicle) -> LinearModel:
+    """phi and phi_dot from the measured specific force a_y: double-layer-gps (3). Output: phi_dot.
+
+    The body's weight, M_s g h_s phi, is within a_y.
+    """
+    I_x = vehicle.roll_inertia
+    A = np.array([[0.0, 1.0], [-vehicle.roll_stiffness / I_x, -vehicle.roll_damping / I_x]])
+    B = np.array([[0.0], [vehicle.roll_moment_arm / I_x]])
+    return LinearModel(A, B, np.array([[0.0, 1.0]]), ("phi", "phi_dot"), ("a_y",), ("phi_dot",))
+
+
+def kinematic(gamma: float) -> LinearModel:
+    """v_x and v_y from both specific forces at a yaw rate in rad/s: double-layer-gps (4)-(5).
+
+    Without roll or bank. Output: v_x, as the wheels tell it; at zero yaw rate v_y is unobservable.
+    """
+    A = np.array([[0.0, gamma], [-gamma, 0.0]])
+    return LinearModel(
+        A, np.eye(2), np.array([[1.0, 0.0]]), ("v_x", "v_y"), ("a_x", "a_y"), ("v_x",)
+    )
+
+
+def velocity_and_roll(vehicle: Vehicle, gamma: float) -> LinearModel:
+    """v_x, v_y, phi and phi_dot from both specific forces: double-layer-gps (42), continuous.
+
+    Outputs: v_x and v_y, which the GPS and the first layer tell, and phi_dot.
+    """
+    body, plane = roll(vehicle), kinematic(gamma)
+    A, B, C = np.zeros((4, 4)), np.zeros((4, 2)), np.zeros((3, 4))
+    A[:2, :2], A[2:, 2:] = plane.A, body.A
+    A[1, 2] = -GRAVITY  # double-layer-gps (5)
+    B[:2], B[2:, 1:] = plane.B, body.B
+    C[0, 0] = C[1, 1] = C[2, 3] = 1.0
+    return LinearModel(
+        A,
+        B,
+        C,
+        (*plane.states, *body.states),
+        plane.inputs,
+        ("v_x", "v_y", "phi_dot"),
+    )

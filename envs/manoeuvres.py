@@ -1,9 +1,10 @@
-"""The manoeuvres by name: the scored ones, drawn by the seed, and the papers' simulations."""
+"""The manoeuvres by name: the scored ones, drawn by the seed, here; the papers' own beside them."""
 
 import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
+from .paper_simulations import ROAD_TESTS, SIMULATIONS
 from .scenario import KMH, Scenario
 
 _DRAWN: dict[str, Any] = {
@@ -12,12 +13,6 @@ _DRAWN: dict[str, Any] = {
     "front_stiffness": (0.6, 1.4),
     "rear_stiffness": (0.6, 1.4),
     "friction": (0.7, 1.0),
-}
-_PAPER: dict[str, Any] = {
-    "small_angle": True,
-    "linear_tyres": True,
-    "lags": False,
-    "scored": False,
 }
 
 _MANOEUVRES = (
@@ -78,59 +73,8 @@ _MANOEUVRES = (
     ),
 )
 
-_FIG7 = Scenario(
-    name="tie-vision-fig7",
-    steering="sine",
-    amplitude=0.1,
-    frequency=0.5,
-    vehicle={"front_stiffness": 7200.0, "rear_stiffness": 7200.0},
-    **_PAPER,
-)
-_FIG8 = Scenario(
-    name="tie-vision-fig8",
-    duration=5.0,
-    steering="lane-change",
-    onset=0.5,
-    amplitude=0.13,
-    frequency=0.5,
-    disturbance_force=0.0,
-    disturbance_moment=0.0,
-    noise={"camera_psi": 0.0005, "camera_y": 0.003},
-    **_PAPER,
-)
-_UNEVEN = _FIG7.replace(
-    name="uneven-delay-fig5",
-    camera_delays=(0.020, 0.015, 0.010, 0.025),
-    disturbance_force=0.0,
-    disturbance_moment=0.0,
-    noise={"camera_psi": 0.001, "camera_y": 0.01},
-)
-_FIG6 = Scenario(
-    name="dakf-fig6",
-    steering="lane-change",
-    onset=0.5,
-    amplitude=0.2,
-    frequency=0.2,
-    wind_force=200.0,
-    wind_arm=0.2,
-    wind_start=4.0,
-    wind_length=4.0,
-    gps_outage=(4.0, 6.0),
-    vehicle={"front_stiffness": 7000.0, "rear_stiffness": 7000.0},
-    nominal={"front_stiffness": 10000.0, "rear_stiffness": 10000.0},
-    **_PAPER,
-)
-_SIMULATIONS = (  # with what the papers leave open chosen once: fixed, never in a score
-    _FIG7,
-    _FIG8,
-    _FIG8.replace(name="tie-vision-fig8-stiff", vehicle=_FIG7.vehicle),
-    _UNEVEN,
-    _UNEVEN.replace(name="uneven-delay-fig5-noisy", noise={"camera_psi": 0.003, "camera_y": 0.03}),
-    _FIG6,
-)
-
 SCENARIOS: dict[str, Scenario] = {
-    scenario.name: scenario for scenario in (*_MANOEUVRES, *_SIMULATIONS)
+    scenario.name: scenario for scenario in (*_MANOEUVRES, *SIMULATIONS, *ROAD_TESTS)
 }
 
 

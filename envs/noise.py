@@ -29,6 +29,7 @@ class Channels(NamedTuple):
     gps_link: int = 5  # the same of the GPS
     initial: int = 6  # disturbance force and moment at reset; clock phases
     scenario: int = 7  # uniforms of the scenario's draws; the counter's tick is the attempt
+    sky: int = 8  # log HDOP's innovation, its start at reset, two unused
 
 
 CHANNELS = Channels()

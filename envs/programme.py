@@ -7,13 +7,15 @@ can reset its rows without Python.
 
 from typing import Any, NamedTuple
 
-from .backend import fixed_tuple, floor, jit, maximum, minimum, select
+from .backend import fixed_tuple, floor, inlined, jit, maximum, minimum, select
 from .elementary import PI, sincos, smoothstep
 from .noise import CHANNELS, uniforms
 from .record import TICK
 
-STRAIGHT, SINE, SLALOM, LANE_CHANGE, STEP, RANDOM = range(6)
-STEERING_KINDS = ("straight", "sine", "slalom", "lane-change", "step", "random")
+STRAIGHT, SINE, SLALOM, LANE_CHANGE, STEP, RANDOM, DOUBLE_LANE_CHANGE = range(7)
+STEERING_KINDS = (
+    "straight", "sine", "slalom", "lane-change", "step", "random", "double-lane-change",
+)  # fmt: skip
 SINES, STEPS = 4, 3
 STEERING_WIDTH = 5 * SINES + 3 * STEPS
 FOREVER = 1e15  # ticks
@@ -34,7 +36,7 @@ class Draws(NamedTuple):
     frequency_2: Any
     frequency_3: Any
     frequency_4: Any
-    hold: Any  # s, of each step
+    hold: Any  # s, of each step; from one lane change to the next
     wind_force: Any  # N
     wind_arm: Any  # m, ahead of the centre of gravity
     wind_start: Any  # s
@@ -47,24 +49,27 @@ DRAWS_WIDTH = len(Draws._fields)
 
 
 class Wind(NamedTuple):
-    """A side wind between two ticks, at a lever arm ahead of the centre of gravity."""
+    """A side wind between two ticks."""
 
-    force: Any
-    arm: Any
+    force: Any  # N, to the left
+    arm: Any  # m, ahead of the centre of gravity
     start: Any
     end: Any
+    height: Any = 0.0  # m, above the roll axis
 
 
 class Pace(NamedTuple):
-    """The driver's longitudinal work: a speed held by PI, or an acceleration."""
+    """The driver's longitudinal work: a speed held or followed by PI, or an acceleration."""
 
     speed: Any  # m/s, at the start and to hold
-    hold: Any  # 1 hold the speed; 0 apply `acceleration`
+    hold: Any  # 1 hold the speed that `acceleration` and `surge` make of it; 0 apply them alone
     acceleration: Any  # m/s2, from start to end
     start: Any  # tick
     end: Any
     k_p: Any  # 1/s
     k_i: Any  # 1/s2
+    surge: Any = 0.0  # m/s2, amplitude of a sine
+    surge_rate: Any = 1.0  # rad/s
 
 
 @jit
@@ -84,21 +89,31 @@ def steering_at(tick: Any, programme: Any) -> Any:
 
 @jit
 def wind_at(tick: Any, wind: Any) -> Any:
-    """(force in N, moment in N m) of the wind that acts from this tick to the next."""
+    """(force in N, yaw moment, roll moment in N m) of the wind from this tick to the next."""
     force = select((tick >= wind.start) & (tick < wind.end), wind.force, 0.0)
-    return force, force * wind.arm
+    return force, force * wind.arm, 0.0 - force * wind.height
 
 
-@jit
+@inlined
 def acceleration_command(tick: Any, v_x: Any, integral: Any, pace: Any, limit: Any) -> Any:
-    """(a_x command in m/s2, next integral): PI on the speed with the integral held at the limit."""
-    error = pace.speed - v_x
-    wanted = pace.k_p * error + integral
+    """(a_x command in m/s2, next integral): PI on the speed with the integral held at the limit.
+
+    The wanted speed starts at `pace.speed` and is the integral of the wanted acceleration, which
+    is fed forward.
+    """
+    ahead = select((tick >= pace.start) & (tick < pace.end), pace.acceleration, 0.0)
+    since = (minimum(maximum(tick, pace.start), pace.end) - pace.start) * TICK
+    speed = pace.speed + pace.acceleration * since
+    if pace.surge != 0.0:
+        s, c = sincos(pace.surge_rate * (tick * TICK))
+        ahead = ahead + pace.surge * s
+        speed = speed + pace.surge / pace.surge_rate * (1.0 - c)
+    error = speed - v_x
+    wanted = pace.k_p * error + integral + pace.hold * ahead
     held = minimum(maximum(wanted, 0.0 - limit), limit)
     grown = integral + pace.k_i * error * TICK
     integral = select(wanted == held, grown, integral)
-    open_loop = select((tick >= pace.start) & (tick < pace.end), pace.acceleration, 0.0)
-    return pace.hold * held + (1.0 - pace.hold) * open_loop, integral
+    return pace.hold * held + (1.0 - pace.hold) * ahead, integral
 
 
 @jit
@@ -158,6 +173,10 @@ def write_steering(kind: int, d: Any, programme: Any) -> None:
         _sine(programme, 0, a, d.frequency, start, FOREVER)
     elif kind == LANE_CHANGE:
         _sine(programme, 0, a, d.frequency, start, start + _ticks(1.0 / d.frequency))
+    elif kind == DOUBLE_LANE_CHANGE:
+        back, period = start + _ticks(d.hold), _ticks(1.0 / d.frequency)
+        _sine(programme, 0, a, d.frequency, start, start + period)
+        _sine(programme, 1, -a, d.frequency, back, back + period)
     elif kind == SLALOM:
         half = start + _ticks(0.5 / d.frequency)
         _sine(programme, 0, 0.5 * a, d.frequency, start, half)

@@ -4,7 +4,7 @@ from typing import Any
 
 from .backend import fixed_tuple, floor, jit, select
 from .delivery import FAR, sense, store
-from .dynamics import Car, Motion, sideslip_angle
+from .dynamics import Car, Motion, Road, gravity_at, sideslip_angle
 from .layout import P, Z
 from .noise import CHANNELS, normals
 from .programme import STEERING_WIDTH, realise, steering_at, write_steering
@@ -13,8 +13,10 @@ from .reference import Target, reference
 from .sensors import IN_FLIGHT, NEVER, Link, clock_phase
 from .summary import observe, write_report
 from .switches import REPORT
+from .vehicle import GRAVITY
 
 _CAR, _MOTION, _LINK, _TARGET = (len(each._fields) for each in (Car, Motion, Link, Target))
+_ROAD = len(Road._fields)
 
 
 @jit
@@ -60,6 +62,7 @@ def reset_vehicle(
     for i in range(_MOTION):
         if start[i] == start[i]:
             z[Z.motion + i] = start[i]
+    z[Z.sky] = p[P.sky + 1] * normals(key_low, key_high, 0, CHANNELS.sky)[1]
     n = normals(key_low, key_high, 0, CHANNELS.initial)
     z[Z.drive + 2] = steering_at(0.0, fixed_tuple(p[P.steering :], STEERING_WIDTH))
     z[Z.drive + 4] = p[P.disturbance] * n[0]
@@ -76,8 +79,10 @@ def reset_vehicle(
     fast = normals(key_low, key_high, 0, CHANNELS.inertial)
     wheels = normals(key_low, key_high, 0, CHANNELS.wheels)
     inputs = (steer, 0.0, 0.0, steer, 0.0)
-    accel = (0.0, 0.0)
-    count = sense(p, z, motion, beta, accel, inputs, rows, 0, packets, 0, fast, wheels)
+    road = Road(*fixed_tuple(p[P.road :], _ROAD))
+    g_x, g_y = gravity_at(motion, road, switches[0])
+    accel = (g_x, g_y + GRAVITY * motion.phi)
+    count = sense(p, z, motion, switches[0], accel, inputs, rows, 0, packets, 0, fast, wheels)
     v = 0.5 * (rows[0, FAST.wheel_left] + rows[0, FAST.wheel_right])
     target = Target(*fixed_tuple(p[P.target :], _TARGET))
     refs = reference(steer, v, target, switches[2])

@@ -10,12 +10,13 @@ import numpy as np
 
 from .layout import Array
 from .programme import DRAWS_WIDTH, STEERING_KINDS, Draws
-from .sensors import Noise
+from .sensors import HDOP_LAWS, Noise
 
 Range = float | tuple[float, float]
 """A number, or the (low, high) that the seed draws from uniformly."""
 
 KMH = 1.0 / 3.6
+SHORTEST_GPS_PERIOD = 0.05  # s; an env keeps room for its packets
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,14 +24,21 @@ class Scenario:
     """What happens in an episode. Ranges are drawn by the seed; SI units.
 
     steering: a kind of `STEERING_KINDS`, built from onset, amplitude, frequency (random: two pairs
-    of sines) and hold (step). mirror: the seed draws the side of steering and wind. front_stiffness
-    and rear_stiffness are factors on the vehicle's; draws that make the car unstable at the drawn
-    speed are drawn again and counted. friction is the road's and replaces the vehicle's.
-    acceleration: None holds the speed. disturbance_*: an
-    Ornstein-Uhlenbeck force and moment. vehicle and nominal: parameters that replace those of the
-    env. noise: sensor noise that replaces the default. camera_delays: a repeating pattern that
-    replaces the id's. small_angle, linear_tyres, lags: the plant.
-    scored: whether it counts in a score (the papers' experiments never do).
+    of sines) and hold (of a step, or from one lane change to the next). mirror: the seed draws the
+    side of steering and wind. front_stiffness and rear_stiffness are factors on the vehicle's;
+    draws that make the car unstable at the drawn speed are drawn again and counted. friction is the
+    road's and replaces the vehicle's. acceleration: None holds the speed. speed_change: m/s by
+    which the held speed changes at an even rate, from change_start over change_length. surge,
+    surge_frequency: amplitude and frequency of a sine of the driver's acceleration, which the held
+    speed follows. wind_height: m above the roll axis. disturbance_*: an Ornstein-Uhlenbeck force
+    and moment. curvature, bank (rad, left side up) and grade (rad, uphill) come in from curve_start
+    over curve_ramp metres; a negative curve_start has them from the beginning. vehicle and nominal:
+    parameters that replace those of the env. noise: sensor noise that replaces the default.
+    camera_delays: a repeating pattern that replaces the id's, and camera_jitter with it; gps_period
+    and gps_delays likewise. hdop, hdop_spread, hdop_time: median of the GPS's HDOP, standard
+    deviation of its logarithm and the time in which that forgets; hdop_law of `HDOP_LAWS`: how much
+    of the noise follows it. small_angle, linear_tyres, lags, roll: the plant. scored: whether it
+    counts in a score (the papers' experiments never do).
 
     Raises ValueError for a value out of place and names the field.
     """
@@ -49,6 +57,11 @@ class Scenario:
     mirror: bool = False
     speed: Range = 25.0 * KMH
     acceleration: float | None = None
+    speed_change: float = 0.0
+    change_start: float = 0.0
+    change_length: float = 10.0
+    surge: float = 0.0
+    surge_frequency: float = 0.1
     friction: Range = 0.9
     front_stiffness: Range = 1.0
     rear_stiffness: Range = 1.0
@@ -56,19 +69,30 @@ class Scenario:
     wind_arm: Range = 0.0
     wind_start: Range = 0.0
     wind_length: Range = 0.0
+    wind_height: float = 0.0
     disturbance_force: float = 50.0
     disturbance_moment: float = 20.0
     disturbance_time: float = 0.3
     curvature: float = 0.0
     curve_start: float = 20.0
     curve_ramp: float = 20.0
+    bank: float = 0.0
+    grade: float = 0.0
     half_width: float = 50.0
     camera_delays: tuple[float, ...] | None = None
+    camera_jitter: float = 0.0
     camera_outage: tuple[float, float] | None = None
+    gps_period: float | None = None
+    gps_delays: tuple[float, ...] | None = None
     gps_outage: tuple[float, float] | None = None
+    hdop: float = 1.4
+    hdop_spread: float = 0.5
+    hdop_time: float = 20.0
+    hdop_law: str = "half"
     small_angle: bool = False
     linear_tyres: bool = False
     lags: bool = True
+    roll: bool = True
     scored: bool = True
     vehicle: Mapping[str, float] = field(default_factory=dict)
     nominal: Mapping[str, float] = field(default_factory=dict)
@@ -79,36 +103,48 @@ class Scenario:
             value = getattr(self, entry.name)
             if isinstance(value, list):
                 object.__setattr__(self, entry.name, tuple(value))
-        if self.steering not in STEERING_KINDS:
-            raise ValueError(
-                f"scenario {self.name!r}: unknown steering {self.steering!r}; "
-                f"known: {', '.join(STEERING_KINDS)}"
-            )
+        for value, known, what in (
+            (self.steering, STEERING_KINDS, "steering"),
+            (self.hdop_law, HDOP_LAWS, "hdop_law"),
+        ):
+            if value not in known:
+                self._refuse(f"unknown {what} {value!r}; known: {', '.join(known)}")
         if not (self.duration > 0.0 and math.isfinite(self.duration)):
-            raise ValueError(f"scenario {self.name!r}: duration {self.duration!r} s")
+            self._refuse(f"duration {self.duration!r} s")
         unknown = sorted(set(self.noise) - set(Noise._fields))
         if unknown:
-            raise ValueError(f"scenario {self.name!r}: unknown noise {', '.join(unknown)}")
+            self._refuse(f"unknown noise {', '.join(unknown)}")
         for name in Draws._fields:
             if name in _SIDES:
                 continue
             low, high = self.range(name)
             if not (math.isfinite(low) and math.isfinite(high) and low <= high):
-                raise ValueError(f"scenario {self.name!r}: {name} {getattr(self, name)!r}")
+                self._refuse(f"{name} {getattr(self, name)!r}")
         numbers = {name: getattr(self, name) for name in _NUMBERS} | dict(self.noise)
         for name, value in (numbers | {"acceleration": self.acceleration or 0.0}).items():
             if not math.isfinite(value):
-                raise ValueError(f"scenario {self.name!r}: {name} {value!r} is not finite")
+                self._refuse(f"{name} {value!r} is not finite")
         for name in ("frequency", "frequency_3", "front_stiffness", "rear_stiffness", "friction"):
             if self.range(name)[0] <= 0.0:
-                raise ValueError(f"scenario {self.name!r}: {name} must be positive")
-        if self.range("speed")[0] < 0.0 or not all(
-            value > 0.0 for value in (self.disturbance_time, self.curve_ramp, self.half_width)
-        ):
-            raise ValueError(
-                f"scenario {self.name!r}: speed must not be negative, disturbance_time, "
-                "curve_ramp and half_width must be positive"
-            )
+                self._refuse(f"{name} must be positive")
+        for name in _POSITIVE:
+            if not getattr(self, name) > 0.0:
+                self._refuse(f"{name} must be positive, got {getattr(self, name)!r}")
+        if self.range("speed")[0] < 0.0 or self.range("speed")[0] + self.speed_change < 0.0:
+            self._refuse("speed must not be negative, with speed_change or without")
+        if self.acceleration is not None and (self.speed_change or self.surge):
+            self._refuse("speed_change and surge need the held speed (acceleration None)")
+        if not 0.0 <= self.hdop_spread <= 1.0:
+            self._refuse(f"hdop_spread is 0 to 1, got {self.hdop_spread!r}")
+        if self.gps_period is not None and not self.gps_period >= SHORTEST_GPS_PERIOD:
+            self._refuse(f"gps_period is {SHORTEST_GPS_PERIOD} s or more, got {self.gps_period!r}")
+        if self.camera_jitter and self.camera_delays is None:
+            self._refuse("camera_jitter needs camera_delays")
+        if max(abs(self.bank), abs(self.grade)) > 0.5:
+            self._refuse(f"bank and grade are up to 0.5 rad, got {self.bank!r}, {self.grade!r}")
+
+    def _refuse(self, message: str) -> None:
+        raise ValueError(f"scenario {self.name!r}: {message}")
 
     def range(self, name: str) -> tuple[float, float]:
         """(low, high) of a drawn quantity."""
@@ -132,7 +168,8 @@ class Scenario:
     def held_speed(self) -> float | None:
         """The speed in m/s where it is one number and held exactly, else None."""
         low, high = self.range("speed")
-        fixed = low == high and self.acceleration is None and self.small_angle
+        moved = self.speed_change or self.surge or self.grade or self.roll
+        fixed = low == high and self.acceleration is None and self.small_angle and not moved
         return low if fixed else None
 
     def replace(self, **changes: Any) -> "Scenario":
@@ -161,4 +198,24 @@ _NUMBERS = (
     "curvature",
     "curve_start",
     "curve_ramp",
+    "speed_change",
+    "change_start",
+    "change_length",
+    "surge",
+    "surge_frequency",
+    "wind_height",
+    "bank",
+    "grade",
+    "half_width",
+    "hdop",
+    "hdop_time",
+)
+_POSITIVE = (
+    "disturbance_time",
+    "curve_ramp",
+    "half_width",
+    "change_length",
+    "surge_frequency",
+    "hdop",
+    "hdop_time",
 )

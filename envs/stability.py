@@ -18,7 +18,7 @@ from .programme import DRAWS_WIDTH
 from .record import FAST_WIDTH, PACKET_WIDTH, SLOW_NAMES, TICK, Record, SlowSensor
 from .restart import reset_vehicle
 from .scenario import Scenario
-from .sensor_sets import SENSOR_SETS, most_packets, with_changes
+from .sensor_sets import SENSOR_SETS, in_scenario, most_packets, with_changes
 from .sensors import ticks
 from .switches import REFUSED, REPORT, RUNNING
 from .template import Template, template_of
@@ -78,7 +78,8 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
 
     ## Options of reset
     `scenario`, `vehicle`, `friction`, `state` (mapping of `v_x, v_y, gamma, psi, X, Y, s, y,
-    theta`), `duration` (s), for that episode; unknown keys raise ValueError.
+    theta, phi, phi_dot`; the last two where the scenario rolls), `duration` (s), for that
+    episode; unknown keys raise ValueError.
 
     ## Arguments
     All JSON-able. sensors: "vision", "vision-uneven", "gps" or "fusion" (camera and GPS).
@@ -150,15 +151,11 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
         self._over = True
 
     def _template(self, scenario: Scenario, vehicle: Vehicle) -> Template:
-        slow = dict(self._sensors)
-        if scenario.camera_delays is not None and "camera" in slow:
-            delays = scenario.camera_delays
-            slow["camera"] = dataclasses.replace(slow["camera"], delays=delays, jitter=0.0)
         return template_of(
             scenario,
             vehicle,
             self._nominal,
-            slow,
+            in_scenario(self._sensors, scenario),
             self.reference,
             self._fast == "all",
             self._yaw_first,
@@ -214,6 +211,11 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
             if value is not None and not abs(value) <= 1e6:
                 raise ValueError(f"reset option state: {name} is {value!r}, not a number up to 1e6")
             start[i] = np.nan if value is None else value
+            if name.startswith("phi") and value and not scenario.roll:
+                raise ValueError(
+                    f"reset option state: {name} is {value!r}, but scenario {scenario.name!r} "
+                    "has no roll"
+                )
         if state:
             known = ", ".join(Motion._fields)
             raise ValueError(f"unknown state {', '.join(state)}; known: {known}")
@@ -310,6 +312,11 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
             if car[P.car] > 0.0
             else self._now.vehicle
         )
+
+    @property
+    def motion(self) -> Motion:
+        """The true velocities, heading, place and roll now, in SI units; no sensor tells these."""
+        return Motion(*self._state[Z.motion : Z.motion + len(Motion._fields)].tolist())
 
     @property
     def nominal(self) -> Vehicle:

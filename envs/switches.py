@@ -16,6 +16,7 @@ class Switches(NamedTuple):
     steering: int  # kind of steering programme, used at reset
     all_samples: int  # the observation holds every fast sample
     fail_bad: int  # a non-finite action ends the episode instead of being refused
+    roll: int  # the body rolls
 
 
 class Report(NamedTuple):

@@ -7,15 +7,16 @@ import numpy as np
 import numpy.typing as npt
 
 from .actuators import lag_of
-from .dynamics import FIALA, LINEAR, Car, Road
+from .dynamics import Car, Road
 from .layout import Array, Disturbance, P, Task
-from .programme import FOREVER, STEERING_KINDS, STEERING_WIDTH, Pace
+from .programme import FOREVER, STEERING_KINDS, STEERING_WIDTH, Pace, Wind
 from .record import TICK, SlowSensor
 from .reference import REFERENCES, target_of
 from .scenario import Scenario
-from .sensors import Noise, link_of, ticks
+from .sensors import HDOP_LAWS, Link, Noise, Sky, link_of, ticks
 from .switches import Switches
-from .vehicle import Vehicle
+from .tyres import FIALA, LINEAR
+from .vehicle import GRAVITY, Vehicle
 
 SPIN_ANGLE = 0.5  # rad of sideslip: the car has spun
 
@@ -24,7 +25,8 @@ SPIN_ANGLE = 0.5  # rad of sideslip: the car has spun
 class Template:
     """What a reset starts from.
 
-    params: (P.end,) packed parameters. low, high: (len(Draws),) ranges. switches: (6,) int64.
+    params: (P.end,) packed parameters. low, high: (len(Draws),) ranges. switches:
+    (len(Switches),) int64.
     vehicle, nominal: with the scenario's replacements. held_speed: m/s, where it is one number
     and held exactly. duration: ticks.
     """
@@ -60,6 +62,51 @@ def car_of(vehicle: Vehicle) -> Car:
         vehicle.motor_torque,
         vehicle.friction,
         vehicle.preview,
+        vehicle.roll_moment_arm,
+        vehicle.roll_inertia,
+        vehicle.roll_stiffness,
+        vehicle.roll_damping,
+        vehicle.gravity_height,
+        vehicle.antenna_ahead,
+        vehicle.antenna_left,
+    )
+
+
+def _pace_of(scenario: Scenario) -> Pace:
+    """The driver's work along the road; the speed itself is drawn."""
+    pace = Pace(0.0, 1.0, 0.0, 0.0, FOREVER, 2.0, 0.5)
+    if scenario.acceleration is not None:
+        return pace._replace(hold=0.0, acceleration=scenario.acceleration)
+    if scenario.speed_change:
+        start = ticks(scenario.change_start)
+        pace = pace._replace(
+            acceleration=scenario.speed_change / scenario.change_length,
+            start=start,
+            end=start + ticks(scenario.change_length),
+        )
+    return pace._replace(surge=scenario.surge, surge_rate=math.tau * scenario.surge_frequency)
+
+
+def _road_of(scenario: Scenario) -> Road:
+    """Curvature, bank and grade of the road."""
+    return Road(
+        scenario.curvature,
+        scenario.curve_start,
+        scenario.curve_ramp,
+        GRAVITY * math.sin(scenario.bank),
+        GRAVITY * math.sin(scenario.grade),
+    )
+
+
+def _sky_of(scenario: Scenario, link: Link) -> Sky:
+    """The satellites of a scenario, at the GPS's own period."""
+    keep = math.exp(-link.period * TICK / scenario.hdop_time)
+    return Sky(
+        math.log(scenario.hdop),
+        scenario.hdop_spread,
+        keep,
+        math.sqrt(1.0 - keep * keep),
+        HDOP_LAWS[scenario.hdop_law],
     )
 
 
@@ -78,26 +125,20 @@ def template_of(
         raise ValueError(f"unknown reference {reference!r}; known: {', '.join(REFERENCES)}")
     vehicle = vehicle.replace(**scenario.vehicle)
     nominal = nominal.replace(**scenario.nominal)
+    if scenario.roll:
+        vehicle.check_roll()
     keep = math.exp(-TICK / scenario.disturbance_time)
-    pace = Pace(
-        0.0,
-        1.0 if scenario.acceleration is None else 0.0,
-        scenario.acceleration or 0.0,
-        0.0,
-        FOREVER,
-        2.0,
-        0.5,
-    )
+    gps = link_of(slow.get("gps"), scenario.gps_outage)
     parts = (
         car_of(vehicle),
-        Road(scenario.curvature, scenario.curve_start, scenario.curve_ramp),
+        _road_of(scenario),
         lag_of(vehicle.motor_lag if scenario.lags else 0.0, TICK),
         lag_of(vehicle.steering_lag if scenario.lags else 0.0, TICK),
-        (0.0, 0.0, 0.0, 0.0),  # the wind is drawn
-        pace,
+        Wind(0.0, 0.0, 0.0, 0.0, scenario.wind_height),  # the rest is drawn
+        _pace_of(scenario),
         Noise()._replace(**scenario.noise),
         link_of(slow.get("camera"), scenario.camera_outage),
-        link_of(slow.get("gps"), scenario.gps_outage),
+        gps,
         target_of(nominal),
         Disturbance(
             scenario.disturbance_force,
@@ -116,6 +157,7 @@ def template_of(
             vehicle.steering_stop,
         ),
         (0.0,) * STEERING_WIDTH,
+        _sky_of(scenario, gps),
     )
     params = np.array([value for part in parts for value in part], dtype=np.float64)
     assert len(params) == P.end
@@ -127,6 +169,7 @@ def template_of(
         STEERING_KINDS.index(scenario.steering),
         int(all_samples),
         int(fail_bad),
+        int(scenario.roll),
     )
     packed = np.array(switches, dtype=np.int64)
     held = scenario.held_speed

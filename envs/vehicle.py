@@ -17,6 +17,7 @@ def _unit(unit: str, text: str, default: float | None = None) -> Any:
 
 
 _MAY_BE_ZERO = ("motor_lag", "steering_lag")
+_OF_ANY_SIGN = ("antenna_ahead", "antenna_left")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,7 +27,8 @@ class Vehicle:
     Cornering stiffness is per tyre, as in the papers (an axle has 2 C). Letters of the papers
     stand in the descriptions: `Vehicle.__dataclass_fields__[name].metadata` has text and unit.
 
-    Raises ValueError on a value that is not finite or not positive (lags may be zero).
+    Raises ValueError on a value that is not finite or not positive (lags may be zero, the
+    antenna's place may be negative).
     """
 
     name: str = "vehicle"
@@ -40,11 +42,6 @@ class Vehicle:
     rear_track: float = _unit("m", "d_r, between the rear wheels")
     wheel_radius: float = _unit("m", "r")
     gravity_height: float = _unit("m", "h, height of the centre of gravity")
-    sprung_mass: float = _unit("kg", "M_s", 300.0)
-    roll_arm: float = _unit("m", "h_s", 0.35)
-    roll_inertia: float = _unit("kg m2", "I_x", 60.0)
-    roll_stiffness: float = _unit("N m/rad", "K_x", 8000.0)
-    roll_damping: float = _unit("N m s/rad", "C_x", 324.0)
     motor_torque: float = _unit("N m", "T_max, limit of one motor")
     motor_lag: float = _unit("s", "time constant of the motors", 0.005)
     steering_lag: float = _unit("s", "time constant of the steering actuator", 0.03)
@@ -53,6 +50,13 @@ class Vehicle:
     steering_rate: float = _unit("rad/s", "how fast the added angle may change", 0.8)
     preview: float = _unit("m", "l_pre, the camera's preview distance", 5.135)
     friction: float = _unit("-", "mu, tyre to road (a scenario has its own)", 0.9)
+    sprung_mass: float = _unit("kg", "M_s, the part of the mass that rolls")
+    roll_arm: float = _unit("m", "h_s, centre of gravity above the roll axis")
+    roll_inertia: float = _unit("kg m2", "I_x, about the roll axis")
+    roll_stiffness: float = _unit("N m/rad", "K_x, of the suspension")
+    roll_damping: float = _unit("N m s/rad", "C_x, of the suspension")
+    antenna_ahead: float = _unit("m", "GPS antenna ahead of the centre of gravity", 0.0)
+    antenna_left: float = _unit("m", "GPS antenna left of the centre of gravity", 0.0)
 
     def __post_init__(self) -> None:
         for entry in dataclasses.fields(self):
@@ -61,13 +65,14 @@ class Vehicle:
             value = getattr(self, entry.name)
             if not isinstance(value, int | float) or isinstance(value, bool):
                 raise TypeError(f"Vehicle.{entry.name}: expected a number, got {value!r}")
-            low_ok = value >= 0.0 if entry.name in _MAY_BE_ZERO else value > 0.0
+            least, low_ok = "positive and ", value > 0.0
+            if entry.name in _MAY_BE_ZERO:
+                least, low_ok = "zero or more and ", value >= 0.0
+            elif entry.name in _OF_ANY_SIGN:
+                least, low_ok = "", True
             if not (math.isfinite(value) and low_ok):
-                least = "zero or more" if entry.name in _MAY_BE_ZERO else "positive"
                 unit = entry.metadata["unit"]
-                raise ValueError(
-                    f"Vehicle.{entry.name}: {value!r} {unit} is not {least} and finite"
-                )
+                raise ValueError(f"Vehicle.{entry.name}: {value!r} {unit} is not {least}finite")
 
     def replace(self, **changes: Any) -> "Vehicle":
         """A copy with some parameters changed; TypeError on an unknown name."""
@@ -84,6 +89,27 @@ class Vehicle:
     def wheelbase(self) -> float:
         """l = l_f + l_r in m."""
         return self.front_arm + self.rear_arm
+
+    @property
+    def roll_moment_arm(self) -> float:
+        """M_s h_s in kg m: the roll moment of 1 m/s2."""
+        return self.sprung_mass * self.roll_arm
+
+    def check_roll(self) -> None:
+        """ValueError where this body would roll over, or its inertia is none, on its suspension."""
+        least = self.roll_moment_arm * GRAVITY
+        if self.roll_stiffness <= least:
+            raise ValueError(
+                f"Vehicle.roll_stiffness: {self.roll_stiffness!r} N m/rad does not hold the body "
+                f"upright; its weight takes M_s g h_s = {least:.6g}"
+            )
+        least = self.roll_moment_arm**2 / self.mass
+        if self.roll_inertia <= least:
+            raise ValueError(
+                f"Vehicle.roll_inertia: {self.roll_inertia!r} kg m2 about the roll axis; a sprung "
+                f"mass of {self.sprung_mass!r} kg at {self.roll_arm!r} m on a car of "
+                f"{self.mass!r} kg has more than {least:.6g}"
+            )
 
     @property
     def yaw_moment_limit(self) -> float:
@@ -104,7 +130,7 @@ def critical_speed(vehicle: Vehicle) -> float:
     return math.sqrt(product / (vehicle.mass * excess))
 
 
-COMS = Vehicle(  # Table I of tie-vision; front track and height of the centre are assumed
+COMS = Vehicle(  # Table I of tie-vision; front track, height of the centre and roll are assumed
     name="coms",
     mass=380.0,
     yaw_inertia=136.08,
@@ -117,6 +143,11 @@ COMS = Vehicle(  # Table I of tie-vision; front track and height of the centre a
     wheel_radius=0.22,
     gravity_height=0.45,
     motor_torque=100.0,
+    sprung_mass=300.0,
+    roll_arm=0.35,
+    roll_inertia=60.0,
+    roll_stiffness=8000.0,
+    roll_damping=324.0,
 )
 
 PASSENGER_CAR = Vehicle(  # a compact electric car with two 700 N m in-wheel motors
@@ -133,6 +164,11 @@ PASSENGER_CAR = Vehicle(  # a compact electric car with two 700 N m in-wheel mot
     gravity_height=0.55,
     motor_torque=700.0,
     preview=12.0,
+    sprung_mass=1300.0,
+    roll_arm=0.45,
+    roll_inertia=760.0,
+    roll_stiffness=90000.0,  # 3.9 degrees of roll at 1 g
+    roll_damping=4000.0,  # a quarter of the critical damping
 )
 
 VEHICLES: dict[str, Vehicle] = {"coms": COMS, "passenger-car": PASSENGER_CAR}

@@ -28,6 +28,9 @@ LINEAR: dict[str, Any] = {
     "small_angle": True,
     "linear_tyres": True,
     "lags": False,
+    "roll": False,
+    "hdop": 1.0,
+    "hdop_spread": 0.0,
     "noise": SILENT,
 }
 """The papers' plant: nothing drawn, nothing disturbed, sensors without noise."""

@@ -95,14 +95,15 @@ def test_old_versions_are_pruned_but_not_in_a_folder_of_the_users_own(
         monkeypatch.delenv(variable, raising=False)
         base = tmp_path / variable
         kernels = base / "sideslip" / "kernels" if variable == "XDG_CACHE_HOME" else base
-        for age in range(6):
+        for age in range(backend._KEPT_CACHES + 3):
             old = kernels / f"version-{age}"
             old.mkdir(parents=True)
             os.utime(old, (1e9 - age, 1e9 - age))
         monkeypatch.setenv(variable, str(base))
         assert backend._cache_folder() == str(kernels / backend.source_stamp())
         left = {path.name for path in kernels.iterdir()} - {backend.source_stamp()}
-        kept = 3 if variable == "XDG_CACHE_HOME" else 6
+        # our own newest folder is one of those kept
+        kept = backend._KEPT_CACHES + (-1 if variable == "XDG_CACHE_HOME" else 3)
         assert left == {f"version-{age}" for age in range(kept)}
 
 

@@ -16,10 +16,12 @@ from sideslip.envs import (
     programme,
     restart,
     stability,
+    tyres,
 )
 from sideslip.envs.backend import ARRAYS, plain
-from sideslip.envs.dynamics import Inputs, Motion, Push, Road
+from sideslip.envs.dynamics import Motion, Push, Road
 from sideslip.envs.template import car_of
+from sideslip.envs.tyres import Inputs
 
 from .helpers import FULL, IDS, LINEAR, bits, play, unwrapped
 
@@ -28,9 +30,9 @@ pytestmark = pytest.mark.plain
 RNG = np.random.default_rng(7)
 N = 60
 CARS = {"coms": car_of(COMS), "passenger-car": car_of(PASSENGER_CAR)}
-ROAD, PUSH = Road(0.01, -5.0, 20.0), Push(50.0, -20.0)
-PLANTS = [(0, 0), (0, 1), (1, 0), (1, 1)]
-SPREAD = np.array([9.0, 2.0, 1.0, 2.0, 50.0, 50.0, 20.0, 3.0, 2.0])
+ROAD, PUSH = Road(0.01, -5.0, 20.0, 0.5, -0.3), Push(50.0, -20.0, 30.0)
+PLANTS = [(a, law, roll) for a in (0, 1) for law in (0, 1) for roll in (0, 1)]
+SPREAD = np.array([9.0, 2.0, 1.0, 2.0, 50.0, 50.0, 20.0, 3.0, 2.0, 0.3, 1.0])
 
 
 def motions() -> list[Motion]:
@@ -65,19 +67,19 @@ def agree(function: Any, lists: list[list[Any]], call: Callable[..., Any]) -> li
 
 
 @pytest.mark.parametrize("car", CARS)
-@pytest.mark.parametrize(("small_angle", "law"), PLANTS)
-def test_plant(car: str, small_angle: int, law: int) -> None:
+@pytest.mark.parametrize(("small_angle", "law", "roll"), PLANTS)
+def test_plant(car: str, small_angle: int, law: int, roll: int) -> None:
     def load_of(function: Any, inputs: Any) -> Any:
         return function(inputs, CARS[car], small_angle)
 
     def derivative(function: Any, motion: Any, load: Any, frame: Any) -> Any:
-        return function(motion, load, PUSH, CARS[car], ROAD, frame, small_angle, law)
+        return function(motion, load, PUSH, CARS[car], ROAD, frame, small_angle, law, roll)
 
     def rk4(function: Any, motion: Any, a: Any, b: Any, c: Any) -> Any:
-        return function(motion, (a, b, c), PUSH, CARS[car], ROAD, 1e-3, small_angle, law)
+        return function(motion, (a, b, c), PUSH, CARS[car], ROAD, 1e-3, small_angle, law, roll)
 
     state = motions()
-    load = agree(dynamics.load_of, [inputs()], load_of)
+    load = agree(tyres.load_of, [inputs()], load_of)
     frames = agree(dynamics.frame_of, [state], lambda function, motion: function(motion))
     agree(dynamics.derivative, [state, load, frames], derivative)
     agree(dynamics.rk4, [state, load, load[1:] + load[:1], load[2:] + load[:2]], rk4)
@@ -105,7 +107,7 @@ def test_noise(name: str) -> None:
     agree(getattr(noise, name), words, lambda f, *counter: f(*counter))
 
 
-@pytest.mark.parametrize("name", ["sin_kernel", "cos_kernel", "sincos", "atan", "wrap"])
+@pytest.mark.parametrize("name", ["sin_kernel", "cos_kernel", "sincos", "atan", "exp", "wrap"])
 def test_elementary(name: str) -> None:
     x = (RNG.normal(size=300) * 10.0).tolist()
     agree(getattr(elementary, name), [x], lambda f, value: f(value))
@@ -115,6 +117,9 @@ EPISODES: list[dict[str, Any]] = [
     {},
     {"scenario": "slalom", "fast": "all", "reference": "limited"},
     {"scenario": "dakf-fig6", "reference": "model"},
+    {"scenario": "double-layer-fig9", "control_period": 33},
+    {"scenario": {"base": "slalom", "bank": 0.1, "grade": -0.05, "curve_start": -50.0}},
+    {"scenario": "tie-vision-fig9", "vehicle": {"base": "coms", "antenna_ahead": 0.4}},
     {"scenario": LINEAR | {"curvature": 0.02, "curve_start": 0.0, "curve_ramp": 1.0}},
     {"scenario": FULL | {"acceleration": 1.0, "speed": 0.0}, "control_period": 33},
     {"vehicle": {"base": "passenger-car", "motor_lag": 0.0}, "scenario": "step-steer"},

@@ -9,20 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sideslip.envs import COMS, PASSENGER_CAR
-from sideslip.envs.dynamics import (
-    FIALA,
-    LINEAR,
-    Car,
-    Inputs,
-    Motion,
-    Push,
-    Road,
-    derivative,
-    frame_of,
-    load_of,
-    rk4,
-)
+from sideslip.envs.dynamics import Car, Motion, Push, Road, derivative, frame_of, rk4
 from sideslip.envs.template import car_of
+from sideslip.envs.tyres import FIALA, LINEAR, Inputs, load_of
 
 pytestmark = pytest.mark.plain
 

@@ -6,19 +6,10 @@ import numpy as np
 import pytest
 
 from sideslip.envs import COMS, StabilityEnv, Vehicle
-from sideslip.envs.dynamics import (
-    LINEAR,
-    Inputs,
-    Motion,
-    Push,
-    Road,
-    derivative,
-    frame_of,
-    load_of,
-    rk4,
-)
+from sideslip.envs.dynamics import Motion, Push, Road, derivative, frame_of, rk4
 from sideslip.envs.linear import bicycle
 from sideslip.envs.template import car_of
+from sideslip.envs.tyres import LINEAR, Inputs, load_of
 
 from . import helpers
 

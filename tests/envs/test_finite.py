@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sideslip.envs import FAILURES, SCENARIOS, StabilityEnv
+from sideslip.envs import FAILURES, SCENARIOS, StabilityEnv, vehicle_from
 from sideslip.envs.layout import P, Task
 
 from .helpers import FULL, Moment, fast_rows, play
@@ -30,12 +30,12 @@ def without_limits(env: StabilityEnv) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("name", SCENARIOS)
-@pytest.mark.parametrize("sensors", ["vision", "gps"])
+@pytest.mark.parametrize("sensors", ["vision", "fusion"])
 def test_every_scenario_under_hard_switching(name: str, sensors: str) -> None:
     env = StabilityEnv(sensors, scenario=name, control_period=100, reference="limited")
     for seed in range(3):
         start = env.reset(seed=seed)
-        moments = play(env, np.random.default_rng(seed).choice([-1.0, 1.0], 200))
+        moments = play(env, np.random.default_rng(seed).choice([-1.0, 1.0], 300))
         assert_finite(env, start, moments)
         assert np.all(np.isfinite(fast_rows(moments)))
         assert moments[-1].terminated or moments[-1].truncated
@@ -45,7 +45,7 @@ def test_every_scenario_under_hard_switching(name: str, sensors: str) -> None:
 def test_every_scenario_from_standstill_on_ice(name: str) -> None:
     env = StabilityEnv("gps", scenario=name, control_period=100, reference="model")
     start = env.reset(seed=0, options={"state": {"v_x": 0.0}, "friction": 1e-9})
-    moments = play(env, [1.0] * 100)
+    moments = play(env, [1.0] * 300)
     assert_finite(env, start, moments)
     assert np.all(np.isfinite(fast_rows(moments)))
 
@@ -65,6 +65,11 @@ TYPICAL = {
     "wheel_radius": 0.3,
     "rear_track": 1.0,
     "motor_torque": 100.0,
+    "sprung_mass": 300.0,
+    "roll_arm": 0.3,
+    "roll_inertia": 100.0,
+    "roll_stiffness": 10000.0,
+    "roll_damping": 300.0,
 }
 
 
@@ -74,14 +79,23 @@ TYPICAL = {
     state=st.fixed_dictionaries(
         {name: st.floats(-50.0, 50.0) for name in ("v_x", "v_y", "gamma", "psi", "theta", "s")}
     ),
-    plant=st.tuples(st.booleans(), st.booleans(), st.booleans()),
+    plant=st.tuples(st.booleans(), st.booleans(), st.booleans(), st.booleans()),
+    slope=st.tuples(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5)),
     kappa=st.floats(-1.0, 1.0),
 )
 def test_vehicles_that_nobody_builds(
-    vehicle: dict[str, float], state: dict[str, float], plant: tuple[bool, ...], kappa: float
+    vehicle: dict[str, float],
+    state: dict[str, float],
+    plant: tuple[bool, ...],
+    slope: tuple[float, float],
+    kappa: float,
 ) -> None:
     """Also where 1 ms is far too long a step for the integrator."""
-    small_angle, linear_tyres, lags = plant
+    small_angle, linear_tyres, lags, roll = plant
+    try:
+        vehicle_from({"base": "coms", **vehicle}).check_roll()
+    except ValueError:
+        roll = False
     scenario = FULL | {
         "steering": "sine",
         "amplitude": 1.0,
@@ -90,6 +104,9 @@ def test_vehicles_that_nobody_builds(
         "small_angle": small_angle,
         "linear_tyres": linear_tyres,
         "lags": lags,
+        "roll": roll,
+        "bank": slope[0],
+        "grade": slope[1],
         "disturbance_force": 50.0,
     }
     env = StabilityEnv("gps", scenario=scenario, reference="model", gps={"period": 0.01})

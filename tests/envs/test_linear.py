@@ -9,21 +9,20 @@ import pytest
 from scipy.signal import cont2discrete
 
 from sideslip.envs import COMS, PASSENGER_CAR, Vehicle, critical_speed
-from sideslip.envs.dynamics import (
-    LINEAR,
-    Inputs,
-    Motion,
-    Push,
-    Road,
-    derivative,
-    frame_of,
-    load_of,
-    sideslip_angle,
+from sideslip.envs.dynamics import Motion, Push, Road, derivative, frame_of
+from sideslip.envs.linear import (
+    LinearModel,
+    bicycle,
+    course,
+    kinematic,
+    roll,
+    velocity_and_roll,
+    vision,
 )
-from sideslip.envs.linear import LinearModel, bicycle, course, vision
 from sideslip.envs.reference import target_of
 from sideslip.envs.sensors import Noise, camera_sample, gps_sample
 from sideslip.envs.template import car_of
+from sideslip.envs.tyres import LINEAR, Inputs, load_of
 
 pytestmark = pytest.mark.plain
 
@@ -62,8 +61,7 @@ def seen(
     dpsi = rate.psi - rate.theta
     dx = [dbeta, rate.gamma, dpsi, rate.y + l_pre * dpsi]
     psi_seen, y_seen = camera_sample(state, road, l_pre, SILENT, (0.0, 0.0))
-    angle = sideslip_angle(v_x, v_y, small_angle)
-    course_seen = gps_sample(state, angle, SILENT, (0.0, 0.0, 0.0, 0.0))[0]
+    course_seen = gps_sample(state, 0.0, 0.0, 1.0, 0.0, SILENT, (0.0,) * 4, small_angle)[0]
     outputs = {"gamma": gamma, "psi": psi_seen, "y_l": y_seen, "course": course_seen}
     names = MODELS[model](vehicle, v).outputs
     return np.array(dx[: len(x)]), np.array([outputs[name] for name in names])
@@ -193,3 +191,58 @@ def test_a_speed_that_is_not_positive_is_refused(v: float) -> None:
     for build in MODELS.values():
         with pytest.raises(ValueError, match="positive speed, got"):
             build(COMS, v)
+
+
+def second_layer(x: Any, u: Any, gamma: float, vehicle: Vehicle) -> Any:
+    """(dx/dt, a_x, a_y) of the plant: x = v_x, v_y, phi, phi_dot; u = drive and side force in N."""
+    car = car_of(vehicle)
+    state = Motion(x[0], x[1], gamma, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, x[2], x[3])
+    T = 0.5 * car.r * u[0]
+    load = load_of(Inputs(0.0, T, T), car, 1)
+    road, push = Road(0.0, 0.0, 1.0), Push(u[1], 0.0)
+    rate = derivative(state, load, push, car, road, frame_of(state), 1, LINEAR, 1)
+    a_x = rate.v_x - gamma * x[1]  # double-layer-gps (4)
+    a_y = rate.v_y + gamma * x[0] + 9.81 * x[2]  # (5)
+    return np.array([rate.v_x, rate.v_y, rate.phi, rate.phi_dot, a_x, a_y])
+
+
+@pytest.mark.parametrize("vehicle", VEHICLES, ids=lambda each: each.name)
+@pytest.mark.parametrize("gamma", [0.0, 0.3, -0.7])
+def test_the_second_layers_matrices_are_the_plants_jacobian(gamma: float, vehicle: Vehicle) -> None:
+    """The plant's rates change by A dx + B da, where a is what its accelerometers then measure.
+
+    The small-angle plant is linear in these but for the tyres' v_y / v_x, which acts through a_y.
+    """
+    model = velocity_and_roll(vehicle, gamma)
+    x, u = np.array([8.0, 0.2, 0.03, 0.1]), np.array([100.0, 200.0])
+    start = second_layer(x, u, gamma, vehicle)
+    for j in range(6):
+        step = np.zeros(6)
+        step[j] = [0.5, 0.1, 0.02, 0.2, 50.0, 80.0][j]
+        moved = second_layer(x + step[:4], u + step[4:], gamma, vehicle) - start
+        expected = model.A @ step[:4] + model.B @ moved[4:]
+        np.testing.assert_allclose(moved[:4], expected, rtol=0.0, atol=1e-11)  # rates up to 100
+    body, plane = roll(vehicle), kinematic(gamma)
+    np.testing.assert_array_equal(model.A[2:, 2:], body.A)
+    np.testing.assert_array_equal(model.A[:2, :2], plane.A)
+    np.testing.assert_array_equal(model.B[2:, 1:], body.B)
+    assert model.states == (*plane.states, *body.states)
+    for each in (model, body, plane):
+        assert each.C.shape == (len(each.outputs), len(each.states))
+        assert each.B.shape == (len(each.states), len(each.inputs))
+        names = [each.states[int(np.argmax(row))] for row in each.C]
+        assert tuple(names) == each.outputs
+        G, H = each.discrete(0.001)
+        for exact, first in ((G - np.eye(len(G)), 0.001 * each.A), (H, 0.001 * each.B)):
+            assert np.abs(exact - first).max() <= 2e-2 * np.abs(first).max()
+
+
+def test_slip_cannot_be_seen_from_the_wheels_alone_at_zero_yaw_rate() -> None:
+    """double-layer-gps, 5.2: the kinematic observer is blind there, the second layer is not."""
+
+    def rank(model: LinearModel) -> int:
+        powers = [np.linalg.matrix_power(model.A, k) for k in range(len(model.A))]
+        return int(np.linalg.matrix_rank(np.vstack([model.C @ power for power in powers])))
+
+    assert (rank(kinematic(0.0)), rank(kinematic(0.1))) == (1, 2)
+    assert rank(velocity_and_roll(COMS, 0.0)) == 4

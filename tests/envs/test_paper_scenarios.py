@@ -1,5 +1,6 @@
-"""The papers' simulations by name, exactly as PAPERS section 1 gives them."""
+"""The papers' simulations by name, exactly as PAPERS section 1 gives them, and the road tests."""
 
+import hashlib
 import math
 from typing import Any
 
@@ -8,13 +9,23 @@ import pytest
 
 from sideslip.envs import COMS, SCENARIOS, StabilityEnv
 from sideslip.envs.layout import P
+from sideslip.envs.paper_simulations import ROAD_TESTS, SIMULATIONS
+from sideslip.envs.record import PACKET
 
 pytestmark = pytest.mark.plain
 
-PAPERS = [name for name, scenario in SCENARIOS.items() if not scenario.scored]
+OURS = [scenario.name for scenario in SIMULATIONS]
+TWINS = [scenario.name for scenario in ROAD_TESTS]
 TYRES = ("front_stiffness", "rear_stiffness")
+ROLL = ("roll_inertia", "roll_damping", "roll_stiffness")  # double-layer-gps (43)
 SINE = {"steering": "sine", "amplitude": 0.1, "frequency": 0.5, "onset": 0.0, "duration": 10.0}
 ONE_PERIOD = {"steering": "lane-change", "amplitude": 0.13, "frequency": 0.5, "onset": 0.5}
+WIND = {"wind_force": 200.0, "wind_arm": 0.2, "wind_start": 4.0, "wind_length": 4.0}
+BLOWN = {"wind_force": 200.0, "wind_height": 0.5, "wind_start": 8.0, "wind_length": 6.0}
+DOUBLE = {
+    **{"steering": "slalom", "amplitude": 0.15, "frequency": 0.2, "onset": 1.0, "duration": 20.0},
+    **{"surge": 0.5, "surge_frequency": 0.1, "roll": True},
+}
 # PAPERS section 1: fields, real tyres, nominal tyres, OU, noise
 TABLE: dict[str, tuple[dict[str, Any], float, float, bool, dict[str, float]]] = {
     "tie-vision-fig7": (SINE, 7200.0, 6000.0, True, {}),
@@ -49,7 +60,7 @@ TABLE: dict[str, tuple[dict[str, Any], float, float, bool, dict[str, float]]] = 
     "dakf-fig6": (
         {
             **{"steering": "lane-change", "amplitude": 0.2, "frequency": 0.2, "onset": 0.5},
-            **{"wind_force": 200.0, "wind_arm": 0.2, "wind_start": 4.0, "wind_length": 4.0},
+            **WIND,
             **{"gps_outage": (4.0, 6.0), "duration": 10.0},
         },
         7000.0,
@@ -57,11 +68,44 @@ TABLE: dict[str, tuple[dict[str, Any], float, float, bool, dict[str, float]]] = 
         True,
         {},
     ),
+    "dakf-fig7": (
+        {
+            **{"steering": "step", "amplitude": 0.06, "onset": 1.0, "duration": 10.0},
+            **WIND,
+            **{"gps_outage": None, "lags": True},
+        },
+        7000.0,
+        10000.0,
+        True,
+        {},
+    ),
+    "dual-rate-fig4": (
+        {
+            **{"steering": "slalom", "amplitude": 0.1, "frequency": 0.25, "onset": 1.0},
+            **WIND,
+            **{"wind_arm": 0.0, "gps_period": 0.1, "duration": 12.0},
+        },
+        7000.0,
+        9100.0,
+        True,
+        {},
+    ),
+    "double-layer-fig9": (DOUBLE | BLOWN, 7000.0, 10000.0, True, {}),
+    "double-layer-fig9-fast": (DOUBLE | BLOWN | {"frequency": 0.4}, 7000.0, 10000.0, True, {}),
+    "double-layer-fig9-periods": (
+        DOUBLE | BLOWN | {"steering": "double-lane-change", "hold": 9.0},
+        7000.0,
+        10000.0,
+        True,
+        {},
+    ),
+    "double-layer-fig9-calm": (DOUBLE, 7000.0, 10000.0, True, {}),
 }
 
 
 def test_every_paper_simulation_stands_in_the_table() -> None:
-    assert set(TABLE) == set(PAPERS)
+    assert set(TABLE) == set(OURS)
+    assert {name for name, each in SCENARIOS.items() if not each.scored} == {*OURS, *TWINS}
 
 
 @pytest.mark.smoke
@@ -71,8 +115,12 @@ def test_papers_simulations_are_as_PAPERS_gives_them(name: str) -> None:
     scenario = SCENARIOS[name]
     for field, value in fields.items():
         assert getattr(scenario, field) == value, field
-    assert scenario.held_speed == 25.0 / 3.6
-    assert (scenario.small_angle, scenario.linear_tyres, scenario.lags) == (True, True, False)
+    rolls = "double-layer" in name
+    assert scenario.speed == 25.0 / 3.6
+    assert scenario.held_speed == (None if rolls else 25.0 / 3.6)
+    assert (scenario.small_angle, scenario.linear_tyres, scenario.roll) == (True, True, rolls)
+    assert scenario.lags == fields.get("lags", False)
+    assert (scenario.hdop, scenario.hdop_spread, scenario.hdop_law) == (1.0, 0.0, "constant")
     assert (scenario.disturbance_force, scenario.disturbance_moment, scenario.disturbance_time) == (
         (50.0, 20.0, 0.3) if disturbed else (0.0, 0.0, 0.3)
     )
@@ -80,12 +128,18 @@ def test_papers_simulations_are_as_PAPERS_gives_them(name: str) -> None:
     assert scenario.wind_force == fields.get("wind_force", 0.0)
     low, high = scenario.draws()
     np.testing.assert_array_equal(low, high)  # nothing is drawn
-    env = StabilityEnv("gps" if "dakf" in name else "vision", scenario=name)
+    env = StabilityEnv("fusion", scenario=name)
     for seed in (0, 1):
         env.reset(seed=seed)
         assert [getattr(env.vehicle, tyre) for tyre in TYRES] == [real, real]
         assert [getattr(env.nominal, tyre) for tyre in TYRES] == [told, told]
-        assert env.vehicle.replace(front_stiffness=6000.0, rear_stiffness=6000.0) == COMS
+        rest = {"front_stiffness": 6000.0, "rear_stiffness": 6000.0}
+        if name == "dakf-fig7":  # the EPS lags, the motors do not
+            assert (env.vehicle.motor_lag, env.vehicle.steering_lag) == (0.0, 0.03)
+            rest["motor_lag"] = COMS.motor_lag
+        assert env.vehicle.replace(**rest) == COMS
+        soft = {each: 1.3 * getattr(COMS, each) for each in ROLL} if rolls else {}
+        assert env.nominal == COMS.replace(front_stiffness=told, rear_stiffness=told, **soft)
         assert env.redraws == 0
 
 
@@ -96,3 +150,106 @@ def test_ou_disturbance_has_the_stated_size_and_time() -> None:
     assert (force, moment) == (50.0, 20.0)
     assert keep == math.exp(-0.001 / 0.3)
     assert fresh**2 + keep**2 == pytest.approx(1.0, abs=1e-15)  # stationary
+
+
+RECORDED = {
+    "tie-vision-fig7": "acd4f2183b6383fa",
+    "tie-vision-fig8": "df011ba2759eb14d",
+    "tie-vision-fig8-stiff": "0cf689b119f7798c",
+    "uneven-delay-fig5": "db52d5035f7fbb05",
+    "uneven-delay-fig5-noisy": "2c1e59cc529db2e3",
+    "dakf-fig6": "13113a923dfb1d54",
+}
+"""SHA-256 of the records and true angles of whole drives, taken before the body could roll."""
+
+
+@pytest.mark.parametrize("name", RECORDED)
+def test_simulations_without_roll_give_the_bits_they_always_gave(name: str) -> None:
+    env = StabilityEnv("gps" if "dakf" in name else "vision", scenario=name)
+    env.reset(seed=3)
+    digest, over, k = hashlib.sha256(), False, 0
+    while not over:
+        action = np.array([0.3 * np.sin(0.1 * k)], np.float32)
+        _, _, failed, ended, info = env.step(action)
+        record, over, k = env.record, failed or ended, k + 1
+        digest.update(record.fast.tobytes())
+        digest.update(record.packets.tobytes())
+        digest.update(np.array([info["beta"], info["psi"]]).tobytes())
+    assert digest.hexdigest()[:16] == RECORDED[name]
+
+
+def uncontrolled(name: str, seed: int = 0) -> tuple[StabilityEnv, Any, Any]:
+    """(env at the end, times and true motions with beta at each step, packets)."""
+    env = StabilityEnv("fusion", scenario=name)
+    env.reset(seed=seed)
+    over, seen, packets = False, [], []
+    while not over:
+        _, _, failed, over, info = env.step(np.zeros(1, np.float32))
+        assert not failed
+        seen.append((info["t"], info["beta"], *env.motion))
+        packets.append(env.record.packets)
+    return env, np.array(seen), np.concatenate(packets)
+
+
+@pytest.mark.parametrize("name", TWINS)
+def test_twins_of_road_tests_drive_the_whole_plant(name: str) -> None:
+    scenario = SCENARIOS[name]
+    assert not (scenario.small_angle or scenario.linear_tyres or scenario.scored)
+    assert scenario.lags
+    assert scenario.roll
+    assert scenario.hdop_law == "half"
+    low, high = scenario.draws()
+    np.testing.assert_array_equal(low, high)
+    _, seen, _ = uncontrolled(name)
+    assert seen[-1, 0] == scenario.duration
+    assert np.abs(seen[:, 1]).max() > 0.01  # the slip is worth an estimate
+    assert np.abs(seen[:, 11]).max() > 0.01  # the body rolls
+
+
+@pytest.mark.parametrize("name", ["tie-vision-fig9", "uneven-delay-fig7"])
+def test_the_driver_goes_from_standstill_to_30_kmh(name: str) -> None:
+    v_x = uncontrolled(name)[1][:, 2] * 3.6
+    assert abs(v_x[50]) < 1e-3  # the side force of 50 N hardly rolls a standing car
+    assert v_x[-1] == pytest.approx(30.0, abs=0.2)  # the turns brake it a little
+    assert np.diff(v_x[150:2000]).min() > 0.0
+
+
+def test_the_steering_motors_lane_change_has_a_slip_of_almost_3_hundredths() -> None:
+    peaks = [np.abs(uncontrolled("tie-vision-fig10", seed)[1][:, 1]).max() for seed in range(9)]
+    assert np.median(peaks) == pytest.approx(0.03, abs=0.002)
+
+
+def test_image_processing_takes_9_to_18_ms() -> None:
+    packets = uncontrolled("uneven-delay-fig7")[2]
+    camera = packets[packets[:, PACKET.sensor] == 0.0]
+    late = camera[:, PACKET.arrived] - camera[:, PACKET.captured]
+    assert set(late.tolist()) == set(range(9, 19))
+
+
+def test_the_course_is_unused_from_10_5_to_13_s() -> None:
+    _, seen, packets = uncontrolled("dakf-fig8")
+    gps = packets[packets[:, PACKET.sensor] == 1.0, PACKET.captured] * 0.001
+    assert not np.any((gps >= 10.5) & (gps < 13.0))
+    assert {10.4, 13.0} <= set(gps.round(3))
+    assert seen[:, 2].mean() * 3.6 == pytest.approx(20.0, abs=0.2)
+    during = (seen[:, 0] > 10.5) & (seen[:, 0] < 13.0)
+    assert np.abs(seen[during, 1]).max() == np.abs(seen[:, 1]).max()  # the lane change
+
+
+@pytest.mark.parametrize("name", ["dual-rate-fig4", "dual-rate-fig5"])
+def test_course_comes_at_10_hz(name: str) -> None:
+    env, _, packets = uncontrolled(name)
+    gps = packets[packets[:, PACKET.sensor] == 1.0]
+    assert set(np.diff(gps[:, PACKET.captured])) == {100.0}
+    assert env.slow_sensors["gps"].period == 0.1
+
+
+def test_the_driver_of_the_double_layer_simulation_surges() -> None:
+    _, seen, _ = uncontrolled("double-layer-fig9-calm")
+    rate = math.tau * 0.1
+    wanted = 25.0 / 3.6 + 0.5 / rate * (1.0 - np.cos(rate * seen[:, 0]))
+    # PI of 2 / s against the turns' gamma v_y
+    turning = np.abs(seen[:, 4] * seen[:, 3]).max()
+    assert np.abs(seen[:, 2] - wanted).max() < turning / 2.0 < 0.5
+    lean = seen[:, 11]
+    assert 0.05 < np.abs(lean).max() < 0.2

@@ -65,6 +65,9 @@ def test_each_kind_is_what_its_name_says() -> None:
     expected = {
         "straight": 0.0 * t,
         "sine": 0.1 * one,
+        # hold: 1.5 s from one to the next
+        "double-lane-change": np.where(t < 0.5 + 2.5, 0.1 * one, 0.0)
+        - np.where(t < 2.0 + 2.5, 0.1 * sine(2.0, 0.4, t), 0.0),
         "lane-change": np.where(t < 0.5 + 2.5, 0.1 * one, 0.0),
         # half a wave of half the size, then the sine with the opposite sign
         "slalom": np.where(t < 0.5 + 1.25, 0.05 * one, -0.1 * sine(1.75, 0.4, t)),
@@ -130,10 +133,11 @@ def test_draws_are_stable_up_to_the_critical_speed_less_5_percent(
         assert not stable(drawn._replace(speed=limit * (1.0 + 1e-12)), car)
 
 
-def test_wind_blows_from_its_start_up_to_its_end_at_its_arm() -> None:
-    wind = Wind(200.0, 0.2, 4000.0, 8000.0)
+def test_wind_blows_from_its_start_up_to_its_end_at_its_arm_and_height() -> None:
+    wind = Wind(200.0, 0.2, 4000.0, 8000.0, 0.5)
     for tick, force in ((3999.0, 0.0), (4000.0, 200.0), (7999.0, 200.0), (8000.0, 0.0)):
-        assert wind_at(tick, wind) == (force, pytest.approx(0.2 * force, rel=1e-15))
+        # to the left and above the roll axis: it rolls the body to the left, which is negative
+        assert wind_at(tick, wind) == (force, pytest.approx(0.2 * force, rel=1e-15), -0.5 * force)
 
 
 def pace(**changes: float) -> Pace:
@@ -186,3 +190,16 @@ def test_a_car_driven_backwards_is_no_spun_one_and_stays_finite() -> None:
     assert not moments[-1].terminated
     assert FAILURES[moments[-1].info["failure"]] == "none"
     assert abs(moments[-1].info["beta"]) > 3.0
+
+
+def test_a_speed_that_changes_is_followed_with_its_acceleration_fed_forward() -> None:
+    ramp = pace(acceleration=0.5, start=1000.0, end=3000.0)
+    for tick, speed, a_x in ((0.0, 7.0, 0.0), (2000.0, 7.5, 0.5), (9000.0, 8.0, 0.0)):
+        assert acceleration_command(tick, speed, 0.0, ramp, 2.0) == (a_x, 0.0)
+    sway = pace(surge=0.5, surge_rate=2.0)
+    for tick in (0.0, 400.0, 1500.0):
+        t = tick * TICK
+        speed = 7.0 + 0.5 / 2.0 * (1.0 - math.cos(2.0 * t))
+        a_x, integral = acceleration_command(tick, speed, 0.0, sway, 2.0)
+        assert a_x == pytest.approx(0.5 * math.sin(2.0 * t), abs=1e-14)
+        assert integral == pytest.approx(0.0, abs=1e-17)

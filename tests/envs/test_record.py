@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from sideslip.envs import COMS, Log, Record, SlowSensor, StabilityEnv
-from sideslip.envs.dynamics import LINEAR as LINEAR_TYRES
-from sideslip.envs.dynamics import Inputs, Motion, Push, Road, load_of, rk4
+from sideslip.envs.dynamics import Motion, Push, Road, rk4
 from sideslip.envs.layout import Z
 from sideslip.envs.record import (
     FAST,
@@ -22,6 +21,8 @@ from sideslip.envs.record import (
     concatenate,
 )
 from sideslip.envs.template import car_of
+from sideslip.envs.tyres import LINEAR as LINEAR_TYRES
+from sideslip.envs.tyres import Inputs, load_of
 
 from .helpers import IDS, LINEAR, bits, play, unwrapped
 

@@ -10,7 +10,14 @@ from scipy import stats
 from sideslip.envs import COMS, StabilityEnv
 from sideslip.envs.dynamics import Motion, Road
 from sideslip.envs.record import FAST, PACKET
-from sideslip.envs.sensors import Noise, camera_sample, gps_sample
+from sideslip.envs.sensors import (
+    HDOP_LAWS,
+    OUTAGE_JUMP,
+    Noise,
+    camera_sample,
+    gps_sample,
+    satellites_at,
+)
 
 from .helpers import FULL, LINEAR, SILENT, fast_rows, packets, play
 
@@ -57,7 +64,7 @@ def test_camera_and_gps_hold_the_state_at_their_capture() -> None:
         for packet in found:
             info = infos[int(packet[PACKET.captured])]
             assert packet[PACKET.value] == pytest.approx(info["psi"], abs=1e-15)  # wrapping
-            assert packet[PACKET.value + 2 :].tolist() == [0.0, 0.0]
+            assert packet[PACKET.value + 2 :].tolist() == [0.0] * 4
         infos, fast, found = drive("gps", ticks=500, scenario=scenario)
         for packet in found:
             tick = int(packet[PACKET.captured])
@@ -91,17 +98,70 @@ def test_y_l_is_where_the_road_is_seen_at_the_preview_distance() -> None:
     assert abs(y_l - left_of_road) < 2e-3
 
 
+def gps(motion: Motion, noise: Noise = QUIET, n: Any = CALM, **how: Any) -> Any:
+    """A GPS sample; `how` changes ahead, left, hdop, weight or small_angle."""
+    place = how.get("ahead", 0.0), how.get("left", 0.0)
+    sky = how.get("hdop", 1.0), how.get("weight", 0.5)
+    return gps_sample(motion, *place, *sky, noise, n, how.get("small_angle", 0))
+
+
 @pytest.mark.plain
 def test_gps_course_is_wrapped_and_too_slow_a_car_says_so() -> None:
     motion = Motion(3.0, 0.3, 0.0, 3.1, 5.0, 6.0, 0.0, 0.0, 0.0)
-    course, speed, X, Y, quality = gps_sample(motion, 0.1, QUIET, CALM)
+    course, speed, X, Y, hdop, satellites, quality = gps(motion, small_angle=1)
     assert course == pytest.approx(3.2 - 2.0 * math.pi, abs=1e-15)
     assert (speed, X, Y, quality) == (math.hypot(3.0, 0.3), 5.0, 6.0, 1.0)
+    assert (hdop, satellites) == (1.0, 12.0)
     for v, good in ((0.99, 0.0), (1.0, 1.0), (-2.0, 1.0), (0.0, 0.0)):
-        still = motion._replace(v_x=v, v_y=0.0)
-        assert gps_sample(still, 0.0, Noise(), CALM)[4] == good
-    noisy = gps_sample(motion._replace(v_x=0.0, v_y=0.0), 0.0, Noise(), (1.0, 0.0, 0.0, 0.0))
+        assert gps(motion._replace(v_x=v, v_y=0.0), Noise())[-1] == good
+    noisy = gps(motion._replace(v_x=0.0, v_y=0.0), Noise(), (1.0, 0.0, 0.0, 0.0))
     assert all(math.isfinite(value) for value in noisy)  # 1 / V stops at half a metre per second
+
+
+@pytest.mark.plain
+@pytest.mark.parametrize(("ahead", "left"), [(0.5, 0.0), (0.0, -0.3), (-0.4, 0.2)])
+def test_an_antenna_off_the_centre_moves_as_a_point_of_the_body_does(
+    ahead: float, left: float
+) -> None:
+    """Its place a moment later, by the body's own motion, gives its velocity."""
+    h, state = 1e-5, Motion(6.0, 0.4, 0.7, 0.9, 20.0, -7.0, 0.0, 0.0, 0.0)
+    s, c = math.sin(state.psi), math.cos(state.psi)
+    V_X, V_Y = c * state.v_x - s * state.v_y, s * state.v_x + c * state.v_y
+    places = []
+    for t in (-h, h):
+        moved = state._replace(
+            X=state.X + V_X * t, Y=state.Y + V_Y * t, psi=state.psi + state.gamma * t
+        )
+        places.append(np.array(gps(moved, ahead=ahead, left=left)[2:4]))
+    velocity = (places[1] - places[0]) / (2.0 * h)
+    course, speed = gps(state, ahead=ahead, left=left)[:2]
+    # differences of 20 m over 2e-5 s: 1e-10 of rounding; gamma^3 h^2 of the difference itself
+    assert speed == pytest.approx(math.hypot(*velocity), abs=1e-8)
+    assert course == pytest.approx(math.atan2(velocity[1], velocity[0]), abs=1e-8)
+    assert places[0] != pytest.approx([state.X, state.Y], abs=0.1)
+
+
+@pytest.mark.plain
+@pytest.mark.parametrize(("law", "weight"), HDOP_LAWS.items())
+def test_gps_noise_follows_hdop_as_its_law_says(law: str, weight: float) -> None:
+    motion = Motion(8.0, 0.0, 0.0, 0.3, 5.0, 6.0, 0.0, 0.0, 0.0)
+    still = np.array(gps(motion)[:4])
+    at_1, at_3 = (
+        np.array(gps(motion, Noise(), (1.0,) * 4, hdop=hdop, weight=weight)[:4]) - still
+        for hdop in (1.0, 3.0)
+    )
+    assert at_1 == pytest.approx(
+        [Noise().course / 8.0, Noise().gps_speed, 0.5, 0.5], rel=1e-12
+    )  # roundings of numbers up to 8
+    times = {"constant": 1.0, "half": 2.0, "table": 3.0}[law]
+    np.testing.assert_allclose(at_3, times * at_1, rtol=1e-12)
+
+
+@pytest.mark.plain
+def test_satellites_fall_with_hdop_below_four() -> None:
+    seen = [satellites_at(hdop) for hdop in (0.5, 1.0, 1.4, 2.0, 5.0, 5.01, 11.0, 1e9)]
+    assert seen == [22.0, 12.0, 9.0, 7.0, 4.0, 3.0, 2.0, 2.0]
+    assert satellites_at(1e-300) == 30.0
 
 
 def test_accelerometers_feel_the_forces_not_the_turning_axes() -> None:
@@ -125,6 +185,7 @@ SIZES = [
     ("gyro", FAST.gyro, 0.005),
     ("accel_y", FAST.accel_y, 0.1),
     ("accel_x", FAST.accel_x, 0.1),
+    ("roll_rate", FAST.roll_rate, 0.005),
     ("wheel_left", FAST.wheel_left, 0.02),
     ("wheel_right", FAST.wheel_right, 0.02),
 ]
@@ -172,3 +233,42 @@ def test_bias_is_added_to_every_sample() -> None:
     np.testing.assert_allclose(
         one[:, FAST.accel_y], other[:, FAST.accel_y] - 0.3, rtol=0.0, atol=1e-15
     )
+
+
+HDOP, SATELLITES = PACKET.value + 4, PACKET.value + 5
+
+
+def test_log_hdop_is_stationary_with_the_stated_median_spread_and_memory() -> None:
+    """200 drives: a packet at the start and one 4 s later each."""
+    changes = {"duration": 4.3, "hdop": 1.4, "hdop_spread": 0.5, "hdop_time": 8.0}
+    env = StabilityEnv("gps", scenario=LINEAR | changes, control_period=1000)
+    first, last = [], []
+    for seed in range(200):
+        env.reset(seed=seed)
+        first.append(math.log(env.record.packets[0, HDOP]))
+        last.append(math.log(packets(play(env, [0.0] * 4))[-1, HDOP]))
+    for logs in (first, last):
+        # four standard errors of a mean and of a standard deviation of 200
+        assert abs(np.mean(logs) - math.log(1.4)) < 4.0 * 0.5 / math.sqrt(200)
+        assert abs(np.std(logs) - 0.5) < 4.0 * 0.5 / math.sqrt(400)
+    kept = np.corrcoef(first, last)[0, 1]
+    assert abs(kept - math.exp(-4.0 / 8.0)) < 4.0 / math.sqrt(200)
+    spread = LINEAR | {"hdop": 1.4, "hdop_spread": 0.0}
+    found = drive("gps", ticks=900, scenario=spread)[2]
+    np.testing.assert_allclose(found[:, HDOP], 1.4, rtol=1e-13)  # exp's and log's own error
+
+
+def test_hdop_jumps_where_an_outage_ends() -> None:
+    sky = LINEAR | {"hdop": 1.4, "hdop_spread": 0.5, "hdop_time": 1e9, "duration": 3.0}
+    seen = {}
+    for outage in (None, (0.5, 1.1)):
+        found = drive("gps", ticks=2500, scenario=sky | {"gps_outage": outage}, seed=2)[2]
+        seen[outage] = {packet[PACKET.captured]: packet for packet in found}
+    calm, cut = seen.values()
+    assert set(cut) == set(calm) - {600.0, 800.0, 1000.0}
+    for tick, packet in cut.items():
+        jump = math.log(packet[HDOP] / calm[tick][HDOP])
+        assert jump == pytest.approx(OUTAGE_JUMP * 0.5 if tick >= 1100 else 0.0, abs=1e-6)
+        assert packet[SATELLITES] == satellites_at(packet[HDOP])
+        assert packet[PACKET.quality] == 1.0  # the filter refuses few satellites, not the sensor
+    assert min(packet[SATELLITES] for packet in cut.values()) < 4.0

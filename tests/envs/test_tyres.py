@@ -8,19 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sideslip.envs import COMS, PASSENGER_CAR
-from sideslip.envs.dynamics import (
-    FIALA,
-    LINEAR,
-    SLOW,
-    Car,
-    Inputs,
-    Motion,
-    lateral_force,
-    load_of,
-    sideslip_angle,
-    slips,
-)
+from sideslip.envs.dynamics import Car, Motion, sideslip_angle
 from sideslip.envs.template import car_of
+from sideslip.envs.tyres import FIALA, LINEAR, SLOW, Inputs, lateral_force, load_of, slips
 from sideslip.envs.vehicle import GRAVITY
 
 pytestmark = pytest.mark.plain

@@ -14,6 +14,7 @@ pytestmark = pytest.mark.plain
 
 NUMBERS = [entry.name for entry in dataclasses.fields(Vehicle) if entry.name != "name"]
 LAGS = ("motor_lag", "steering_lag")
+PLACES = ("antenna_ahead", "antenna_left")
 
 
 @pytest.mark.smoke
@@ -48,13 +49,16 @@ def test_every_parameter_has_a_unit_and_a_description(name: str) -> None:
 @pytest.mark.parametrize("name", NUMBERS)
 @pytest.mark.parametrize("value", [-1.0, math.nan, math.inf])
 def test_values_that_cannot_be_are_refused_by_name(name: str, value: float) -> None:
+    if name in PLACES and value == -1.0:
+        assert getattr(COMS.replace(**{name: value}), name) == value
+        return
     with pytest.raises(ValueError, match=rf"Vehicle\.{name}: {value!r} .* is not"):
         COMS.replace(**{name: value})
 
 
 @pytest.mark.parametrize("name", NUMBERS)
-def test_zero_is_for_lags_only(name: str) -> None:
-    if name in LAGS:
+def test_zero_is_for_lags_and_places_only(name: str) -> None:
+    if name in LAGS + PLACES:
         assert getattr(COMS.replace(**{name: 0.0}), name) == 0.0
     else:
         with pytest.raises(ValueError, match=name):
@@ -131,3 +135,12 @@ def test_bad_vehicle_files_are_refused_with_their_name() -> None:
         vehicle_from_file_values({"base": "tank"}, "car.json")
     with pytest.raises(TypeError, match=r"car\.json: .*front_stiffness_axle"):
         vehicle_from_file_values({"front_stiffness_axle": "stiff"}, "car.json")
+
+
+def test_a_body_that_falls_over_or_has_no_inertia_cannot_roll() -> None:
+    for vehicle in VEHICLES.values():
+        vehicle.check_roll()
+    with pytest.raises(ValueError, match=r"roll_stiffness: 1000.0 .* M_s g h_s = 1030.05"):
+        COMS.replace(roll_stiffness=1000.0).check_roll()
+    with pytest.raises(ValueError, match=r"roll_inertia: 29.0 .* more than 29.01"):
+        COMS.replace(roll_inertia=29.0).check_roll()
