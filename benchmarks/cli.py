@@ -36,6 +36,7 @@ Mapping = Annotated[
 ]
 Jobs = Annotated[int | None, typer.Option("--jobs", "-j", min=1, help="Processes.")]
 
+_NAME = 48  # letters: a longer text in a table's first column is no name and may wrap
 _SHOWN = ("numpy", "scipy", "numba", "gymnasium", "control", "plotly")
 
 
@@ -137,13 +138,19 @@ def _control(quick: bool, jobs: int | None) -> Suite:
     return control.run(control.QUICK_SEEDS if quick else control.SEEDS, jobs, console=console)
 
 
+def _papers(quick: bool, jobs: int | None) -> Suite:
+    from . import papers
+
+    return papers.run(papers.QUICK_SEEDS if quick else papers.SEEDS, jobs, console=console)
+
+
 def _speed(quick: bool, jobs: int | None) -> Suite:
     from . import speed
 
     return speed.run()
 
 
-SUITES = {"estimation": _estimation, "control": _control, "speed": _speed}
+SUITES = {"estimation": _estimation, "control": _control, "papers": _papers, "speed": _speed}
 
 
 @app.command()
@@ -187,11 +194,11 @@ def _give(
     """Print the tables and write what was asked for."""
     for suite in suites:
         console.rule(f"[bold]{suite.title}")
-        console.print(suite.text + "\n", highlight=False)
+        console.print(escape(suite.text) + "\n", highlight=False)
         for table in suite.tables:
             console.print(_screen(table.title, table.header, table.cells))
             if table.note:
-                console.print(f"[dim]{table.note}[/]\n", highlight=False)
+                console.print(f"[dim]{escape(table.note)}[/]\n", highlight=False)
     rows: list[Row] = [row for suite in suites for row in suite.rows]
     if json is not None:
         write_json(json, rows)
@@ -234,11 +241,17 @@ def environment() -> dict[str, str]:
 
 
 def _screen(title: str, header: Sequence[str], cells: Sequence[Sequence[str]]) -> RichTable:
+    """Columns of numbers to the right and whole, those of text to the left, wrapped if long."""
+    from .report import numeric
+
     table = RichTable(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    for i, name in enumerate(header):
-        table.add_column(name, justify="left" if i == 0 else "right", no_wrap=i == 0)
+    columns = zip(*cells, strict=True) if cells else [()] * len(header)
+    for i, (name, column) in enumerate(zip(header, columns, strict=True)):
+        right = i > 0 and numeric(column)
+        whole = right or (i == 0 and max(map(len, column), default=0) <= _NAME)
+        table.add_column(name, justify="right" if right else "left", no_wrap=whole)
     for row in cells:
-        table.add_row(*row)
+        table.add_row(*map(escape, row))
     return table
 
 

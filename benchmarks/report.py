@@ -128,7 +128,7 @@ _NUMBER = re.compile(
 _BLANK = {"", "-", "\u2013", "\u2014", "nan", "n/a"}
 
 
-def _numeric(cells: Iterable[str]) -> bool:
+def numeric(cells: Iterable[str]) -> bool:
     """Whether a column is one of numbers: some, and nothing else but blanks."""
     told = [cell for cell in cells if cell.strip().lower() not in _BLANK]
     return bool(told) and all(number(cell) is not None for cell in told)
@@ -141,13 +141,13 @@ def _table(table: Table) -> str:
                 f"table {table.title!r}: {len(row)} cells under {len(table.header)} headers: {row}"
             )
     columns = list(zip(*table.cells, strict=True)) or [()] * len(table.header)
-    numeric = [_numeric(column) for column in columns]
+    are_numbers = [numeric(column) for column in columns]
     heads = "".join(
         f'<th scope="col" aria-sort="none"{_number_class(is_number)}>'
         f'<button type="button">{escape(name)}</button></th>'
-        for name, is_number in zip(table.header, numeric, strict=True)
+        for name, is_number in zip(table.header, are_numbers, strict=True)
     )
-    body = "\n".join(f"<tr>{_row(row, numeric)}</tr>" for row in table.cells)
+    body = "\n".join(f"<tr>{_row(row, are_numbers, table.keyed)}</tr>" for row in table.cells)
     title = escape(table.title)
     note = f'\n<p class="note">{_inline(table.note)}</p>' if table.note else ""
     return (
@@ -158,12 +158,12 @@ def _table(table: Table) -> str:
     )
 
 
-def _row(row: Sequence[str], numeric: Sequence[bool]) -> str:
+def _row(row: Sequence[str], numeric: Sequence[bool], keyed: bool) -> str:
     cells = []
     for i, (cell, is_number) in enumerate(zip(row, numeric, strict=True)):
         value = number(cell) if is_number else None
         data = "" if value is None else f' data-value="{_plain(value)}"'
-        tag, key = ('th scope="row"', _key(cell)) if i == 0 else ("td", "")
+        tag, key = ('th scope="row"', _key(cell) if keyed else "") if i == 0 else ("td", "")
         cells.append(f"<{tag}{_number_class(is_number)}{data}>{key}{escape(cell)}</{tag[:2]}>")
     return "".join(cells)
 

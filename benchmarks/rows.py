@@ -19,6 +19,13 @@ METRICS = {
     "effort": "-",
     "cost": "-",
     "ratio": "-",
+    "static_slip": "rad",
+    "drift": "rad",
+    "difference": "-",
+    "residual": "-",
+    "rank": "-",
+    "share": "-",
+    "spectral_radius": "-",
 }
 """The vocabulary of metrics with their units; a new one is added here first."""
 
@@ -30,7 +37,8 @@ class Row:
     """One number of a benchmark.
 
     suite, scenario, estimator, controller, metric: what was measured. value with its 95 % interval
-    [low, high] over n runs (NaN bounds where there is no spread). salt: what salted the seeds.
+    [low, high] over n runs (NaN bounds where there is no spread); for a claim, which has a verdict,
+    the median and range over n seeds. salt: what salted the seeds.
     spec: the env's JSON, "" where no env was run. verdict and paper: for claims.
 
     Raises ValueError for a metric or verdict outside the vocabulary.
@@ -60,12 +68,16 @@ class Row:
 
 @dataclass
 class Table:
-    """A table for the screen and the report: texts, a header, and what each column means."""
+    """A table for the screen and the report: texts, a header, and what each column means.
+
+    keyed: whether the first column names estimators or controllers, which have their colour.
+    """
 
     title: str
     header: Sequence[str]
     cells: Sequence[Sequence[str]]
     note: str = ""
+    keyed: bool = True
 
 
 @dataclass

@@ -1,0 +1,217 @@
+"""A claim of a paper, and the rule that turns what was measured into a verdict.
+
+A claim has one or more parts. A part is one number a seed, what the paper says about that number
+(`says`) and the threshold that an honest implementation meets (`threshold`, docs/PAPERS.md
+section 3); both are data. The rule:
+
+- a part *holds* where at least nine in ten seeds meet what the paper says, holds *in the median*
+  where at least the median over the seeds does, and *fails* otherwise;
+- a claim is `reproduced` if all its parts hold, `not reproduced` if all fail, `partly` otherwise;
+- a claim none of whose parts has a `says` (the paper gives no statement that could be false, or the
+  ledger only shows a number) is `report only`.
+
+A threshold is met if the median over the seeds meets it. It guards our implementation and has no
+part in the verdict.
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass
+class Example:
+    """Signals of the first seed, for figures.
+
+    time: (K,) s. curves: by who ("truth", a filter, a controller, "reference") and signal, (K,).
+    packets: by slow sensor, (count, PACKET_WIDTH).
+    """
+
+    time: Array
+    curves: dict[str, dict[str, Array]]
+    packets: dict[str, Array] = field(default_factory=dict)
+
+
+@dataclass
+class Measured:
+    """What a simulation or an analysis gave.
+
+    numbers: (seeds,) by who and metric. example: None but for the chunk with the first seed.
+    """
+
+    numbers: dict[tuple[str, str], Array]
+    example: Example | None = None
+
+
+Results = Mapping[str, Measured]
+"""What was measured, by the name of the simulation or analysis."""
+
+MOST = 0.9  # of the seeds
+
+_RELATIONS: dict[str, Callable[[Array, float], npt.NDArray[np.bool_]]] = {
+    "<": np.less,
+    "<=": np.less_equal,
+    ">": np.greater,
+    ">=": np.greater_equal,
+    "=": np.equal,
+}
+
+
+@dataclass(frozen=True)
+class Bound:
+    """A relation and a number, such as "<= 0.75".
+
+    Raises ValueError for an unknown relation or a number that is not finite.
+    """
+
+    relation: str
+    value: float
+
+    def __post_init__(self) -> None:
+        if self.relation not in _RELATIONS or not math.isfinite(self.value):
+            raise ValueError(
+                f"expected one of {', '.join(_RELATIONS)} and a finite number, "
+                f"got {self.relation!r} {self.value!r}"
+            )
+
+    def met(self, values: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+        """Which of the values meet it; NaN never does."""
+        return np.asarray(_RELATIONS[self.relation](np.asarray(values, float), self.value))
+
+    def __str__(self) -> str:
+        return f"{self.relation} {self.value:g}"
+
+
+@dataclass(frozen=True)
+class Part:
+    """One measured number of a claim.
+
+    label: who against whom. of: from the results to one number a seed. scenario: the name of the
+    simulation or analysis it comes from. metric: of `rows.METRICS`.
+    """
+
+    label: str
+    scenario: str
+    of: Callable[[Results], Array]
+    says: Bound | None = None
+    threshold: Bound | None = None
+    metric: str = "ratio"
+
+
+@dataclass(frozen=True)
+class Claim:
+    """paper: its short name. source: equation, figure or section. text: what it says, in a line.
+
+    note: what was found out about it, for the report. Raises ValueError for a claim without parts.
+    """
+
+    paper: str
+    source: str
+    text: str
+    parts: tuple[Part, ...]
+    note: str = ""
+
+    def __post_init__(self) -> None:
+        if not self.parts:
+            raise ValueError(f"{self.paper} {self.source}: a claim needs at least one part")
+
+
+@dataclass(frozen=True)
+class Found:
+    """A part with its numbers, (seeds,)."""
+
+    part: Part
+    values: Array
+
+    @property
+    def median(self) -> float:
+        """Over the seeds."""
+        return float(np.median(self.values))
+
+    @property
+    def low(self) -> float:
+        """The least of the seeds."""
+        return float(np.min(self.values))
+
+    @property
+    def high(self) -> float:
+        """The most of the seeds."""
+        return float(np.max(self.values))
+
+    @property
+    def agreeing(self) -> float:
+        """The share of seeds that meet what the paper says; NaN where it says nothing."""
+        says = self.part.says
+        return math.nan if says is None else float(np.mean(says.met(self.values)))
+
+    @property
+    def in_the_median(self) -> bool:
+        """Whether the median meets what the paper says."""
+        return self.part.says is not None and bool(self.part.says.met(self.median))
+
+    @property
+    def threshold_met(self) -> bool | None:
+        """Whether the median meets the threshold; None where there is none."""
+        threshold = self.part.threshold
+        return None if threshold is None else bool(threshold.met(self.median))
+
+
+def find(claim: Claim, results: Results) -> tuple[Found, ...]:
+    """Every part of a claim, measured. Raises ValueError for a part without numbers."""
+    found = []
+    for part in claim.parts:
+        values = np.atleast_1d(np.asarray(part.of(results), np.float64))
+        if values.ndim != 1 or not len(values):
+            raise ValueError(f"{claim.paper} {claim.source}, {part.label}: {values.shape} numbers")
+        found.append(Found(part, values))
+    return tuple(found)
+
+
+def verdict(found: Sequence[Found]) -> str:
+    """The verdict on a claim: the rule of this module."""
+    judged = [each for each in found if each.part.says is not None]
+    if not judged:
+        return "report only"
+    if all(each.agreeing >= MOST for each in judged):
+        return "reproduced"
+    if any(each.in_the_median for each in judged):
+        return "partly"
+    return "not reproduced"
+
+
+def number(scenario: str, who: str, metric: str) -> Callable[[Results], Array]:
+    """A measured number as it stands."""
+    return lambda results: results[scenario].numbers[who, metric]
+
+
+def ratio(scenario: str, one: str, other: str, metric: str = "beta") -> Callable[[Results], Array]:
+    """One's number over the other's, seed by seed."""
+
+    def of(results: Results) -> Array:
+        numbers = results[scenario].numbers
+        return np.asarray(numbers[one, metric] / numbers[other, metric])
+
+    return of
+
+
+def over_others(
+    scenario: str,
+    one: str,
+    others: Sequence[str],
+    pick: Callable[..., Array],
+    metric: str = "beta",
+) -> Callable[[Results], Array]:
+    """One's number over the best (pick: np.min) or the poorest (np.max) of the others'."""
+
+    def of(results: Results) -> Array:
+        numbers = results[scenario].numbers
+        return np.asarray(
+            numbers[one, metric] / pick([numbers[other, metric] for other in others], axis=0)
+        )
+
+    return of

@@ -1,0 +1,100 @@
+"""The papers' figures from an example's signals: axes and curves as the papers have them."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ...envs.record import PACKET
+from .claim import Array, Example
+
+Draw = Callable[[Example], Any]
+
+
+@dataclass(frozen=True)
+class PaperFigure:
+    """One figure of a paper, redrawn. scenario: of the simulation. caption: what to see."""
+
+    paper: str
+    title: str
+    scenario: str
+    draw: Draw
+    caption: str
+
+
+def curves(
+    signal: str, y_label: str, who: Sequence[str] = (), window: tuple[float, float] | None = None
+) -> Draw:
+    """A signal of everybody (or of those named) over time. window: s, of the time axis."""
+
+    def draw(example: Example) -> Any:
+        from ..figures import time_series
+
+        shown = [name for name in who or example.curves if signal in example.curves.get(name, {})]
+        inside = _inside(example.time, window)
+        series = {name: example.curves[name][signal][inside] for name in shown}
+        return time_series("", example.time[inside], series, y_label)
+
+    return draw
+
+
+def course(y_label: str, who: Sequence[str]) -> Draw:
+    """The course psi + beta: the truth, the receiver's samples and each filter's."""
+
+    def draw(example: Example) -> Any:
+        from ..figures import time_series
+
+        series = {name: example.curves[name]["psi"] + example.curves[name]["beta"] for name in who}
+        series["GPS"] = samples(example, "gps", 0, "arrived")
+        return time_series("", example.time, series, y_label, dots=("GPS",))
+
+    return draw
+
+
+def samples(example: Example, sensor: str, row: int, at: str) -> Array:
+    """A slow sensor's values at the ticks they were `captured` or `arrived`, NaN elsewhere."""
+    values = np.full(len(example.time), np.nan)
+    ticks = example.packets[sensor][:, getattr(PACKET, at)].astype(int)
+    there = ticks < len(values)
+    values[ticks[there]] = example.packets[sensor][there, PACKET.value + row]
+    return values
+
+
+def held(values: Array) -> Array:
+    """Samples held until the next one, as a controller without an estimator sees them."""
+    known = np.flatnonzero(~np.isnan(values))
+    last = np.searchsorted(known, np.arange(len(values)), side="right") - 1
+    out = np.full(len(values), np.nan)
+    out[last >= 0] = values[known[last[last >= 0]]]
+    return out
+
+
+def measured_offset(y_label: str, who: Sequence[str], window: tuple[float, float]) -> Draw:
+    """The lateral offset: truth, the camera's held late samples, and each filter's."""
+
+    def draw(example: Example) -> Any:
+        from ..figures import time_series
+
+        inside = _inside(example.time, window)
+        series = {name: example.curves[name]["y_l"][inside] for name in who}
+        series["camera, held"] = held(samples(example, "camera", 1, "arrived"))[inside]
+        return time_series("", example.time[inside], series, y_label)
+
+    return draw
+
+
+def delays(example: Example) -> Any:
+    """The delay of each frame of the camera over the time of its capture."""
+    from ..figures import time_series
+
+    packets = example.packets["camera"]
+    t = 1e-3 * packets[:, PACKET.captured]
+    late = packets[:, PACKET.arrived] - packets[:, PACKET.captured]
+    return time_series("", t, {"camera": late}, "delay / ms", dots=("camera",))
+
+
+def _inside(time: Array, window: tuple[float, float] | None) -> Any:
+    if window is None:
+        return slice(None)
+    return (time >= window[0]) & (time <= window[1])

@@ -1,0 +1,86 @@
+"""With how many tunings does tie-vision's filter with pseudo-residuals diverge?
+
+The paper does not say which gain its (16), (21) use between samples. Two are tried with the same
+random process noise: the Kalman gain of (13) at 1 ms, every row corrected at every step, as the
+four steps (19)-(22) read; and the shipped filter's, which spreads the multirate filter's gain over
+the frame.
+"""
+
+import numpy as np
+from scipy.linalg import solve_discrete_are
+
+from ...envs.linear import vision
+from ...envs.scenario import KMH
+from ...envs.sensor_sets import CAMERA_33_30
+from ...envs.vehicle import COMS
+from ...estimators import kalman, make_estimator
+from .claim import Array, Measured
+
+SPEED = 25.0 * KMH
+PERIOD, DELAY = 33, 30  # ms, of the camera
+R = np.diag([0.005, 3.5e-3, 0.02]) ** 2
+LITERAL, SPREAD = "the gain of (13)", "the shipped gain"
+
+C = np.zeros((3, 6))  # of (13): gamma and the delayed psi and y_l
+C[0, 1] = C[1, 4] = C[2, 5] = 1.0
+
+
+def transitions() -> tuple[Array, Array]:
+    """G of (13) at 1 ms: with the delayed states held, and in the step after a trigger (12)."""
+    held = np.eye(6)
+    held[:4, :4], _ = vision(COMS, SPEED).discrete(1e-3)
+    latched = held.copy()
+    latched[4:] = 0.0
+    latched[4, 2] = latched[5, 3] = 1.0
+    return held, latched
+
+
+def literal_gain(Q: Array) -> Array:
+    """The Kalman gain of (13) at 1 ms with a measurement at every step, (6, 3)."""
+    _, latched = transitions()
+    noise = np.diag([*Q, 0.0, 0.0]) * 1e-3
+    return kalman.gain(solve_discrete_are(latched.T, C.T, noise, R), C, R)
+
+
+def spectral_radius(K: Array) -> float:
+    """Of the map of (error, estimated error e) over a frame: (19)-(22) with the gyro at 1 ms."""
+    held, latched = transitions()
+    I, zero = np.eye(6), np.zeros((6, 6))  # noqa: E741
+    inverse = C.T @ np.linalg.inv(C @ C.T)
+    sample = np.block([[I - K @ C, zero], [(inverse - K) @ C, zero]])  # (19)-(20)
+    fast = np.outer(K[:, 0], C[0])
+    between = np.block([[I - fast, fast - K @ C], [zero, I - K @ C]])  # (21)-(22)
+    total = np.eye(12)
+    for k in range(1, PERIOD + 1):  # captured at tick 0, there at DELAY
+        move = np.kron(np.eye(2), latched if k == 1 else held)
+        total = (sample if k == DELAY else between) @ move @ total
+    return float(np.abs(np.linalg.eigvals(total)).max())
+
+
+def random_tunings(seeds: tuple[int, ...], batch: int = 20) -> Measured:
+    """The share of random tunings with which the error grows; a batch a seed.
+
+    Process noise of each state log-uniform over eight decades up to 1 (unit)^2/s.
+    """
+    shares: dict[str, list[float]] = {LITERAL: [], SPREAD: []}
+    for seed in seeds:
+        rng = np.random.default_rng(seed)
+        tunings = 10.0 ** rng.uniform(-8.0, 0.0, (batch, 4))
+        radii = {
+            LITERAL: [spectral_radius(literal_gain(Q)) for Q in tunings],
+            SPREAD: [_shipped(Q) for Q in tunings],
+        }
+        for name, found in radii.items():
+            shares[name].append(float(np.mean(np.array(found) > 1.0 + 1e-9)))
+    return Measured({(name, "share"): np.array(values) for name, values in shares.items()})
+
+
+def _shipped(Q: Array) -> float:
+    return make_estimator(
+        "multirate-residual-kf",
+        vehicle=COMS,
+        sensors={"camera": CAMERA_33_30},
+        speed=SPEED,
+        Q=Q,
+        allow_unstable=True,
+    ).spectral_radius

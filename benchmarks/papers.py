@@ -1,0 +1,157 @@
+"""Question: which claims of the five papers hold? Every claim, what was measured, its verdict, and
+the papers' figures redrawn."""
+
+from collections import Counter
+
+from rich.console import Console
+
+from .. import __version__
+from .cases import run_cases
+from .claims import CLAIMS, FIGURES, SIMULATIONS
+from .claims.claim import Claim, Found, Measured, Results, find, verdict
+from .claims.simulations import joined
+from .rows import VERDICTS, Row, Suite, Table
+
+SEEDS = 20
+QUICK_SEEDS = 4
+NAME = "papers"
+
+_TEXT = (
+    "The five papers' claims, each measured on the paper's own simulation or worked out exactly. "
+    "A part of a claim is one number a seed. `reproduced`: all parts are as the paper says, each "
+    "in nine of ten seeds. `not reproduced`: no part is, even in the median over the seeds. "
+    "`partly`: anything between. `report only`: the paper says nothing that could be false. "
+    "Thresholds are what an honest implementation reaches (docs/PAPERS.md section 3); the median "
+    "has to meet them. No paper prints its noise or its tuning: both are ours."
+)
+
+Case = tuple[str, tuple[int, ...]]
+Ledger = list[tuple[Claim, tuple[Found, ...]]]
+
+
+def measure(case: Case) -> Measured:
+    """One simulation on a few of its seeds."""
+    name, seeds = case
+    return SIMULATIONS[name].measure(seeds)
+
+
+def run(seeds: int = SEEDS, jobs: int | None = None, console: Console | None = None) -> Suite:
+    """Every simulation once, then every claim on what it gave."""
+    results = simulate(seeds, jobs, console)
+    ledger = [(claim, find(claim, results)) for claim in CLAIMS]
+    counted = Counter(verdict(found) for _, found in ledger)
+    counts = ", ".join(f"{counted[name]} {name}" for name in VERDICTS if counted[name])
+    suite = Suite(
+        NAME, "Which claims of the papers hold", f"{_TEXT}\n\n{len(ledger)} claims: {counts}."
+    )
+    suite.tables = [_verdicts(ledger), _notes(ledger)]
+    suite.tables += [_numbers(ledger, paper) for paper in dict.fromkeys(c.paper for c in CLAIMS)]
+    suite.rows = [_row(claim, each, verdict(found)) for claim, found in ledger for each in found]
+    _draw(suite, results)
+    return suite
+
+
+def simulate(seeds: int, jobs: int | None = None, console: Console | None = None) -> Results:
+    """What every simulation and analysis gives, by name."""
+    cases = [(name, chunk) for name, each in SIMULATIONS.items() for chunk in each.chunks(seeds)]
+    parts: dict[str, list[Measured]] = {name: [] for name in SIMULATIONS}
+    done = run_cases(measure, cases, NAME, jobs, console)
+    for (name, _), measured in zip(cases, done, strict=True):
+        parts[name].append(measured)
+    return {name: joined(chunks) for name, chunks in parts.items()}
+
+
+def _verdicts(ledger: Ledger) -> Table:
+    """One line a claim."""
+    cells = [[_where(claim), claim.text, verdict(found), _kept(found)] for claim, found in ledger]
+    return Table(
+        "The claims and what became of them",
+        ("paper", "claim", "verdict", "thresholds"),
+        cells,
+        keyed=False,
+    )
+
+
+def _numbers(ledger: Ledger, paper: str) -> Table:
+    """One line a part of a paper's claims."""
+    cells = [
+        [f"{claim.source}: {each.part.label}", _spread(each), _said(each), _checked(each)]
+        for claim, found in ledger
+        for each in found
+        if claim.paper == paper
+    ]
+    return Table(
+        f"{paper}: what was measured",
+        ("number", "median [range]", "paper says", "threshold"),
+        cells,
+        "The range is over seeds, tunings or speeds; behind what the paper says stands the share "
+        "of them in which it is so.",
+        keyed=False,
+    )
+
+
+def _notes(ledger: Ledger) -> Table:
+    """What was found out about some claims."""
+    cells = [[_where(claim), claim.note] for claim, _ in ledger if claim.note]
+    return Table("Why", ("paper", "what was found"), cells, keyed=False)
+
+
+def _where(claim: Claim) -> str:
+    return f"{claim.paper} {claim.source}"
+
+
+def _spread(found: Found) -> str:
+    if found.low == found.high:
+        return f"{found.median:.3g}"
+    return f"{found.median:.3g} [{found.low:.3g}, {found.high:.3g}]"
+
+
+def _said(found: Found) -> str:
+    says = found.part.says
+    return "" if says is None else f"{says} ({100.0 * found.agreeing:.0f} %)"
+
+
+def _checked(found: Found) -> str:
+    met = {True: "met", False: "MISSED"}
+    return (
+        "" if found.threshold_met is None else f"{found.part.threshold} {met[found.threshold_met]}"
+    )
+
+
+def _kept(found: tuple[Found, ...]) -> str:
+    """How many of a claim's thresholds are met."""
+    checked = [each.threshold_met for each in found if each.threshold_met is not None]
+    if not checked:
+        return ""
+    return "met" if all(checked) else f"{checked.count(False)} of {len(checked)} MISSED"
+
+
+def _row(claim: Claim, found: Found, judged: str) -> Row:
+    """low and high are the range over the seeds."""
+    return Row(
+        NAME,
+        found.part.scenario,
+        found.part.metric,
+        found.median,
+        estimator=found.part.label,
+        low=found.low,
+        high=found.high,
+        n=len(found.values),
+        salt="fixed",
+        env_version=__version__,
+        verdict=judged,
+        paper=f"{_where(claim)}: {claim.text}",
+    )
+
+
+def _draw(suite: Suite, results: Results) -> None:
+    """The papers' figures; nothing where plotly is not installed."""
+    try:
+        from . import figures  # noqa: F401
+    except ModuleNotFoundError:
+        return
+    for figure in FIGURES:
+        example = results[figure.scenario].example
+        if example is not None:
+            title = f"{figure.paper} {figure.title}"
+            suite.figures.append((title, figure.draw(example), figure.caption))
