@@ -36,7 +36,7 @@ Mapping = Annotated[
 ]
 Jobs = Annotated[int | None, typer.Option("--jobs", "-j", min=1, help="Processes.")]
 
-_NAME = 48  # letters: a longer text in a table's first column is no name and may wrap
+_NAME = 32  # letters: a longer text in a table's first column is no name and may wrap
 _SHOWN = ("numpy", "scipy", "numba", "gymnasium", "control", "plotly")
 
 
@@ -248,8 +248,13 @@ def _screen(title: str, header: Sequence[str], cells: Sequence[Sequence[str]]) -
     columns = zip(*cells, strict=True) if cells else [()] * len(header)
     for i, (name, column) in enumerate(zip(header, columns, strict=True)):
         right = i > 0 and numeric(column)
-        whole = right or (i == 0 and max(map(len, column), default=0) <= _NAME)
-        table.add_column(name, justify="right" if right else "left", no_wrap=whole)
+        longest = max(map(len, column), default=0)
+        table.add_column(
+            name,
+            justify="right" if right else "left",
+            no_wrap=right or (i == 0 and longest <= _NAME),
+            min_width=min(longest, _NAME) if i == 0 else None,
+        )
     for row in cells:
         table.add_row(*map(escape, row))
     return table

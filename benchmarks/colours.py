@@ -15,6 +15,7 @@ COLOURS = {
     "reference": INK,
     "bound": INK,
     "none": GREY,
+    "measured": GREY,
     "bicycle-kf": GREY,
     "gyro-only": GREY,
     "single-rate": "#D55E00",

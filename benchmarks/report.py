@@ -125,6 +125,7 @@ _NUMBER = re.compile(
     r"|(?P<digits>(?>\d+(?:[,\u00a0\u202f]\d{3})*(?:\.\d*)?|\.\d+)(?>e[-+\u2212]?\d+)?)(?!-\w))",
     re.IGNORECASE,
 )
+_LONG = 40  # letters: a longer cell wraps
 _BLANK = {"", "-", "\u2013", "\u2014", "nan", "n/a"}
 
 
@@ -164,7 +165,8 @@ def _row(row: Sequence[str], numeric: Sequence[bool], keyed: bool) -> str:
         value = number(cell) if is_number else None
         data = "" if value is None else f' data-value="{_plain(value)}"'
         tag, key = ('th scope="row"', _key(cell) if keyed else "") if i == 0 else ("td", "")
-        cells.append(f"<{tag}{_number_class(is_number)}{data}>{key}{escape(cell)}</{tag[:2]}>")
+        kind = ' class="long"' if i > 0 and len(cell) > _LONG else _number_class(is_number)
+        cells.append(f"<{tag}{kind}{data}>{key}{escape(cell)}</{tag[:2]}>")
     return "".join(cells)
 
 

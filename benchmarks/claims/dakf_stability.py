@@ -6,12 +6,19 @@ from .observability import coms_ranks
 from .simulations import Analysis, Estimation, Filter
 
 PAPER = "dakf-stability"
-FIG6, BIAS, RANKS = "dakf-fig6", "dakf-bias", "dakf-rank"
+FIG6, FASTER = "dakf-fig6", "dakf-fig6-faster"
+BIAS, RANKS = "dakf-bias", "dakf-rank"
 DAKF, KF = "dakf", "course-kf"
 GYRO_BIAS = 8.7266e-4  # rad/s, 0.05 deg/s
 
 SIMULATIONS = (
     Estimation(FIG6, "sideslip/YawGps-v0", FIG6, (Filter(DAKF, DAKF), Filter(KF, KF))),
+    Estimation(
+        FASTER,
+        "sideslip/YawGps-v0",
+        {"base": FIG6, "name": FASTER, "frequency": 0.4},
+        (Filter(DAKF, DAKF), Filter(KF, KF)),
+    ),
     Estimation(
         BIAS,
         "sideslip/YawGps-v0",
@@ -27,6 +34,7 @@ SIMULATIONS = (
             "noise": {"gyro_bias": GYRO_BIAS},
         },
         (Filter(DAKF, DAKF), Filter(KF, KF)),
+        control_period=100,
     ),
     Analysis(RANKS, coms_ranks, random=False),
 )
@@ -37,20 +45,23 @@ CLAIMS = (
         "Fig. 6",
         "the DAKF beats the three-state Kalman filter",
         (
-            Part(
-                "DAKF / KF",
-                FIG6,
-                ratio(FIG6, DAKF, KF),
-                Bound("<", 1.0),
-                Bound("<=", 0.75),
-            ),
+            Part("DAKF / KF", FIG6, ratio(FIG6, DAKF, KF), Bound("<", 1.0), Bound("<=", 0.75)),
+            Part("DAKF / KF at 0.4 Hz", FASTER, ratio(FASTER, DAKF, KF), Bound("<", 1.0)),
         ),
     ),
     Claim(
         PAPER,
         "Fig. 6",
         "the DAKF is better during the outage too",
-        (Part("DAKF / KF, 4 to 6 s", FIG6, ratio(FIG6, DAKF, KF, "outage"), Bound("<", 1.0)),),
+        tuple(
+            Part(
+                f"DAKF / KF, 4 to 6 s{text}",
+                scenario,
+                ratio(scenario, DAKF, KF, "outage"),
+                Bound("<", 1.0),
+            )
+            for scenario, text in ((FIG6, ""), (FASTER, " at 0.4 Hz"))
+        ),
     ),
     Claim(
         PAPER,

@@ -46,8 +46,8 @@ def course(y_label: str, who: Sequence[str]) -> Draw:
         from ..figures import time_series
 
         series = {name: example.curves[name]["psi"] + example.curves[name]["beta"] for name in who}
-        series["GPS"] = samples(example, "gps", 0, "arrived")
-        return time_series("", example.time, series, y_label, dots=("GPS",))
+        series["measured"] = samples(example, "gps", 0, "arrived")
+        return time_series("", example.time, series, y_label, dots=("measured",))
 
     return draw
 
@@ -78,20 +78,22 @@ def measured_offset(y_label: str, who: Sequence[str], window: tuple[float, float
 
         inside = _inside(example.time, window)
         series = {name: example.curves[name]["y_l"][inside] for name in who}
-        series["camera, held"] = held(samples(example, "camera", 1, "arrived"))[inside]
+        series["measured, held"] = held(samples(example, "camera", 1, "arrived"))[inside]
         return time_series("", example.time[inside], series, y_label)
 
     return draw
 
 
 def delays(example: Example) -> Any:
-    """The delay of each frame of the camera over the time of its capture."""
+    """The delay of the newest frame over the time of its capture, for the first second."""
     from ..figures import time_series
 
     packets = example.packets["camera"]
-    t = 1e-3 * packets[:, PACKET.captured]
-    late = packets[:, PACKET.arrived] - packets[:, PACKET.captured]
-    return time_series("", t, {"camera": late}, "delay / ms", dots=("camera",))
+    late = np.full(len(example.time), np.nan)
+    ticks = packets[:, PACKET.captured].astype(int)
+    late[ticks] = packets[:, PACKET.arrived] - packets[:, PACKET.captured]
+    inside = _inside(example.time, (0.0, 1.0))
+    return time_series("", example.time[inside], {"camera": held(late)[inside]}, "delay / ms")
 
 
 def _inside(time: Array, window: tuple[float, float] | None) -> Any:

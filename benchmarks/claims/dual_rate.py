@@ -77,7 +77,7 @@ def gains(seeds: tuple[int, ...]) -> Measured:
         P = np.diag([0.02, 0.05, 0.05, 0.1, 1.0, 0.1]) ** 2
         for name, found in radii.items():
             design = error_maps.FromNoise(A, C, Q, R, RATIO, name == PRINTED)
-            found.append(design.spectral_radius(P, 40))
+            found.append(design.spectral_radius(P, 15))
     return Measured({(name, "spectral_radius"): np.array(r) for name, r in radii.items()})
 
 

@@ -48,7 +48,8 @@ class Estimation:
     "outage", that of beta while the GPS is out; "jump", the RMS change of beta in the milliseconds
     in which a packet arrives; "last", the mean of beta's error over the last second, its size.
     bound: whether "bound" is wanted, the RMS of the optimal standard deviation. times: that many
-    times the seeds, where a ratio is close to its threshold.
+    times the seeds, where a ratio is close to its threshold. control_period: ticks between rows of
+    the truth; in between it is interpolated.
     """
 
     name: str
@@ -57,6 +58,7 @@ class Estimation:
     filters: tuple[Filter, ...]
     bound: bool = False
     times: int = 1
+    control_period: int = 1
 
     def chunks(self, seeds: int) -> list[tuple[int, ...]]:
         """The seeds of each case."""
@@ -64,7 +66,9 @@ class Estimation:
 
     def measure(self, seeds: tuple[int, ...]) -> Measured:
         """Drive each seed once and run every filter over its record."""
-        env: gym.Env[Any, Any] = gym.make(self.env_id, scenario=self.scenario, control_period=1)
+        env: gym.Env[Any, Any] = gym.make(
+            self.env_id, scenario=self.scenario, control_period=self.control_period
+        )
         base: Any = env.unwrapped
         estimators: dict[str, Any] = {}
         lines, example = [], None

@@ -1,0 +1,196 @@
+"""The ledger's rule, its arithmetic, and that every claim of it can be measured."""
+
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sideslip.benchmarks import papers
+from sideslip.benchmarks.claims import CLAIMS, FIGURES, SIMULATIONS, error_maps, observability
+from sideslip.benchmarks.claims.claim import (
+    Bound,
+    Claim,
+    Measured,
+    Part,
+    find,
+    number,
+    over_others,
+    ratio,
+    verdict,
+)
+from sideslip.benchmarks.claims.simulations import joined
+from sideslip.benchmarks.claims.tie_vision_appendix import residuals
+from sideslip.benchmarks.rows import METRICS, VERDICTS
+from sideslip.envs.linear import vision
+from sideslip.envs.vehicle import COMS
+from sideslip.estimators.kalman import gain
+
+
+def judged(*parts: tuple[Any, Any]) -> str:
+    """The verdict on parts of (numbers, bound)."""
+    results = {"s": Measured({(str(i), "m"): np.array(v) for i, (v, _) in enumerate(parts)})}
+    claim = Claim(
+        "p", "(1)", "t", tuple(
+            Part("l", "s", number("s", str(i), "m"), bound) for i, (_, bound) in enumerate(parts)
+        ),
+    )  # fmt: skip
+    return verdict(find(claim, results))
+
+
+BELOW = Bound("<", 1.0)
+ALWAYS, NINE, SIX, NEVER = [0.5] * 10, [0.5] * 9 + [2.0], [0.5] * 6 + [2.0] * 4, [2.0] * 10
+
+
+@pytest.mark.parametrize(
+    ("parts", "expected"),
+    [
+        ([(ALWAYS, BELOW)], "reproduced"),
+        ([(NINE, BELOW)], "reproduced"),
+        ([(SIX, BELOW)], "partly"),
+        ([(NEVER, BELOW)], "not reproduced"),
+        ([(ALWAYS, BELOW), (NEVER, BELOW)], "partly"),
+        ([(SIX, BELOW), (SIX, BELOW)], "partly"),
+        ([(NEVER, BELOW), (NEVER, BELOW)], "not reproduced"),
+        ([(NEVER, None)], "report only"),
+        ([(ALWAYS, BELOW), (NEVER, None)], "reproduced"),
+        ([([np.nan] * 3, BELOW)], "not reproduced"),
+    ],
+)
+def test_the_verdict_follows_from_the_numbers(parts: Any, expected: str) -> None:
+    assert judged(*parts) == expected
+
+
+def test_a_threshold_is_one_of_the_median_and_not_of_the_verdict() -> None:
+    results = {"s": Measured({("a", "m"): np.array([0.7, 0.8, 5.0])})}
+    part = Part("l", "s", number("s", "a", "m"), BELOW, Bound("<=", 0.75))
+    found = find(Claim("p", "(1)", "t", (part,)), results)
+    assert (found[0].median, found[0].low, found[0].high) == (0.8, 0.7, 5.0)
+    assert found[0].threshold_met is False
+    assert verdict(found) == "partly"
+
+
+def test_ratios_are_taken_seed_by_seed() -> None:
+    numbers = {("a", "beta"): [1.0, 2.0], ("b", "beta"): [2.0, 1.0], ("c", "beta"): [4.0, 8.0]}
+    results = {"s": Measured({key: np.array(value) for key, value in numbers.items()})}
+    np.testing.assert_array_equal(ratio("s", "a", "b")(results), [0.5, 2.0])
+    np.testing.assert_array_equal(over_others("s", "a", ("b", "c"), np.max)(results), [0.25, 0.25])
+    np.testing.assert_array_equal(over_others("s", "a", ("b", "c"), np.min)(results), [0.5, 2.0])
+
+
+def test_bad_claims_are_refused() -> None:
+    with pytest.raises(ValueError, match="'~'"):
+        Bound("~", 1.0)
+    with pytest.raises(ValueError, match="inf"):
+        Bound("<", float("inf"))
+    with pytest.raises(ValueError, match="at least one part"):
+        Claim("p", "(1)", "t", ())
+    empty = Part("l", "s", lambda results: np.zeros(0))
+    with pytest.raises(ValueError, match=r"\(0,\) numbers"):
+        find(Claim("p", "(1)", "t", (empty,)), {})
+
+
+def test_the_ledger_names_what_exists() -> None:
+    for claim in CLAIMS:
+        for part in claim.parts:
+            assert part.scenario in SIMULATIONS and part.metric in METRICS
+    assert all(figure.scenario in SIMULATIONS for figure in FIGURES)
+    titles = [(figure.paper, figure.title) for figure in FIGURES]
+    assert len(set(titles)) == len(titles)
+
+
+def test_chunks_cover_every_seed_once() -> None:
+    for simulation in SIMULATIONS.values():
+        seeds = [seed for chunk in simulation.chunks(7) for seed in chunk]
+        assert seeds == list(range(len(seeds)))
+
+
+def test_joined_chunks_keep_the_order_of_the_seeds() -> None:
+    parts = [Measured({("a", "m"): np.arange(k, k + 2.0)}) for k in (0, 2)]
+    np.testing.assert_array_equal(joined(parts).numbers["a", "m"], np.arange(4.0))
+
+
+def test_exact_ranks() -> None:
+    """docs/PAPERS.md section 3: dakf 4 of 5, dual-rate 4 of 6, vision alone 4 of 4."""
+    numbers = observability.coms_ranks(()).numbers
+    ranks = {name: float(value[0]) for (name, _), value in numbers.items()}
+    assert ranks == {"dakf": 4.0, "dual-rate": 4.0, "vision": 4.0}
+    singular = [[Fraction(1, 3), Fraction(2, 3)], [Fraction(1), Fraction(2)]]
+    assert observability.rank(singular) == 1
+
+
+def test_exact_matrices_are_the_packages() -> None:
+    ours = observability.bicycle(COMS, observability.SPEED, 4)
+    wanted = vision(COMS, float(observability.SPEED)).A
+    np.testing.assert_allclose(np.array(ours, float), wanted, rtol=1e-14)
+
+
+def test_pseudo_measurements_equal_fast_ones_for_square_c_only() -> None:
+    """dual-rate (33): the maps agree where (30) can be solved."""
+    rng = np.random.default_rng(5)
+    A = 0.97 * np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    for outputs, equal in ((3, True), (2, False)):
+        C = rng.normal(size=(outputs, 3))
+        L = gain(np.eye(3), C, np.eye(outputs))
+        ours, frame = error_maps.pseudo(A, C, L, 10)
+        off = error_maps.difference(ours, error_maps.fast(A, C, L, 10))
+        assert off < 1e-12 if equal else off > 0.1
+        np.testing.assert_allclose(frame, A @ ours[-1])
+
+
+def test_the_map_is_what_a_simulated_error_does() -> None:
+    """(13)-(14), (17), (19) and (31)-(32) step by step, without noise."""
+    rng = np.random.default_rng(6)
+    A, C = 0.3 * rng.normal(size=(3, 3)), rng.normal(size=(1, 3))
+    L = 0.3 * rng.normal(size=(3, 1))
+    maps, _ = error_maps.pseudo(A, C, L, 3)
+    x, start = rng.normal(size=3), rng.normal(size=3)
+    hat = x - start
+    innovation = C @ (x - hat)  # (13)
+    hat = hat + L @ innovation
+    np.testing.assert_allclose(maps[0] @ start, x - hat)
+    C_plus = C.T @ np.linalg.inv(C @ C.T)
+    G1 = C @ A @ (np.eye(3) - L @ C) @ C_plus  # (32)
+    x, hat = A @ x, A @ hat
+    pseudo = C @ hat + G1 @ innovation  # (14)
+    hat = hat + L @ (pseudo - C @ hat)  # (19)
+    np.testing.assert_allclose(maps[1] @ start, x - hat)
+    Psi = A @ A @ (np.eye(3) - L @ C) - A @ L @ G1 @ C  # (26) for i = 2
+    G2 = C @ Psi @ C_plus  # (31)
+    x, hat = A @ x, A @ hat
+    hat = hat + L @ G2 @ innovation
+    np.testing.assert_allclose(maps[2] @ start, x - hat)
+
+
+def test_gains_from_the_pseudo_noise_start_with_the_kalman_gain_and_grow() -> None:
+    """dual-rate (29) on its own application: PAPERS found a radius of 1.17 to 1.22."""
+    from sideslip.benchmarks.claims.dual_rate import COURSE_SD, RATIO, extended
+
+    A, C = extended()
+    Q = np.diag([1e-4, 1e-4, 1e-4, 20.0, 20.0, 20.0]) * 1e-3
+    R, P = np.array([[COURSE_SD**2]]), 0.01 * np.eye(6)
+    _, once = error_maps.FromNoise(A, C, Q, R, 1).frame(P)
+    np.testing.assert_allclose(once, A @ (np.eye(6) - gain(P, C, R) @ C))
+    for printed in (True, False):
+        radius = error_maps.FromNoise(A, C, Q, R, RATIO, printed).spectral_radius(P, 15)
+        assert 1.15 < radius < 1.25
+
+
+def test_the_appendix_holds_as_corrected_and_fails_as_printed() -> None:
+    """tie-vision's appendix on random time-varying systems."""
+    for (label, _), values in residuals((0, 1, 2)).numbers.items():
+        if label.endswith("printed"):
+            assert values.min() > 0.01, label
+        else:
+            assert values.max() < 1e-12, label
+
+
+@pytest.mark.long
+def test_every_threshold_is_met() -> None:
+    """The whole ledger, quickly: thresholds of docs/PAPERS.md section 3, by the median."""
+    suite = papers.run(papers.QUICK_SEEDS)
+    table = next(table for table in suite.tables if "verdict" in table.header)
+    assert len(table.cells) == len(CLAIMS)
+    missed = [row for each in suite.tables for row in each.cells if "MISSED" in " ".join(row)]
+    assert missed == []
+    assert {row.verdict for row in suite.rows} <= set(VERDICTS[1:])
