@@ -37,6 +37,7 @@ Mapping = Annotated[
 Jobs = Annotated[int | None, typer.Option("--jobs", "-j", min=1, help="Processes.")]
 
 _NAME = 32  # letters: a longer text in a table's first column is no name and may wrap
+_LEAST = 22  # letters that the first column keeps on a narrow screen
 _SHOWN = ("numpy", "scipy", "numba", "gymnasium", "control", "plotly")
 
 
@@ -253,7 +254,7 @@ def _screen(title: str, header: Sequence[str], cells: Sequence[Sequence[str]]) -
             name,
             justify="right" if right else "left",
             no_wrap=right or (i == 0 and longest <= _NAME),
-            min_width=min(longest, _NAME) if i == 0 else None,
+            min_width=min(longest, _LEAST) if i == 0 else None,
         )
     for row in cells:
         table.add_row(*map(escape, row))
