@@ -102,8 +102,13 @@ def _where(claim: Claim) -> str:
 
 def _spread(found: Found) -> str:
     if found.low == found.high:
-        return f"{found.median:.3g}"
-    return f"{found.median:.3g} [{found.low:.3g}, {found.high:.3g}]"
+        return _text(found.median)
+    return f"{_text(found.median)} [{_text(found.low)}, {_text(found.high)}]"
+
+
+def _text(value: float) -> str:
+    """Three digits; of rounding errors the order of magnitude says enough."""
+    return f"{value:.0e}" if 0.0 < abs(value) < 1e-6 else f"{value:.3g}"
 
 
 def _said(found: Found) -> str:

@@ -65,7 +65,7 @@ CLAIMS = (
     ),
     Claim(
         PAPER,
-        "IV.D",
+        "Sec. IV.D",
         "slip and disturbances are observable",
         (
             Part(
@@ -115,7 +115,7 @@ FIGURES = (
     ),
     PaperFigure(
         PAPER,
-        "IV.D: slip with a gyro bias of 0.05 deg/s",
+        "Sec. IV.D: slip with a gyro bias of 0.05 deg/s",
         BIAS,
         curves("beta", "sideslip angle / rad"),
         "Straight on at 25 km/h: the direction that the DAKF cannot see fills up.",

@@ -115,7 +115,7 @@ CLAIMS = (
     ),
     Claim(
         PAPER,
-        "3.3",
+        "Sec. 3.3",
         "gains from the pseudo measurement's noise (29) make a filter",
         tuple(
             Part(
@@ -133,7 +133,7 @@ CLAIMS = (
     ),
     Claim(
         PAPER,
-        "4.3",
+        "Sec. 4.3",
         "the extended model's rank (the paper only checks that C C^T is invertible)",
         (
             Part(

@@ -24,7 +24,7 @@ SIMULATIONS = (
 CLAIMS = (
     Claim(
         PAPER,
-        "1.3",
+        "Sec. 1.3",
         "slip is observable from vision alone",
         (
             Part(
