@@ -4,20 +4,15 @@ from functools import partial
 
 import gymnasium as gym
 import numpy as np
-from scipy.linalg import solve_discrete_are
 
 from ...agents import make_agent
 from ...agents.rollout import rollout
-from ...envs.linear import vision
 from ...envs.scenario import KMH
-from ...envs.vehicle import COMS
-from ...estimators import kalman
-from . import error_maps
 from .claim import Bound, Claim, Measured, Part, number, over_others, ratio
 from .draw import PaperFigure, curves
 from .simulations import Analysis, Control, Estimation, Filter
 from .tie_vision_appendix import residuals
-from .tie_vision_tunings import LITERAL, PERIOD, SPEED, SPREAD, R, random_tunings
+from .tie_vision_convergence import LITERAL, SPREAD, intersample_maps, random_tunings
 
 PAPER = "tie-vision"
 FIG7, FIG8, STIFF = "tie-vision-fig7", "tie-vision-fig8", "tie-vision-fig8-stiff"
@@ -44,22 +39,6 @@ def static_slip(_: tuple[int, ...]) -> Measured:
         env = gym.make("sideslip/YawVision-v0", scenario=scenario)
         left.append(abs(rollout(env, make_agent("feedforward", env))["beta"][-1]))
     return Measured({("feedforward", "static_slip"): np.array(left)})
-
-
-def intersample_maps(seeds: tuple[int, ...]) -> Measured:
-    """How far the error dynamics with pseudo-residuals are from those of a fast camera.
-
-    The vision model at 1 ms, every row slow, a Kalman gain of random process noise a seed.
-    """
-    model = vision(COMS, SPEED)
-    G, _ = model.discrete(1e-3)
-    found = []
-    for seed in seeds:
-        Q = 1e-3 * np.diag(10.0 ** np.random.default_rng(seed).uniform(-8.0, 0.0, 4))
-        K = kalman.gain(solve_discrete_are(G.T, model.C.T, Q, R), model.C, R)
-        ours, _ = error_maps.pseudo(G, model.C, K, PERIOD)
-        found.append(error_maps.difference(ours, error_maps.fast(G, model.C, K, PERIOD)))
-    return Measured({("pseudo-residuals", "difference"): np.array(found)})
 
 
 SIMULATIONS = (
