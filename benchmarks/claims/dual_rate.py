@@ -21,6 +21,8 @@ SPEED = 25.0 * KMH
 COURSE_SD = math.radians(0.14) * (60.0 * KMH) / SPEED
 SQUARE, APPLICATION = "square C", "course only"
 PRINTED, CORRECTED = "(29) as printed", "(29) corrected"
+STRONG, ANY = "strong disturbances", "any tuning"
+GROWS = 1.001  # the unobservable directions stay at 1, to the rounding of a double eigenvalue
 
 
 def extended(stiffness: float = 9100.0) -> tuple[Array, Array]:
@@ -63,21 +65,26 @@ def maps(seeds: tuple[int, ...]) -> Measured:
 
 
 def gains(seeds: tuple[int, ...]) -> Measured:
-    """Growth of the error from sample to sample with gains from the noise (29).
+    """Growth of the error from sample to sample with gains from the noise (29), a tuning a seed.
 
-    Process noise 1e-4 per second on the states and the same 5 to 50 per second on each of the
-    three extended states, log-uniform.
+    Strong: process noise 1e-4 per second on the states and the same 5 to 50 on each of the three
+    extended states, log-uniform. Any: 1e-6 to 1 on each state, 1e-3 to 100 on each extended one.
     """
     A, C = extended()
     R = np.array([[COURSE_SD**2]])
-    radii: dict[str, list[float]] = {PRINTED: [], CORRECTED: []}
+    radii: dict[str, list[float]] = {}
     for seed in seeds:
-        q = 10.0 ** np.random.default_rng(seed).uniform(math.log10(5.0), math.log10(50.0))
-        Q = np.diag([1e-4, 1e-4, 1e-4, q, q, q]) * 1e-3
+        rng = np.random.default_rng(seed)
+        strong = 10.0 ** rng.uniform(math.log10(5.0), math.log10(50.0))
+        tunings = {
+            STRONG: [1e-4] * 3 + [strong] * 3,
+            ANY: 10.0 ** rng.uniform([-6.0] * 3 + [-3.0] * 3, [0.0] * 3 + [2.0] * 3),
+        }
         P = np.diag([0.02, 0.05, 0.05, 0.1, 1.0, 0.1]) ** 2
-        for name, found in radii.items():
-            design = error_maps.FromNoise(A, C, Q, R, RATIO, name == PRINTED)
-            found.append(design.spectral_radius(P, 15))
+        for tuning, q in tunings.items():
+            for form in (PRINTED, CORRECTED):
+                design = error_maps.FromNoise(A, C, np.diag(q) * 1e-3, R, RATIO, form == PRINTED)
+                radii.setdefault(f"{form}, {tuning}", []).append(design.spectral_radius(P, 30))
     return Measured({(name, "spectral_radius"): np.array(r) for name, r in radii.items()})
 
 
@@ -119,17 +126,19 @@ CLAIMS = (
         "gains from the pseudo measurement's noise (29) make a filter",
         tuple(
             Part(
-                f"spectral radius, {name}",
+                f"spectral radius, {form}, {tuning}",
                 GAINS,
-                number(GAINS, name, "spectral_radius"),
-                Bound("<=", 1.0 + 1e-9),
-                Bound(">=", 1.1),
+                number(GAINS, f"{form}, {tuning}", "spectral_radius"),
+                Bound("<=", GROWS),
+                Bound(">=", 1.1) if tuning == STRONG else None,
                 "spectral_radius",
             )
-            for name in (PRINTED, CORRECTED)
+            for tuning in (STRONG, ANY)
+            for form in (PRINTED, CORRECTED)
         ),
         "The pseudo measurements of a frame all repeat one innovation; taken for independent ones "
-        "they are used a hundred times.",
+        "they are used a hundred times. The error grows where all three extended states are driven "
+        "hard (we looked for such a tuning; the paper gives none), and mostly stays bounded else.",
     ),
     Claim(
         PAPER,

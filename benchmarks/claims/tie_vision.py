@@ -152,7 +152,9 @@ CLAIMS = (
                 for gain in (LITERAL, SPREAD)
             ),
         ),
-        "C has full row rank only: (20) cannot know the error that the sample does not see.",
+        "C has full row rank only: (20) cannot know the error that the sample does not see. How "
+        "often the filter diverges depends on the gain between samples, which the paper leaves "
+        "open.",
     ),
     Claim(
         PAPER,
