@@ -88,7 +88,7 @@ def packet_rows(
 ) -> Array:
     """Packets of one sensor in capture order, (count, PACKET_WIDTH).
 
-    captured, arrived: (count,) ticks. values: (count, up to 4), quality: (count,).
+    captured, arrived: (count,) ticks. values: (count, up to VALUES), quality: (count,).
     """
     packets = np.zeros((len(captured), PACKET_WIDTH))
     packets[:, PACKET.sensor] = SLOW_NAMES.index(sensor)

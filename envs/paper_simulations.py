@@ -27,8 +27,8 @@ _SIMULATED: dict[str, Any] = {  # the plant of the papers' own equations
     "scored": False,
 }
 _ON_THE_ROAD: dict[str, Any] = {"half_width": 200.0, "scored": False}  # all that the plant has
-_QUIET: dict[str, float] = {"disturbance_force": 0.0, "disturbance_moment": 0.0}
-_WIND: dict[str, float] = {"wind_force": 200.0, "wind_start": 4.0, "wind_length": 4.0}
+_QUIET: dict[str, Any] = {"disturbance_force": 0.0, "disturbance_moment": 0.0}
+_WIND: dict[str, Any] = {"wind_force": 200.0, "wind_start": 4.0, "wind_length": 4.0}
 
 # given: sine steering, 25 km/h, tyres 1.2 times the filter's
 _FIG7 = Scenario(

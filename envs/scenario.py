@@ -23,22 +23,28 @@ SHORTEST_GPS_PERIOD = 0.05  # s; an env keeps room for its packets
 class Scenario:
     """What happens in an episode. Ranges are drawn by the seed; SI units.
 
-    steering: a kind of `STEERING_KINDS`, built from onset, amplitude, frequency (random: two pairs
-    of sines) and hold (of a step, or from one lane change to the next). mirror: the seed draws the
-    side of steering and wind. front_stiffness and rear_stiffness are factors on the vehicle's;
-    draws that make the car unstable at the drawn speed are drawn again and counted. friction is the
-    road's and replaces the vehicle's. acceleration: None holds the speed. speed_change: m/s by
+    Driver: steering is a kind of `STEERING_KINDS`, built from onset, amplitude, frequency (random:
+    two pairs of sines) and hold (of a step, or from one lane change to the next). mirror: the seed
+    draws the side of steering and wind. acceleration: None holds the speed. speed_change: m/s by
     which the held speed changes at an even rate, from change_start over change_length. surge,
-    surge_frequency: amplitude and frequency of a sine of the driver's acceleration, which the held
-    speed follows. wind_height: m above the roll axis. disturbance_*: an Ornstein-Uhlenbeck force
-    and moment. curvature, bank (rad, left side up) and grade (rad, uphill) come in from curve_start
-    over curve_ramp metres; a negative curve_start has them from the beginning. vehicle and nominal:
-    parameters that replace those of the env. noise: sensor noise that replaces the default.
-    camera_delays: a repeating pattern that replaces the id's, and camera_jitter with it; gps_period
-    and gps_delays likewise. hdop, hdop_spread, hdop_time: median of the GPS's HDOP, standard
-    deviation of its logarithm and the time in which that forgets; hdop_law of `HDOP_LAWS`: how much
-    of the noise follows it. small_angle, linear_tyres, lags, roll: the plant. scored: whether it
-    counts in a score (the papers' experiments never do).
+    surge_frequency: a sine of the driver's acceleration, which the held speed follows.
+
+    Car: front_stiffness and rear_stiffness are factors on the vehicle's; draws that make the car
+    unstable at the drawn speed are drawn again and counted. vehicle and nominal: parameters that
+    replace those of the env. small_angle, linear_tyres, lags, roll: the plant.
+
+    Surroundings: friction is the road's and replaces the vehicle's. curvature, bank (rad, left side
+    up) and grade (rad, uphill) come in from curve_start over curve_ramp metres; a negative
+    curve_start has them from the beginning. wind_*: a side wind, wind_arm ahead of the centre of
+    gravity and wind_height above the roll axis. disturbance_*: an Ornstein-Uhlenbeck force and
+    moment.
+
+    Sensors: noise replaces the default. camera_delays: a repeating pattern that replaces the id's,
+    and camera_jitter with it; gps_period and gps_delays likewise. hdop, hdop_spread, hdop_time:
+    median of the GPS's HDOP, standard deviation of its logarithm, and the time in which that
+    forgets. hdop_law of `HDOP_LAWS`: how much of the noise follows HDOP.
+
+    scored: whether it counts in a score (the papers' experiments never do).
 
     Raises ValueError for a value out of place and names the field.
     """

@@ -9,6 +9,7 @@ from scipy import stats
 
 from sideslip.envs import SlowSensor, StabilityEnv
 from sideslip.envs.record import CAMERA, GPS, PACKET
+from sideslip.envs.scenario import SHORTEST_GPS_PERIOD
 from sideslip.envs.sensor_sets import SENSOR_SETS
 from sideslip.envs.sensors import IN_FLIGHT, link_of
 
@@ -215,3 +216,23 @@ def test_more_packets_under_way_than_there_is_room_for_are_refused(changes: Any)
         link_of(SlowSensor(**changes))
     with pytest.raises(ValueError, match="under way"):
         StabilityEnv(camera=changes)
+
+
+@pytest.mark.parametrize("n", [1, 10, 1000])
+def test_a_scenario_sets_the_gps_clock_and_its_packets_have_room(n: int) -> None:
+    clock = {"gps_period": SHORTEST_GPS_PERIOD, "gps_delays": [0.12, 0.05, 0.1], "duration": 60.0}
+    env = StabilityEnv("fusion", control_period=n, gps={"duplicate": 1.0, "delays": [0.0]})
+    env.reset(seed=0, options={"scenario": LINEAR | clock})
+    told = env.slow_sensors["gps"]
+    assert (told.period, told.delays, told.duplicate) == (0.05, (0.12, 0.05, 0.1), 1.0)
+    found = packets(play(env, [0.0] * (4000 // n)))
+    gps = found[found[:, PACKET.sensor] == GPS]
+    first = gps[np.unique(gps[:, SEQUENCE], return_index=True)[1]]
+    assert np.array_equal(first[:, CAPTURED], 50.0 * first[:, SEQUENCE])
+    late = np.array([120.0, 50.0, 100.0])[first[:, SEQUENCE].astype(int) % 3]
+    assert np.array_equal(first[:, ARRIVED] - first[:, CAPTURED], late)
+    counts = np.bincount(gps[:, SEQUENCE].astype(int))
+    assert np.all(counts[:70] == 2)
+    env.reset(seed=0)
+    assert env.slow_sensors["gps"].period == 0.2
+    assert StabilityEnv("vision", scenario=LINEAR | clock).slow_sensors.keys() == {"camera"}

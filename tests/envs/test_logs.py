@@ -166,3 +166,20 @@ def test_the_stanford_log() -> None:
     beta = log.truth["beta"] / DEG
     assert -5.5 < beta.min() < -5.0
     assert 3.5 < beta.max() < 4.5
+
+
+def test_roll_rate_hdop_and_satellites_are_read(tmp_path: Path) -> None:
+    table = drive(100)
+    table["roll_rate_degps"] = np.sin(table["time_s"])
+    table["course_rad"] = np.nan
+    table.loc[5::20, "course_rad"] = 0.1
+    table["gps_hdop_count"] = 1.0 + 0.01 * np.arange(100)
+    table["gps_satellites_count"] = np.arange(100) // 10
+    log = read_log(saved(table, tmp_path))
+    assert "roll_rate" in log.record.present
+    rate = log.record.fast[:, FAST.roll_rate]
+    np.testing.assert_allclose(rate, DEG * table["roll_rate_degps"], rtol=1e-15)
+    packets = log.record.packets_of("gps")
+    np.testing.assert_array_equal(packets[:, PACKET.value + 4], table["gps_hdop_count"][5::20])
+    np.testing.assert_array_equal(packets[:, PACKET.value + 5], [0, 2, 4, 6, 8])
+    np.testing.assert_array_equal(packets[:, PACKET.quality], 1.0)  # few satellites or not

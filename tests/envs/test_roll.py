@@ -72,7 +72,7 @@ def test_both_laws_hold_on_every_plant_and_on_a_bank(
     v_y: float, phi: float, phi_dot: float, car: Car, plant: tuple[int, int]
 ) -> None:
     state = Motion(9.0, v_y, 0.2, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, phi, phi_dot)
-    how = {"car": car, "road": BANKED, "small_angle": plant[0], "law": plant[1]}
+    how: dict[str, Any] = {"car": car, "road": BANKED, "small_angle": plant[0], "law": plant[1]}
     rate = slope(state, Push(70.0, 0.0, 25.0), **how)
     felt = gravity_at(state, BANKED, plant[0])
     a_y = rate.v_y + 0.2 * 9.0 + felt[1] + 9.81 * phi
@@ -113,7 +113,7 @@ def test_an_undamped_body_on_tyres_without_force_keeps_its_energy() -> None:
 
     def energy(x: Motion) -> float:
         moving = 0.5 * car.m * x.v_y**2 - car.S * x.v_y * x.phi_dot + 0.5 * car.I_x * x.phi_dot**2
-        return moving + 0.5 * (car.K_x - car.S * 9.81) * x.phi**2
+        return float(moving + 0.5 * (car.K_x - car.S * 9.81) * x.phi**2)
 
     before, momentum = energy(state), car.m * state.v_y - car.S * state.phi_dot
     for _ in range(2000):
