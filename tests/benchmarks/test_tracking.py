@@ -1,0 +1,58 @@
+"""dakf-stability Fig. 7: the thresholds of PAPERS section 3, and what they leave out."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sideslip.benchmarks.tracking import compared, drive, tracking
+
+FIG7: dict[str, Any] = {
+    "base": "dakf-fig6",
+    "name": "step steer by wire",
+    "steering": "step",
+    "onset": 1.0,
+    "amplitude": 0.06,
+    "hold": 100.0,
+    "gps_outage": None,
+    "half_width": 1e6,  # ten seconds of a turn leave any proving ground
+    "lags": True,
+    "vehicle": {
+        "front_stiffness": 7000.0,
+        "rear_stiffness": 7000.0,
+        "motor_lag": 0.0,
+        "steering_lag": 0.03,
+    },
+}
+
+pytestmark = pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning")
+
+
+def test_the_numbers_are_those_of_the_episode() -> None:
+    episode = drive(0, FIG7 | {"duration": 2.0})
+    found = tracking(episode)
+    assert found.rms_beta == np.sqrt(np.mean((episode["beta"] - episode["beta_ref"]) ** 2))
+    assert found.rms_gamma == np.sqrt(np.mean((episode["gamma"] - episode["gamma_ref"]) ** 2))
+    assert found.peak_beta == np.max(np.abs(episode["beta"]))
+    assert not found.failed
+    assert episode["t"][-1] == 2.0
+    assert len(episode["t"]) == 2001
+    assert 0.0 < found.steered < 1.0
+    none = tracking(drive(0, FIG7 | {"duration": 2.0}, "none"))
+    assert (none.saturated, none.steered) == (0.0, 0.0)
+
+
+@pytest.mark.long
+def test_control_tracks_better_than_none() -> None:
+    """Worst of ten seeds: beta at most 0.80 of the error without control, gamma 0.50."""
+    found = compared(range(10), FIG7)
+    assert found["rms_beta"].max() <= 0.80
+    assert found["rms_gamma"].max() <= 0.50
+    assert not found["failed"].any()
+
+
+@pytest.mark.long
+def test_a_larger_step_saturates_the_motors() -> None:
+    small, large = (compared(range(3), FIG7 | {"amplitude": a}) for a in (0.06, 0.1))
+    assert (large["saturated"] > 3.0 * small["saturated"]).all()
+    assert (large["saturated"] > 0.02).all()
