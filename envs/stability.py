@@ -148,6 +148,9 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
         self._drawn = np.zeros(DRAWS_WIDTH)
         self.ticks_done = 0  # rows of the newest record
         self.delivered = 0  # its packets
+        # the record as it stood before the newest reset: a vector env resets within a step
+        self.final_rows, self.final_packets = self.rows.copy(), self.packets.copy()
+        self.final_ticks_done, self.final_delivered = 0, 0
         self._over = True
 
     def _template(self, scenario: Scenario, vehicle: Vehicle) -> Template:
@@ -172,6 +175,9 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
         self._now = now
         key = int(self.np_random.integers(0, 2**64, dtype=np.uint64))
         obs = np.empty(len(self.layout), np.float32)
+        self.rows, self.final_rows = self.final_rows, self.rows
+        self.packets, self.final_packets = self.final_packets, self.packets
+        self.final_ticks_done, self.final_delivered = self.ticks_done, self.delivered
         reset_vehicle(
             now.params,
             now.low,

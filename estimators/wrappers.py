@@ -13,22 +13,9 @@ from ..envs.layout import Entry
 from ..envs.vehicle import Vehicle, vehicle_from
 from .estimator import Estimator
 from .make import make_estimator
-from .models import UNITS
 from .observing import observe_entry
+from .outputs import outputs_of
 
-BOUNDS = {
-    "beta": np.pi / 2.0,
-    "gamma": 10.0,
-    "psi": np.pi,
-    "y_l": 200.0,
-    "d1": 100.0,
-    "d2": 1000.0,
-    "F_d": 1e5,
-    "N_d": 1e5,
-}
-"""Estimates are clipped here, the heading is wrapped."""
-
-_TRUE = ("beta", "gamma")  # states whose truth stands in the info
 _MAY_STAND_BETWEEN = (PassiveEnvChecker, OrderEnforcing)
 _OFFERED = ("rows", "ticks_done", "packets", "delivered", "slow_sensors", "nominal", "layout")
 
@@ -77,35 +64,17 @@ class EstimateObservation(
             name=name,
         )
         gym.Wrapper.__init__(self, env)
-        self._base = _base_of(env)
+        self._base = base_of(env)
         self._kind, self._options = estimator, dict(options or {})
         self._vehicle = None if vehicle is None else vehicle_from(vehicle)
         self._told: Any = None
         self.estimator: Estimator = self._current_estimator()
-        states = self.estimator.names
-        for output in outputs:
-            if output not in states:
-                raise ValueError(
-                    f"{estimator} has no state {output!r}; it has: {', '.join(states)}"
-                )
-        before = "" if name is None else f"{name}_"
-        self._keys = f"{before}beta_hat", f"{before}beta_std", f"{before}nees"
         inner: tuple[Entry, ...] = () if replace else env.get_wrapper_attr("layout")
-        hats = [Entry(f"{before}{s}_hat", UNITS[s], -BOUNDS[s], BOUNDS[s]) for s in outputs]
-        stds = [Entry(f"{before}{s}_std", UNITS[s], 0.0, BOUNDS[s]) for s in outputs]
-        self.layout: tuple[Entry, ...] = (*inner, *hats, *(stds if std else ()))
-        names = [each.name for each in self.layout]
-        twice = sorted({each for each in names if names.count(each) > 1})
-        if twice:
-            raise ValueError(f"{', '.join(twice)} would stand twice; give this wrapper a name=...")
-        low, high = np.array([each[2:] for each in self.layout]).T.astype(np.float32)
+        self._says = outputs_of(estimator, self.estimator.names, outputs, std, name, inner)
+        self.layout: tuple[Entry, ...] = self._says.layout
+        low, high = self._says.bounds
         self.observation_space = gym.spaces.Box(low, high, dtype=np.float32)
-        self._kept, self._width = len(inner), len(self.layout)
-        judged = [s in _TRUE for s in outputs]
-        columns = [states.index(s) for s in outputs], [s == "psi" for s in outputs], judged
-        self._plan = np.array(columns, np.int64).T.copy()
-        self._limits = high[self._kept : self._kept + len(outputs)].astype(np.float64)
-        self._judges = any(judged)
+        self._width = len(self.layout)
         self._said = np.zeros(3)
 
     def _current_estimator(self) -> Estimator:
@@ -153,7 +122,7 @@ class EstimateObservation(
     def _observed(
         self, obs: npt.NDArray[np.float32], info: dict[str, Any]
     ) -> npt.NDArray[np.float32]:
-        base, estimator = self._base, self.estimator
+        base, estimator, says = self._base, self.estimator, self._says
         out, said, rows, done = np.empty(self._width, np.float32), self._said, base.ticks_done, 0
         while True:
             done = observe_entry()(
@@ -165,9 +134,9 @@ class EstimateObservation(
                 base.delivered,
                 done,
                 obs,
-                self._kept,
-                self._plan,
-                self._limits,
+                says.kept,
+                says.plan,
+                says.limits,
                 info["beta"],
                 info["gamma"],
                 out,
@@ -177,15 +146,15 @@ class EstimateObservation(
                 break
             estimator.design_missing()
         hat, std, nees = said.tolist()
-        keys = self._keys
+        keys = says.keys
         info[keys[0]], info[keys[1]] = hat, std
-        if self._judges:
+        if says.judged:
             info[keys[2]] = nees
         base.annotate(**{keys[0]: hat})
         return out
 
 
-def _base_of(env: gym.Env[Any, Any]) -> Any:
+def base_of(env: gym.Env[Any, Any]) -> Any:
     """The base env; TypeError if anything that may hide ticks from the estimator is in between."""
     layer = env
     while isinstance(layer, gym.Wrapper):

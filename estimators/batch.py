@@ -1,0 +1,226 @@
+"""Many filters of one kind at work side by side, each with its own memory and covariance."""
+
+import copy
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..envs.record import FAST_WIDTH, PACKET_WIDTH, TICK, Log, Record, SlowSensor
+from ..envs.vehicle import COMS, Vehicle, vehicle_from
+from .batched import batch_entries
+from .designs import Designs, Told
+from .estimates import Estimates
+from .estimator import Estimator
+from .memory import FILTER, Counters
+
+Array = npt.NDArray[np.float64]
+Whole = npt.NDArray[np.int64]
+Sensors = Mapping[str, SlowSensor]
+Car = Vehicle | str | Mapping[str, Any]
+
+
+class BatchEstimator:
+    """N filters of one name; built by `make_batch`.
+
+    `batch[i]` is the `Estimator` at work in row i: it shares that row's memory. `filters` (N, L)
+    are the records of all filters and their layers. Filters that are told the same, but for the
+    phases of clocks, share one table of gains.
+
+    Raises ValueError if the filters have different states.
+    """
+
+    def __init__(
+        self, name: str, told: Sequence[Told], dt: float, options: Mapping[str, Any]
+    ) -> None:
+        self.name, self.dt = name, dt
+        self._designs = Designs(name, dt, options)
+        self._told: list[Told] = list(told)
+        self._of: list[Any] = [None] * len(told)  # each row's design
+        first = self._designs.built(told[0])
+        self.names, self.units = first.names, first.units
+        self.filters = np.zeros((len(told), len(first.filters)), FILTER).view(np.recarray)
+        self.tell(range(len(told)), told)
+
+    def __len__(self) -> int:
+        return len(self.filters)
+
+    def __getitem__(self, i: int) -> Estimator:
+        design = self._of[i]
+        estimator = copy.copy(self._designs[design])
+        estimator.sensors = {name: self._told[i].sensors[name] for name in estimator.sensors}
+        estimator.filters, estimator.gains = self.filters[i], self._designs.gains(design)
+        return estimator
+
+    def tell(self, rows: Iterable[int], told: Iterable[Told]) -> None:
+        """Tell some rows' filters what their cars are, to be reset then.
+
+        A filter that is told more than other phases is built anew.
+        """
+        changed = False
+        for i, each in zip(rows, told, strict=True):
+            self._told[i], design = each, each.design
+            if design == self._of[i]:
+                continue
+            built = self._designs.built(each)
+            if built.names != self.names:
+                raise ValueError(
+                    f"{self.name}: the filters of a batch have the same states, row 0 has "
+                    f"{', '.join(self.names)} and row {i} {', '.join(built.names)}"
+                )
+            self._of[i], self.filters[i], changed = design, built.filters, True
+        if changed:
+            self._places = self._designs.place(self._of)
+
+    def reset(
+        self,
+        mask: npt.ArrayLike | None = None,
+        sensors: Sensors | Sequence[Sensors] | None = None,
+        first: int = 0,
+    ) -> None:
+        """Let the filters of a mask (N,) forget everything (None: all); see `Estimator.reset`.
+
+        sensors: slow sensors whose clocks have a new phase, of all filters or a list (N,).
+        """
+        for i in _rows_of(mask, len(self)):
+            told = sensors if sensors is None or isinstance(sensors, Mapping) else sensors[i]
+            self[i].reset(told, first)
+
+    def step(
+        self,
+        fast: Array,
+        packets: Array,
+        counts: npt.ArrayLike | None = None,
+        rows: npt.ArrayLike | None = None,
+    ) -> None:
+        """Take each filter's fast rows (N, k, FAST_WIDTH) and packets (N, room, PACKET_WIDTH).
+
+        counts, rows: (N,), how many of each filter's packets and rows are there (all if None; a
+        filter with none of either stands still). Raises ValueError for other shapes.
+        """
+        N = len(self)
+        fast = np.ascontiguousarray(fast, np.float64)
+        packets = np.ascontiguousarray(packets, np.float64)
+        _check_shape("fast rows", fast, N, FAST_WIDTH)
+        _check_shape("packets", packets, N, PACKET_WIDTH)
+        rows = _how_many("rows", fast.shape[1] if rows is None else rows, N, fast.shape[1])
+        counts = _how_many(
+            "counts", packets.shape[1] if counts is None else counts, N, packets.shape[1]
+        )
+        self.take(None, fast, rows, packets, counts)
+
+    def take(
+        self,
+        mask: npt.NDArray[np.bool_] | None,
+        fast: Array,
+        rows: Whole,
+        packets: Array,
+        counts: Whole,
+        *observed: Any,
+    ) -> None:
+        """`step` of the filters of a mask without any checks of C-contiguous arrays.
+
+        observed: what `observe_batch` takes after `counts`, to write observations as well.
+        """
+        done = np.full(len(self), -1) if mask is None else np.where(mask, -1, rows)
+        call = batch_entries()[1 if observed else 0]
+        memory = self.filters, self._designs.pool, self._places, done
+        while call(*memory, fast, rows, packets, counts, *observed) > 0:
+            self._design_missing(np.flatnonzero(done < rows))
+
+    def _design_missing(self, rows: Whole) -> None:
+        """Make the tables of gains that compiled code has just asked for, each once."""
+        wanted = {(self._of[i], int(self.filters[i, 0].wanted)): int(i) for i in rows}
+        for i in wanted.values():
+            self[i].design_missing()
+
+    def run(self, sources: Sequence[Log | Record]) -> list[Estimates]:
+        """`Estimator.run` of each filter on a record of its own."""
+        if len(sources) != len(self):
+            raise ValueError(f"{self.name}: {len(self)} filters, got {len(sources)} records")
+        return [self[i].run(source) for i, source in enumerate(sources)]
+
+    def get_state(self) -> Any:
+        """A snapshot that `set_state` continues from, bit for bit."""
+        return self.filters.copy()
+
+    def set_state(self, snapshot: Any) -> None:
+        """Go back to a snapshot of this batch or of one built with the same arguments."""
+        self.filters[:] = snapshot
+
+    @property
+    def x(self) -> Array:
+        """The states now, (N, n)."""
+        return np.array([each.x for each in self])
+
+    @property
+    def P(self) -> Array:
+        """Their covariances now, (N, n, n), as `Estimator.P`."""
+        return np.array([each.P for each in self])
+
+    @property
+    def counts(self) -> dict[str, Whole]:
+        """All counters by name, each (N,)."""
+        told = [each.counts for each in self]
+        return {name: np.array([each[name] for each in told]) for name in Counters._fields}
+
+    def __repr__(self) -> str:
+        return f"<{len(self)} x {self.name}: {', '.join(self.names)}>"
+
+
+def make_batch(
+    name: str,
+    count: int,
+    *,
+    vehicle: Car | Sequence[Car] = COMS,
+    sensors: Sensors | Sequence[Sensors] | None = None,
+    dt: float = TICK,
+    speed: float | Sequence[float | None] | None = None,
+    **options: Any,
+) -> BatchEstimator:
+    """Build `count` filters by name; the arguments are those of `make_estimator`.
+
+    vehicle, sensors and speed may each be a list of `count`: one for each filter. Raises what
+    `make_estimator` raises, and ValueError for a list of another length.
+    """
+    if count < 1:
+        raise ValueError(f"{name}: a batch has at least one filter, got {count}")
+    cars = _each("vehicle", vehicle, count, (Vehicle, str, Mapping))
+    clocks = _each("sensors", sensors or {}, count, (Mapping,))
+    speeds = _each("speed", speed, count, (int, float, np.number, type(None)))
+    told = [Told(vehicle_from(c), s, v) for c, s, v in zip(cars, clocks, speeds, strict=True)]
+    batch = BatchEstimator(name, told, dt, options)
+    batch.reset(None, clocks)
+    return batch
+
+
+def _each(what: str, value: Any, count: int, alone: tuple[type, ...]) -> list[Any]:
+    if isinstance(value, alone):
+        return [value] * count
+    if len(value) != count:
+        raise ValueError(f"{what}: one or a list of {count}, got {len(value)}")
+    return list(value)
+
+
+def _rows_of(mask: npt.ArrayLike | None, count: int) -> list[int]:
+    if mask is None:
+        return list(range(count))
+    chosen = np.asarray(mask)
+    if chosen.shape != (count,) or chosen.dtype != np.bool_:
+        raise ValueError(
+            f"a mask has shape ({count},) and dtype bool, got {chosen.shape} and {chosen.dtype}"
+        )
+    return [int(i) for i in np.flatnonzero(chosen)]
+
+
+def _check_shape(what: str, array: Array, count: int, width: int) -> None:
+    if array.ndim != 3 or array.shape[::2] != (count, width):
+        raise ValueError(f"{what} have shape ({count}, k, {width}), got {array.shape}")
+
+
+def _how_many(what: str, value: npt.ArrayLike, count: int, room: int) -> Whole:
+    numbers = np.ascontiguousarray(np.broadcast_to(np.asarray(value, np.int64), (count,)))
+    if numbers.min() < 0 or numbers.max() > room:
+        raise ValueError(f"{what} are 0 to {room}, got {numbers.min()} to {numbers.max()}")
+    return numbers

@@ -1,0 +1,165 @@
+"""Where a batch of estimators finds the records of a vector env's cars."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+import numpy.typing as npt
+from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv, VectorEnv
+
+from ..envs.layout import Entry
+from ..envs.record import FAST_WIDTH, PACKET_WIDTH, SlowSensor
+from ..envs.vehicle import Vehicle
+from .designs import Told
+from .wrappers import base_of
+
+Array = npt.NDArray[np.float64]
+Whole = npt.NDArray[np.int64]
+
+
+class Batch(NamedTuple):
+    """The records of N cars' newest step."""
+
+    fast: Array  # (N, k, FAST_WIDTH)
+    rows: Whole  # (N,), how many of them are there
+    packets: Array  # (N, room, PACKET_WIDTH)
+    counts: Whole  # (N,)
+
+
+class Batched(Protocol):
+    """What a vector env that steps all cars at once offers.
+
+    slow_sensors, nominal and held_speed: of each car, (N,). The final_... ones are a row's record
+    as it stood before its newest reset; they are read in the step that ended its episode.
+    """
+
+    rows: Array
+    ticks_done: Whole
+    packets: Array
+    delivered: Whole
+    final_rows: Array
+    final_ticks_done: Whole
+    final_packets: Array
+    final_delivered: Whole
+    slow_sensors: Sequence[Mapping[str, SlowSensor]]
+    nominal: Sequence[Vehicle]
+    held_speed: Sequence[float | None]
+    layout: tuple[Entry, ...]
+    dt: float
+
+
+class BatchedRecords:
+    """The records of a `Batched` env."""
+
+    def __init__(self, env: Any) -> None:
+        self._env = env
+        self.layout: tuple[Entry, ...] = env.layout
+        self.dt: float = env.dt
+
+    def newest(self) -> Batch:
+        """Of the newest step, or of tick 0 where a car was reset."""
+        env = self._env
+        return _contiguous(env.rows, env.ticks_done, env.packets, env.delivered)
+
+    def final(self, ended: npt.NDArray[np.bool_]) -> Batch:
+        """Of the last step of the episodes that ended in this step."""
+        env = self._env
+        return _contiguous(
+            env.final_rows, env.final_ticks_done, env.final_packets, env.final_delivered
+        )
+
+    def told(self, rows: Sequence[int]) -> list[Told]:
+        """What the estimators of some rows are told, by the env."""
+        env = self._env
+        return [Told(env.nominal[i], env.slow_sensors[i], env.held_speed[i]) for i in rows]
+
+    def annotate(self, key: str, values: Array, mask: npt.NDArray[np.bool_]) -> None:
+        """Numbers to draw: a batch is not drawn."""
+
+
+class SyncRecords:
+    """The records of the environments in a `SyncVectorEnv`, copied into one array each."""
+
+    def __init__(self, env: SyncVectorEnv[Any, Any]) -> None:
+        self._bases = [base_of(each) for each in env.envs]
+        layouts = [each.get_wrapper_attr("layout") for each in env.envs]
+        for i, layout in enumerate(layouts):
+            if layout != layouts[0]:
+                raise ValueError(f"environment {i} of the vector env has another layout than 0")
+        self.layout: tuple[Entry, ...] = layouts[0]
+        self.dt: float = self._bases[0].dt
+        N = len(self._bases)
+        ticks = max(len(base.rows) for base in self._bases)
+        room = max(len(base.packets) for base in self._bases)
+        self._batch = Batch(
+            np.zeros((N, ticks, FAST_WIDTH)),
+            np.zeros(N, np.int64),
+            np.zeros((N, room, PACKET_WIDTH)),
+            np.zeros(N, np.int64),
+        )
+
+    def newest(self) -> Batch:
+        """Of the newest step, or of tick 0 where a car was reset."""
+        fast, rows, packets, counts = self._batch
+        for i, base in enumerate(self._bases):
+            n, m = base.ticks_done, base.delivered
+            fast[i, :n], packets[i, :m] = base.rows[:n], base.packets[:m]
+            rows[i], counts[i] = n, m
+        return self._batch
+
+    def final(self, ended: npt.NDArray[np.bool_]) -> Batch:
+        """Of the last step of the episodes that ended in this step."""
+        fast, rows, packets, counts = self._batch
+        for i in np.flatnonzero(ended):
+            base = self._bases[i]
+            n, m = base.final_ticks_done, base.final_delivered
+            fast[i, :n], packets[i, :m] = base.final_rows[:n], base.final_packets[:m]
+            rows[i], counts[i] = n, m
+        return self._batch
+
+    def told(self, rows: Sequence[int]) -> list[Told]:
+        """What the estimators of some rows are told, by their environments."""
+        bases = [self._bases[i] for i in rows]
+        return [
+            Told(base.nominal, base.slow_sensors, getattr(base, "held_speed", None))
+            for base in bases
+        ]
+
+    def annotate(self, key: str, values: Array, mask: npt.NDArray[np.bool_]) -> None:
+        """Numbers to draw beside the truth."""
+        for base, value, told in zip(self._bases, values.tolist(), mask, strict=True):
+            if told:
+                base.annotate(**{key: value})
+
+
+def _contiguous(fast: Any, rows: Any, packets: Any, counts: Any) -> Batch:
+    """Arrays as compiled code takes them, copied only where they are not."""
+    return Batch(
+        np.ascontiguousarray(fast, np.float64),
+        np.ascontiguousarray(rows, np.int64),
+        np.ascontiguousarray(packets, np.float64),
+        np.ascontiguousarray(counts, np.int64),
+    )
+
+
+def records_of(env: VectorEnv[Any, Any, Any]) -> SyncRecords | BatchedRecords:
+    """The records of a bare vector env.
+
+    Raises TypeError for workers, whose records are out of reach, and where there are no records.
+    """
+    if isinstance(env, AsyncVectorEnv):
+        raise TypeError(
+            "the records in AsyncVectorEnv's worker processes are out of reach; wrap each "
+            "environment in its worker with sideslip.estimators.EstimateObservation: "
+            "gym.make_vec(id, vectorization_mode='async', wrappers=[functools.partial("
+            "EstimateObservation, estimator=...)]), or use vectorization_mode='sync'"
+        )
+    if isinstance(env, SyncVectorEnv):
+        return SyncRecords(env)
+    missing = [name for name in Batched.__annotations__ if not hasattr(env, name)]
+    if missing:
+        raise TypeError(
+            "EstimateObservation reads the records of a sideslip vector environment; "
+            f"{type(env).__name__} has no {', '.join(missing)}"
+        )
+    return BatchedRecords(env)
