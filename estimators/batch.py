@@ -1,7 +1,7 @@
 """Many filters of one kind at work side by side, each with its own memory and covariance."""
 
 import copy
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -52,6 +52,9 @@ class BatchEstimator:
         estimator.sensors = {name: self._told[i].sensors[name] for name in estimator.sensors}
         estimator.filters, estimator.gains = self.filters[i], self._designs.gains(design)
         return estimator
+
+    def __iter__(self) -> Iterator[Estimator]:
+        return (self[i] for i in range(len(self)))
 
     def tell(self, rows: Iterable[int], told: Iterable[Told]) -> None:
         """Tell some rows' filters what their cars are, to be reset then.

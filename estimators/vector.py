@@ -89,7 +89,7 @@ class EstimateObservation(
         self._ended: Mask | None = None  # rows that the next step resets; None: all are to be reset
 
     @property
-    def spec(self) -> EnvSpec | None:
+    def spec(self) -> EnvSpec | None:  # type: ignore[override]  # as in VectorWrapper
         """The env's with the single wrapper; JSON-able, None where the env has none."""
         if self.env.spec is None:
             return None

@@ -1,0 +1,201 @@
+"""BatchEstimator: every row has the bits of the filter that works alone."""
+
+import copy
+import dataclasses
+import pickle
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sideslip.envs import COMS, Log, SlowSensor
+from sideslip.envs.record import FAST_WIDTH, PACKET, PACKET_WIDTH
+from sideslip.estimators import FILTERS, make_estimator
+from sideslip.estimators.batch import BatchEstimator, make_batch
+from sideslip.estimators.designs import Told
+from tests.estimators.simulation import CAMERA, FIG7, GPS, KMH, simulate
+
+pytestmark = pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning")
+
+JITTERY = SlowSensor(period=0.033, delays=(0.010,), jitter=0.020)
+SPEED = 25.0 * KMH
+
+
+def drives(count: int, sensor: str, clock: SlowSensor, seconds: float = 0.5) -> list[Log]:
+    """Drives whose sensor has the same clock, of another phase each."""
+    drive = dataclasses.replace(FIG7, duration=seconds)
+    clocks = [dataclasses.replace(clock, phase=0.003 * i) for i in range(count)]
+    return [simulate(drive, {sensor: each}, seed) for seed, each in enumerate(clocks)]
+
+
+def feed(batch: BatchEstimator, logs: list[Log], n: int, first: int = 0, last: int = 10**9) -> None:
+    """Let the batch take the logs' ticks from `first` to before `last` in steps of n ticks."""
+    end = min(last, len(logs[0].record.fast))
+    for k in range(first, end, n):
+        rows = [record.fast[k : min(k + n, end)] for record in (log.record for log in logs)]
+        came = []
+        for log in logs:
+            arrived = log.record.packets[:, PACKET.arrived]
+            came.append(log.record.packets[(arrived >= k) & (arrived < k + len(rows[0]))])
+        packets = np.full((len(logs), max(map(len, came)), PACKET_WIDTH), np.nan)
+        for i, each in enumerate(came):
+            packets[i, : len(each)] = each
+        batch.step(np.array(rows), packets, [len(each) for each in came])
+
+
+def home(name: str) -> tuple[str, SlowSensor]:
+    """A slow sensor that a filter can use."""
+    slow = FILTERS[name].slow
+    return ("gps", GPS) if slow and "camera" not in slow else ("camera", CAMERA)
+
+
+def same_bits(batch: BatchEstimator, singles: list[Any]) -> None:
+    np.testing.assert_array_equal(batch.x, [each.x for each in singles], strict=True)
+    np.testing.assert_array_equal(batch.P, [each.P for each in singles], strict=True)
+    for name, counts in batch.counts.items():
+        assert counts.tolist() == [each.counts[name] for each in singles]
+
+
+@pytest.mark.parametrize("name", FILTERS)
+@pytest.mark.parametrize("speed", [SPEED, None])
+def test_every_row_is_the_filter_alone(name: Any, speed: Any) -> None:
+    """Own phases, own noise, own car; gains that are missing are made on the way."""
+    logs = drives(3, *home(name))
+    cars = [COMS, COMS.scaled(0.9), COMS]
+    told = [log.slow for log in logs]
+    batch = make_batch(name, 3, vehicle=cars, sensors=told, speed=speed)
+    singles = [
+        make_estimator(name, vehicle=car, sensors=slow, speed=speed)
+        for car, slow in zip(cars, told, strict=True)
+    ]
+    feed(batch, logs, 33)
+    found = [single.run(log) for single, log in zip(singles, logs, strict=True)]
+    same_bits(batch, singles)
+    assert len(np.unique(batch.x[:, 0])) == 3
+    for one, other in zip(batch.run(logs), found, strict=True):
+        np.testing.assert_array_equal(one.x, other.x)
+        np.testing.assert_array_equal(one.std, other.std)
+
+
+@pytest.mark.parametrize("n", [1, 10])
+def test_covariances_are_each_rows_own(n: Any) -> None:
+    """Random delays: rows that differ in nothing but arrivals have their own P."""
+    drive = dataclasses.replace(FIG7, duration=0.4)
+    logs = [simulate(drive, {"camera": JITTERY}, seed) for seed in range(8)]
+    batch = make_batch("exact-kf", 8, sensors=logs[0].slow, speed=SPEED)
+    feed(batch, logs, n)
+    singles = [make_estimator("exact-kf", sensors=log.slow, speed=SPEED) for log in logs]
+    for single, log in zip(singles, logs, strict=True):
+        single.run(log)
+    same_bits(batch, singles)
+    assert len({P.tobytes() for P in batch.P}) > 4
+
+
+def test_a_masked_reset_starts_some_rows_anew() -> None:
+    logs = drives(3, *home("multirate-kf"), seconds=0.08)
+    batch = make_batch("multirate-kf", 3, sensors=[log.slow for log in logs], speed=SPEED)
+    feed(batch, logs, 10)
+    before = batch.x
+    phases = [{"camera": dataclasses.replace(CAMERA, phase=0.007 + 0.001 * i)} for i in range(3)]
+    batch.reset([False, True, False], phases)
+    np.testing.assert_array_equal(batch.x[[0, 2]], before[[0, 2]])
+    assert batch.x[1].tolist() == [0.0] * len(batch.names)
+    assert [each.filters[0].phase[0] for each in batch] == [0, 8, 6]
+    assert [each.tick for each in batch] == [80, -1, 80]
+
+
+@pytest.mark.plain
+def test_a_row_without_ticks_and_packets_stands_still() -> None:
+    logs = drives(2, *home("bicycle-kf"), seconds=0.05)
+    batch = make_batch("bicycle-kf", 2, sensors=[log.slow for log in logs], speed=SPEED)
+    fast = np.array([log.record.fast[:20] for log in logs])
+    batch.step(fast, np.zeros((2, 0, PACKET_WIDTH)), rows=[20, 0])
+    assert [each.tick for each in batch] == [19, -1]
+    alone = make_estimator("bicycle-kf", sensors=logs[0].slow, speed=SPEED)
+    alone.step(fast[0], np.zeros((0, PACKET_WIDTH)))
+    np.testing.assert_array_equal(batch[0].P, alone.P)
+
+
+def test_rows_that_are_told_the_same_share_their_gains() -> None:
+    cars = [COMS, COMS.scaled(0.9), COMS, COMS.scaled(0.9)]
+    batch = make_batch("multirate-kf", 4, vehicle=cars, sensors={"camera": CAMERA}, speed=SPEED)
+    first, other = batch[0].gains, batch[1].gains
+    assert np.shares_memory(first, batch[2].gains) and np.shares_memory(other, batch[3].gains)
+    assert not np.shares_memory(first, other)
+
+
+def test_a_row_that_is_told_something_new_is_the_filter_for_that() -> None:
+    """Of other delays and gains of another shape, while the others keep what they know."""
+    logs = drives(2, "camera", CAMERA, 0.3)
+    uneven = dataclasses.replace(CAMERA, delays=(0.020, 0.015, 0.010, 0.025))
+    later = simulate(dataclasses.replace(FIG7, duration=0.3), {"camera": uneven}, 9)
+    batch = make_batch("multirate-kf", 2, sensors=[log.slow for log in logs], speed=SPEED)
+    feed(batch, logs, 10, 0, 150)
+    batch.tell([1], [Told(COMS, later.slow, SPEED)])
+    batch.reset([False, True])
+    fast, packets = later.record.fast[:100], later.record.packets
+    for k in range(0, 100, 10):
+        came = packets[(packets[:, PACKET.arrived] >= k) & (packets[:, PACKET.arrived] < k + 10)]
+        empty = np.zeros((2, len(came), PACKET_WIDTH))
+        empty[1] = came
+        batch.step(np.array([fast[k : k + 10]] * 2), empty, [0, len(came)], [0, 10])
+    alone = make_estimator("multirate-kf", sensors=later.slow, speed=SPEED)
+    alone.step(fast, packets[packets[:, PACKET.arrived] < 100])
+    kept = make_estimator("multirate-kf", sensors=logs[0].slow, speed=SPEED)
+    arrived = logs[0].record.packets[:, PACKET.arrived]
+    kept.step(logs[0].record.fast[:150], logs[0].record.packets[arrived < 150])
+    same_bits(batch, [kept, alone])
+
+
+def test_snapshots_and_copies_continue_bit_for_bit() -> None:
+    logs = drives(3, "camera", JITTERY, 0.4)
+    batch = make_batch("exact-kf", 3, sensors=[log.slow for log in logs])
+    feed(batch, logs, 10, 0, 200)
+    snapshot, twin, thawed = (
+        batch.get_state(),
+        copy.deepcopy(batch),
+        pickle.loads(pickle.dumps(batch)),
+    )
+    feed(batch, logs, 10, 200)
+    once = batch.x, batch.P
+    batch.set_state(snapshot)
+    for each in (batch, twin, thawed):
+        feed(each, logs, 10, 200)
+        np.testing.assert_array_equal(each.x, once[0])
+        np.testing.assert_array_equal(each.P, once[1])
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "message"),
+    [
+        ({"count": 0}, ValueError, "at least one filter, got 0"),
+        ({"vehicle": [COMS]}, ValueError, "vehicle: one or a list of 2, got 1"),
+        ({"sensors": [{"camera": CAMERA}] * 3}, ValueError, "sensors: one or a list of 2, got 3"),
+        ({"speed": [1.0]}, ValueError, "speed: one or a list of 2, got 1"),
+        ({"sensors": {"gps": GPS}, "slow": "camera"}, ValueError, "needs the slow sensor camera"),
+        ({"sensors": [{"camera": CAMERA}, {"gps": GPS}]}, ValueError, "same states, row 0 .*row 1"),
+        ({"q": 1.0}, TypeError, "no option 'q'"),
+    ],
+)
+def test_wrong_arguments(changes: Any, error: Any, message: Any) -> None:
+    told: dict[str, Any] = {"count": 2, "sensors": {"camera": CAMERA}} | changes
+    with pytest.raises(error, match=message):
+        make_batch("multirate-kf", **told)
+
+
+def test_wrong_shapes() -> None:
+    batch = make_batch("multirate-kf", 2, sensors={"camera": CAMERA}, speed=SPEED)
+    fast, packets = np.zeros((2, 5, FAST_WIDTH)), np.zeros((2, 3, PACKET_WIDTH))
+    with pytest.raises(ValueError, match=r"fast rows have shape \(2, k, \d+\), got \(5, \d+\)"):
+        batch.step(fast[0], packets)
+    with pytest.raises(ValueError, match=r"packets have shape \(2, k, \d+\), got \(1, 3, \d+\)"):
+        batch.step(fast, packets[:1])
+    with pytest.raises(ValueError, match="counts are 0 to 3, got 0 to 4"):
+        batch.step(fast, packets, [0, 4])
+    with pytest.raises(ValueError, match="rows are 0 to 5, got -1 to 5"):
+        batch.step(fast, packets, [0, 0], [-1, 5])
+    with pytest.raises(ValueError, match=r"mask has shape \(2,\) and dtype bool, got \(3,\)"):
+        batch.reset([True, False, True])
+    with pytest.raises(ValueError, match="2 filters, got 1 records"):
+        batch.run(drives(1, "camera", CAMERA, 0.05))
+    assert [each.tick for each in batch] == [-1, -1]

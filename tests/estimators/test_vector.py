@@ -1,0 +1,342 @@
+"""The vector EstimateObservation: every row has the bits of the environment wrapped alone."""
+
+import copy
+import functools
+import json
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.envs.classic_control import CartPoleEnv
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.error import ResetNeeded
+from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
+from gymnasium.vector.utils import batch_space
+
+import sideslip  # noqa: F401  registers the environments
+from sideslip.envs import COMS
+from sideslip.estimators import FILTERS
+from sideslip.estimators.vector import EstimateObservation
+from sideslip.estimators.wrappers import EstimateObservation as Single
+from tests.envs.helpers import bits
+
+pytestmark = pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning")
+
+VISION, UNEVEN, GPS = (f"sideslip/Yaw{kind}-v0" for kind in ("Vision", "VisionUneven", "Gps"))
+MODES = ("NextStep", "SameStep")
+BAD = np.float32(np.nan)  # fails an episode
+
+
+def home(name: str) -> tuple[str, str]:
+    """An id whose sensors a filter can use, and the sensor's name."""
+    slow = FILTERS[name].slow
+    return (GPS, "gps") if slow and "camera" not in slow else (VISION, "camera")
+
+
+def fleet(
+    env_id: str,
+    count: int,
+    mode: str,
+    wrap: Any = None,
+    changes: Sequence[dict[str, Any]] | None = None,
+    **kwargs: Any,
+) -> SyncVectorEnv[Any, Any]:
+    """Environments whose episodes have different lengths, up to a quarter of a second."""
+
+    def made(i: int) -> Any:
+        scenario = {"base": "random-steering", "duration": 0.09 + 0.02 * i}
+        own = changes[i % len(changes)] if changes else {}
+        told = {"scenario": scenario, "on_bad_action": "fail"} | kwargs | own
+        env = gym.make(env_id, **told)
+        return env if wrap is None else wrap(env)
+
+    return SyncVectorEnv([functools.partial(made, i) for i in range(count)], autoreset_mode=mode)
+
+
+def pair(
+    env_id: str, count: int, mode: str, layers: Sequence[dict[str, Any]], **kwargs: Any
+) -> tuple[Any, Any]:
+    """The environments wrapped one by one, and the same ones wrapped together."""
+
+    def wrap(env: Any, kind: Any) -> Any:
+        for layer in layers:
+            env = kind(env, **layer)
+        return env
+
+    alone = fleet(env_id, count, mode, functools.partial(wrap, kind=Single), **kwargs)
+    return alone, wrap(fleet(env_id, count, mode, **kwargs), EstimateObservation)
+
+
+def actions(count: int, step: int) -> Any:
+    """Any action, now and then a bad one, which ends a row's episode at once."""
+    drawn = np.random.default_rng(step).uniform(-1.0, 1.0, (count, 1)).astype(np.float32)
+    if step % 7 == 6:
+        drawn[step % count] = BAD
+    return drawn
+
+
+def plain(infos: Any) -> Any:
+    """`infos` with the objects in `final_obs` taken out, for comparison."""
+    if isinstance(infos, dict):
+        return {key: plain(value) for key, value in infos.items()}
+    return list(infos) if infos.dtype.kind == "O" else infos
+
+
+def same_bits(one: Any, other: Any) -> None:
+    assert bits(one[0]) == bits(other[0])
+    assert bits(list(one[1:-1])) == bits(list(other[1:-1]))
+    first, second = plain(one[-1]), plain(other[-1])
+    assert first.keys() == second.keys()
+    for key in first:
+        assert bits(first[key]) == bits(second[key]), key
+
+
+def drive_both(alone: Any, together: Any, steps: int, start: int = 0) -> int:
+    """Step both and compare everything; returns the episodes that ended."""
+    ended = 0
+    for step in range(start, start + steps):
+        told = actions(alone.num_envs, step)
+        one, other = alone.step(told), together.step(told)
+        same_bits(one, other)
+        ended += int(np.logical_or(one[2], one[3]).sum())
+    return ended
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("name", FILTERS)
+def test_every_row_is_the_environment_wrapped_alone(name: Any, mode: Any) -> None:
+    """Observations, rewards, ends and infos, with `final_obs`, over several episodes."""
+    env_id, sensor = home(name)
+    alone, together = pair(
+        env_id, 3, mode, [{"estimator": name}], **{sensor: {"phase": None, "loss": 0.2}}
+    )
+    same_bits(alone.reset(seed=[11, 5, 7]), together.reset(seed=[11, 5, 7]))
+    assert drive_both(alone, together, 40) > 6
+
+
+@pytest.mark.smoke
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("count", [1, 8])
+def test_own_covariance_where_arrivals_differ(count: Any, mode: Any) -> None:
+    """Delays with jitter, an int as seed, other outputs."""
+    layer = {"estimator": "exact-kf", "outputs": ["y_l", "gamma"], "replace": True}
+    alone, together = pair(UNEVEN, count, mode, [layer], camera={"phase": None})
+    same_bits(alone.reset(seed=3), together.reset(seed=3))
+    assert drive_both(alone, together, 40) > 0
+    if count > 1:
+        assert len({P.tobytes() for P in together.estimator.P}) > 4
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("control_period", [1, 33])
+def test_other_control_periods(control_period: Any, mode: Any) -> None:
+    alone, together = pair(
+        VISION, 2, mode, [{"estimator": "multirate-kf"}], control_period=control_period
+    )
+    same_bits(alone.reset(seed=3), together.reset(seed=3))
+    assert drive_both(alone, together, 130 if control_period == 1 else 15) > 1
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_rows_may_be_different_cars(mode: Any) -> None:
+    """Own nominal vehicle, own plant with a held speed, own delays: filters of three designs."""
+    changes: list[dict[str, Any]] = [
+        {"nominal": COMS.scaled(0.8).to_dict()},
+        {"scenario": {"base": "tie-vision-fig7", "duration": 0.15}},
+        {"scenario": {"base": "uneven-delay-fig5", "duration": 0.1}},
+    ]
+    alone, together = pair(VISION, 4, mode, [{"estimator": "multirate-kf"}], changes=changes)
+    same_bits(alone.reset(seed=3), together.reset(seed=3))
+    assert drive_both(alone, together, 30) > 3
+    tables = [each.gains for each in together.estimator]
+    assert np.shares_memory(tables[0], tables[3]) and not np.shares_memory(tables[0], tables[1])
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_reset_to_another_scenario_tells_the_filters(mode: Any) -> None:
+    alone, together = pair(VISION, 2, mode, [{"estimator": "multirate-kf"}])
+    same_bits(alone.reset(seed=1), together.reset(seed=1))
+    drive_both(alone, together, 5)
+    for scenario in ("uneven-delay-fig5", "tie-vision-fig7", "sine"):
+        options = {"scenario": scenario, "duration": 0.05}
+        same_bits(
+            alone.reset(seed=2, options=dict(options)), together.reset(seed=2, options=options)
+        )
+        drive_both(alone, together, 12)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_masked_reset_leaves_the_other_rows_alone(mode: Any) -> None:
+    alone, together = pair(UNEVEN, 3, mode, [{"estimator": "exact-kf"}])
+    same_bits(alone.reset(seed=1), together.reset(seed=1))
+    for start in range(0, 40, 8):
+        drive_both(alone, together, 8, start)
+        mask = np.array([start % 16 == 0, False, True])
+        one = alone.reset(seed=[start, None, 4], options={"reset_mask": mask.copy()})
+        other = together.reset(seed=[start, None, 4], options={"reset_mask": mask.copy()})
+        same_bits(one, other)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_several_estimators_stand_side_by_side(mode: Any) -> None:
+    layers: list[dict[str, Any]] = [
+        {"estimator": "bicycle-kf", "name": "plain", "outputs": ["gamma"]},
+        {"estimator": "exact-kf", "std": False, "vehicle": COMS.scaled(1.2)},
+        {"estimator": "multirate-kf", "name": "last", "outputs": ["psi"]},
+    ]
+    alone, together = pair(VISION, 2, mode, layers)
+    assert together.layout == alone.envs[0].layout
+    same_bits(alone.reset(seed=1), together.reset(seed=1))
+    assert drive_both(alone, together, 30) > 3
+    drawn = [each.unwrapped.annotations for each in alone.envs]
+    assert [each.unwrapped.annotations for each in together.unwrapped.envs] == drawn
+    infos = together.step(actions(2, 0))[-1]
+    assert "plain_nees" in infos and "last_beta_hat" in infos and "last_nees" not in infos
+    with pytest.raises(ValueError, match=r"last_psi_hat.* would stand twice; give"):
+        EstimateObservation(together, "exact-kf", outputs=["psi"], name="last")
+
+
+@pytest.mark.smoke
+def test_layout_and_spaces_describe_the_observations() -> None:
+    env: Any = gym.make_vec(VISION, num_envs=2, vectorization_mode="sync")
+    together = EstimateObservation(env, "multirate-kf", outputs=["beta", "y_l"])
+    alone: Any = Single(gym.make(VISION), "multirate-kf", outputs=["beta", "y_l"])
+    assert together.layout == alone.layout
+    assert together.single_observation_space == alone.observation_space
+    assert together.observation_space == batch_space(alone.observation_space, 2)
+    obs, _ = together.reset(seed=0)
+    assert together.observation_space.contains(obs)
+    held = obs.copy()
+    stepped = together.step(np.zeros((2, 1), np.float32))[0]
+    assert together.observation_space.contains(stepped)
+    np.testing.assert_array_equal(obs, held)  # what was returned is the caller's
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_the_spec_builds_environments_wrapped_one_by_one(count: Any) -> None:
+    how = {"autoreset_mode": AutoresetMode.SAME_STEP}
+    made = gym.make_vec(VISION, num_envs=count, vectorization_mode="sync", vector_kwargs=how)
+    options = {"q_beta": 1e-3}
+    together: Any = EstimateObservation(
+        made, "multirate-kf", outputs=("beta",), vehicle=COMS.scaled(0.8), options=options
+    )
+    text = together.spec.to_json()
+    json.loads(text)
+    again: Any = gym.make_vec(EnvSpec.from_json(text))
+    assert again.num_envs == count and again.metadata["autoreset_mode"] == how["autoreset_mode"]
+    assert again.spec.to_json() == text
+    same_bits(again.reset(seed=5), together.reset(seed=5))
+    for step in range(10):
+        told = np.full((count, 1), 0.1 * step, np.float32)
+        same_bits(again.step(told), together.step(told))
+    assert EstimateObservation(fleet(VISION, 2, "NextStep"), "bicycle-kf").spec is None
+
+
+def test_copies_continue_bit_for_bit() -> None:
+    _, env = pair(UNEVEN, 3, "SameStep", [{"estimator": "exact-kf"}])
+    env.reset(seed=2)
+    for step in range(8):
+        env.step(actions(3, step))
+    twin = copy.deepcopy(env)
+    assert drive_both(env, twin, 12, 8) > 2
+
+
+def test_a_failed_step_or_none_asks_for_a_reset() -> None:
+    """Some rows were stepped, others not: no estimator may go on as if nothing had happened."""
+    env: Any = EstimateObservation(
+        fleet(VISION, 2, "NextStep", on_bad_action="raise"), "multirate-kf"
+    )
+    still = np.zeros((2, 1), np.float32)
+    with pytest.raises(ResetNeeded, match="before the first step"):
+        env.step(still)
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="not finite"):
+        env.step(np.array([[0.0], [BAD]], np.float32))
+    with pytest.raises(ResetNeeded, match="after one that failed"):
+        env.step(still)
+    with pytest.raises(ResetNeeded, match="reset all rows"):
+        env.reset(options={"reset_mask": np.array([True, False])})
+    env.reset(seed=0)
+    env.step(still)
+
+
+def test_it_is_the_innermost_wrapper_or_an_error() -> None:
+    wrapped = gym.wrappers.vector.RecordEpisodeStatistics(fleet(VISION, 2, "NextStep"))
+    with pytest.raises(TypeError, match=r"innermost wrapper.*RecordEpisodeStatistics"):
+        EstimateObservation(wrapped, "multirate-kf")
+    clipped = fleet(VISION, 2, "NextStep", gym.wrappers.ClipAction)
+    with pytest.raises(TypeError, match=r"innermost wrapper.*ClipAction"):
+        EstimateObservation(clipped, "multirate-kf")
+    with pytest.raises(TypeError, match="CartPoleEnv has no rows"):
+        EstimateObservation(SyncVectorEnv([CartPoleEnv]), "multirate-kf")
+    with pytest.raises(TypeError, match="CartPoleVectorEnv has no rows"):
+        EstimateObservation(gym.make_vec("CartPole-v1", num_envs=2), "multirate-kf")
+    single: Any = gym.make(VISION)
+    with pytest.raises(TypeError, match=r"no vector env.*sideslip\.estimators\.EstimateObs"):
+        EstimateObservation(single, "multirate-kf")
+
+
+def test_worker_processes_are_out_of_reach() -> None:
+    env = gym.make_vec("sideslip:" + VISION, num_envs=1, vectorization_mode="async")
+    try:
+        with pytest.raises(TypeError, match=r"AsyncVectorEnv.*wrappers=\[functools\.partial"):
+            EstimateObservation(env, "multirate-kf")
+    finally:
+        env.close()
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"estimator": "dakf"}, ValueError, "dakf needs the slow sensor gps; there is: camera"),
+        ({"estimator": "bicycle-kf", "outputs": ["psi"]}, ValueError, "no state 'psi'"),
+        ({"estimator": "multirate-kf", "options": {"q": 1}}, TypeError, "no option 'q'"),
+    ],
+)
+def test_wrong_arguments(options: Any, error: Any, message: Any) -> None:
+    with pytest.raises(error, match=message):
+        EstimateObservation(fleet(VISION, 2, "NextStep"), **options)
+
+
+def test_no_autoreset_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"must reset rows itself.*DISABLED"):
+        EstimateObservation(fleet(VISION, 2, "Disabled"), "multirate-kf")
+
+
+class Native(VectorEnv[Any, Any, Any]):
+    """A vector env that offers its records as arrays of all cars, as `records.Batched` says."""
+
+    held = ("rows", "packets", "ticks_done", "delivered")
+
+    def __init__(self, inner: SyncVectorEnv[Any, Any]) -> None:
+        self._inner, self.num_envs, self.metadata = inner, inner.num_envs, inner.metadata
+        self.single_observation_space = inner.single_observation_space
+        self.observation_space = inner.observation_space
+
+    def reset(self, **kwargs: Any) -> Any:
+        return self._inner.reset(**kwargs)
+
+    def step(self, actions: Any) -> Any:
+        return self._inner.step(actions)
+
+    def __getattr__(self, name: str) -> Any:
+        cars: list[Any] = [each.unwrapped for each in self._inner.envs]
+        if name in ("layout", "dt"):
+            return getattr(cars[0], name)
+        if name.removeprefix("final_") in self.held:
+            return np.array([getattr(car, name) for car in cars])
+        if name in ("slow_sensors", "nominal", "held_speed"):
+            return [getattr(car, name) for car in cars]
+        raise AttributeError(name)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_an_env_that_offers_its_records_as_arrays(mode: Any) -> None:
+    layer: dict[str, Any] = {"estimator": "exact-kf"}
+    alone, _ = pair(UNEVEN, 3, mode, [layer], camera={"phase": None})
+    native = Native(fleet(UNEVEN, 3, mode, camera={"phase": None}))
+    together = EstimateObservation(native, **layer)
+    same_bits(alone.reset(seed=6), together.reset(seed=6))
+    assert drive_both(alone, together, 30) > 3
