@@ -22,7 +22,8 @@ from ..envs.scenario import KMH
 from ..envs.vehicle import Vehicle
 from ..estimators.kalman import gain
 from .margins import Margins, margins
-from .two_dof import CAMERA_PERIOD, PI, PLACEMENTS, POLE, design_pi
+from .pi import PI, PLACEMENTS, POLE, design_pi
+from .two_dof import CAMERA_PERIOD
 
 if TYPE_CHECKING:
     from control import StateSpace

@@ -5,22 +5,19 @@ front wheel speeds: the feedforward by its formula, the PI on a grid of speeds.
 """
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
 from ..envs.backend import absolute, jit, maximum, select
-from ..envs.linear import bicycle
 from ..envs.record import TICK
 from ..envs.vehicle import COMS, Vehicle
 from .controller import Array, Controller
+from .pi import COMS_PI, PLACEMENTS, POLE, design_pi, sample_pi
 
 SLOWEST = 2.0  # m/s: gains below it are those of this speed
 SPEEDS = np.arange(SLOWEST, 61.0, 0.5)  # m/s
-POLE = 2.0 * math.pi * 2.0  # rad/s: Table II of tie-vision places poles at 2 Hz
-PLACEMENTS = ("radius", "real")
 CAMERA_PERIOD = 0.033  # s
 
 
@@ -58,59 +55,20 @@ def feedforward_gain(vehicle: Vehicle, speed: float) -> float:
     return float(_static_gain(_car(vehicle), float(speed)))
 
 
-@dataclass(frozen=True)
-class PI:
-    """Gains of the yaw moment on the slip error: k_p in N m/rad, k_i in N m/(rad s)."""
-
-    k_p: float
-    k_i: float
-
-
-def design_pi(vehicle: Vehicle, speed: float, pole: float = POLE, placement: str = "radius") -> PI:
-    """A PI whose zero lies on the plant's slow pole, with closed-loop poles at `pole` rad/s.
-
-    With G = k / ((s + p_1)(s + p_2)), p_1 < p_2, and C = k_p (s + p_1) / s the closed loop is
-    s^2 + p_2 s + k k_p. placement "radius": k k_p = pole^2 puts both poles on the circle of that
-    radius. They are kept at a damping of a half at least, which a slow plant reaches at a smaller
-    radius, and are real where p_2 > 2 pole. placement "real": k k_p = pole (p_2 - pole) puts one
-    of two real poles there (both at p_2 / 2 where pole is beyond p_2). Gains are capped at the full
-    yaw moment for 0.01 rad (near the speed where the yaw moment does not move beta, k is nearly
-    zero).
-
-    Raises ValueError for another placement, ModuleNotFoundError without python-control (the extra
-    `design`).
-    """
-    if placement not in PLACEMENTS:
-        raise ValueError(f"placement is one of {', '.join(PLACEMENTS)}, got {placement!r}")
-    import control
-
-    model = bicycle(vehicle, speed)
-    plant = control.StateSpace(model.A, model.B[:, 1:], [[1.0, 0.0]], 0.0)
-    transfer = control.tf(plant)
-    k = float(transfer.num[0][0][-1] / transfer.den[0][0][0])
-    slow_first = sorted(-float(p.real) for p in plant.poles())
-    p_1, p_2 = max(slow_first[0], 0.0), slow_first[1]
-    if placement == "radius":
-        product = min(pole, p_2) ** 2
-    else:
-        product = pole * (p_2 - pole) if pole < p_2 else 0.25 * p_2 * p_2
-    most = vehicle.yaw_moment_limit / 0.01
-    k_p = np.clip(product / k, -most, most) if k != 0.0 else 0.0
-    return PI(float(k_p), float(k_p) * p_1)
-
-
-COMS_PI = PI(-19000.506, -115535.531)
-"""What `design_pi` gives for the COMS at 25 km/h: used where python-control is not installed."""
-
-
-def _pi_table(vehicle: Vehicle, gain: float) -> Array:
+def _pi_table(
+    vehicle: Vehicle, gain: float, pole: float, placement: str, period: float | None
+) -> Array:
     """(len(SPEEDS), 2) of k_p and k_i; one row's gains everywhere without python-control."""
     try:
-        gains = [design_pi(vehicle, float(speed)) for speed in SPEEDS]
+        if period is None:
+            gains = [design_pi(vehicle, float(v), pole, placement) for v in SPEEDS]
+        else:
+            gains = [sample_pi(vehicle, float(v), period, pole, placement) for v in SPEEDS]
     except ModuleNotFoundError:
-        if vehicle.name != COMS.name:
+        if vehicle.name != COMS.name or pole != POLE or placement != PLACEMENTS[0]:
             raise ModuleNotFoundError(
-                "designing two-dof for another car than the COMS needs python-control: "
+                "designing two-dof for another car or pole than the shipped one needs "
+                "python-control: "
                 "pip install 'sideslip[design]'"
             ) from None
         gains = [COMS_PI] * len(SPEEDS)
@@ -181,15 +139,25 @@ class TwoDof(Controller):
 
     rate: "control" updates at every decision of the env, "camera" every 33 ms (held between;
     for a control period that is no divisor of it, the next decision). gain: a factor on the PI.
-    Memory: the integral, the decisions until the next update, the held action.
+    pole (rad/s), placement: of `design_pi`. sampled: place the poles of the loop as sampled at
+    that rate (`sample_pi`) instead of the continuous one's. Memory: the integral, the decisions
+    until the next update, the held action.
 
-    Raises ValueError for an unknown rate or an env whose observation lacks beta_hat.
+    Raises ValueError for an unknown rate or placement or an env whose observation lacks beta_hat.
     """
 
     needs = ("wheel_left", "wheel_right", "steer_command", "beta_hat", "beta_ref")
     memory = 3
 
-    def __init__(self, env: gym.Env[Any, Any], rate: str = "control", gain: float = 1.0) -> None:
+    def __init__(
+        self,
+        env: gym.Env[Any, Any],
+        rate: str = "control",
+        gain: float = 1.0,
+        pole: float = POLE,
+        placement: str = PLACEMENTS[0],
+        sampled: bool = False,
+    ) -> None:
         super().__init__(env)
         if rate not in ("control", "camera"):
             raise ValueError(f"rate is 'control' or 'camera', got {rate!r}")
@@ -197,7 +165,8 @@ class TwoDof(Controller):
         self.wait = 1 if rate == "control" else max(1, math.ceil(CAMERA_PERIOD / period - 1e-9))
         self.dt = self.wait * period
         self.car = _car(self.nominal)
-        self.k_p, self.k_i = np.ascontiguousarray(_pi_table(self.nominal, gain).T)
+        table = _pi_table(self.nominal, gain, pole, placement, self.dt if sampled else None)
+        self.k_p, self.k_i = np.ascontiguousarray(table.T)
 
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
         _two_dof_law(

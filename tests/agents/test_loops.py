@@ -18,7 +18,7 @@ from sideslip.agents.loops import (
     table_two,
 )
 from sideslip.agents.margins import margins
-from sideslip.agents.two_dof import PLACEMENTS, POLE, design_pi
+from sideslip.agents.pi import PLACEMENTS, POLE, design_pi
 from sideslip.envs import COMS
 from sideslip.envs.linear import bicycle, vision
 from sideslip.estimators.kalman import gain, joseph, predict

@@ -98,6 +98,11 @@ def test_bad_input(env: gym.Env[Any, Any]) -> None:
         make_agent("two-dof", bare)
     with pytest.raises(ValueError, match="rate is 'control' or 'camera'"):
         make_agent("two-dof", env, rate="fast")
+    for sampled in (True, False):
+        with pytest.raises(ValueError, match="placement is one of radius, real, got 'both'"):
+            make_agent("two-dof", env, placement="both", sampled=sampled)
+        with pytest.raises(ValueError, match="pole is a positive number"):
+            make_agent("two-dof", env, pole=-1.0, sampled=sampled)
     with pytest.raises(TypeError, match="speed"):
         make_agent("two-dof", env, speed=3)
     with pytest.raises(ValueError, match="width"):

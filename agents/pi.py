@@ -1,0 +1,110 @@
+"""The PI on the sideslip angle of tie-vision section V, by pole placement."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import brentq
+
+from ..envs.linear import bicycle
+from ..envs.vehicle import Vehicle
+
+POLE = 2.0 * math.pi * 2.0  # rad/s: Table II of tie-vision places poles at 2 Hz
+PLACEMENTS = ("radius", "real")
+
+
+@dataclass(frozen=True)
+class PI:
+    """Gains of the yaw moment on the slip error: k_p in N m/rad, k_i in N m/(rad s)."""
+
+    k_p: float
+    k_i: float
+
+
+def design_pi(vehicle: Vehicle, speed: float, pole: float = POLE, placement: str = "radius") -> PI:
+    """A PI whose zero lies on the plant's slow pole, with closed-loop poles at `pole` rad/s.
+
+    With G = k / ((s + p_1)(s + p_2)), p_1 < p_2, and C = k_p (s + p_1) / s the closed loop is
+    s^2 + p_2 s + k k_p. placement "radius": k k_p = pole^2 puts both poles on the circle of that
+    radius. They are kept at a damping of a half at least, which a slow plant reaches at a smaller
+    radius, and are real where p_2 > 2 pole. placement "real": k k_p = pole (p_2 - pole) puts one
+    of two real poles there (both at p_2 / 2 where pole is beyond p_2). Gains are capped at the full
+    yaw moment for 0.01 rad (near the speed where the yaw moment does not move beta, k is nearly
+    zero).
+
+    Raises ValueError for another placement or pole, ModuleNotFoundError without python-control (the extra
+    `design`).
+    """
+    _check(pole, placement)
+    import control
+
+    model = bicycle(vehicle, speed)
+    plant = control.StateSpace(model.A, model.B[:, 1:], [[1.0, 0.0]], 0.0)
+    transfer = control.tf(plant)
+    k = float(transfer.num[0][0][-1] / transfer.den[0][0][0])
+    slow_first = sorted(-float(p.real) for p in plant.poles())
+    p_1, p_2 = max(slow_first[0], 0.0), slow_first[1]
+    if placement == "radius":
+        product = min(pole, p_2) ** 2
+    else:
+        product = pole * (p_2 - pole) if pole < p_2 else 0.25 * p_2 * p_2
+    k_p = _capped(vehicle, product / k) if k != 0.0 else 0.0
+    return PI(k_p, k_p * p_1)
+
+
+def _check(pole: float, placement: str) -> None:
+    if placement not in PLACEMENTS:
+        raise ValueError(f"placement is one of {', '.join(PLACEMENTS)}, got {placement!r}")
+    if not 0.0 < pole < math.inf:
+        raise ValueError(f"pole is a positive number in rad/s, got {pole!r}")
+
+
+def _capped(vehicle: Vehicle, k_p: float) -> float:
+    most = vehicle.yaw_moment_limit / 0.01
+    return min(max(float(k_p), -most), most)
+
+
+def sample_pi(
+    vehicle: Vehicle,
+    speed: float,
+    period: float,
+    pole: float = POLE,
+    placement: str = "radius",
+) -> PI:
+    """`design_pi` for a loop sampled every `period` seconds, with the moment held between.
+
+    The PI is k_p + k_i T / (z - 1), its zero lies on the plant's slow pole a_1, and the poles of
+    (z - a_2)(z - 1) + k_p (b_1 z + b_0) are placed: with ln z = s T, "radius" makes the product of
+    the two s pole^2, "real" puts one s at -pole. It tends to `design_pi` for a short period and
+    raises as that does, without needing python-control.
+    """
+    _check(pole, placement)
+    model = bicycle(vehicle, speed)
+    p_1, p_2 = np.sort(-np.linalg.eigvals(model.A).real).tolist()
+    a_1, a_2 = math.exp(-max(p_1, 0.0) * period), math.exp(-p_2 * period)
+    G, H = model.discrete(period)
+    b_1 = H[0, 1]
+    b_0 = G[0, 1] * H[1, 1] - G[1, 1] * H[0, 1]
+    if b_1 + b_0 == 0.0:
+        return PI(0.0, 0.0)
+    if placement == "real":
+        z = math.exp(-(pole if pole < p_2 else 0.5 * p_2) * period)
+        k_p = -(z - a_2) * (z - 1.0) / (b_1 * z + b_0)
+    else:
+        radius = min(pole, p_2)
+        continuous = radius**2 / float(model.A[0, 1] * model.B[1, 1])
+
+        def excess(factor: float) -> float:
+            k_p = factor * continuous
+            poles = np.roots([1.0, k_p * b_1 - 1.0 - a_2, a_2 + k_p * b_0]).astype(complex)
+            return float(np.prod(np.log(poles)).real - (radius * period) ** 2)
+
+        factors = np.linspace(0.0, 4.0, 81)  # the first of them, before a pole leaves z > 0
+        beyond = next((f for f in factors[1:] if excess(f) > 0.0), None)
+        k_p = continuous * (4.0 if beyond is None else brentq(excess, beyond - 0.05, beyond))
+    k_p = _capped(vehicle, float(k_p))
+    return PI(k_p, k_p * (1.0 - a_1) / period)
+
+
+COMS_PI = PI(-19000.506, -115535.531)
+"""What `design_pi` gives for the COMS at 25 km/h: used where python-control is not installed."""
