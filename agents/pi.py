@@ -32,8 +32,8 @@ def design_pi(vehicle: Vehicle, speed: float, pole: float = POLE, placement: str
     yaw moment for 0.01 rad (near the speed where the yaw moment does not move beta, k is nearly
     zero).
 
-    Raises ValueError for another placement or pole, ModuleNotFoundError without python-control (the extra
-    `design`).
+    Raises ValueError for another placement or pole, ModuleNotFoundError without python-control
+    (the extra `design`).
     """
     _check(pole, placement)
     import control
