@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from ..envs.record import FAST_WIDTH, PACKET_WIDTH, TICK, Log, Record, SlowSensor
 from ..envs.vehicle import COMS, Vehicle, vehicle_from
-from .batched import batch_entries
+from .batched import batch_entry, nothing_observed
 from .designs import Designs, Told
 from .estimates import Estimates
 from .estimator import Estimator
@@ -41,6 +41,7 @@ class BatchEstimator:
         first = self._designs.built(told[0])
         self.names, self.units = first.names, first.units
         self.filters = np.zeros((len(told), len(first.filters)), FILTER).view(np.recarray)
+        self._unread = nothing_observed(len(told))
         self.tell(range(len(told)), told)
 
     def __len__(self) -> int:
@@ -111,7 +112,7 @@ class BatchEstimator:
         counts = _how_many(
             "counts", packets.shape[1] if counts is None else counts, N, packets.shape[1]
         )
-        self.take(None, fast, rows, packets, counts)
+        self.take(None, fast, rows, packets, counts, *self._unread)
 
     def take(
         self,
@@ -124,12 +125,11 @@ class BatchEstimator:
     ) -> None:
         """`step` of the filters of a mask without any checks of C-contiguous arrays.
 
-        observed: what `observe_batch` takes after `counts`, to write observations as well.
+        observed: what `observe_batch` takes after `counts`.
         """
         done = np.full(len(self), -1) if mask is None else np.where(mask, -1, rows)
-        call = batch_entries()[1 if observed else 0]
         memory = self.filters, self._designs.pool, self._places, done
-        while call(*memory, fast, rows, packets, counts, *observed) > 0:
+        while batch_entry()(*memory, fast, rows, packets, counts, *observed) > 0:
             self._design_missing(np.flatnonzero(done < rows))
 
     def _design_missing(self, rows: Whole) -> None:

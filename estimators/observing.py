@@ -18,19 +18,22 @@ def _clipped(value: Any, limit: Any) -> Any:
 
 
 @jit
-def _nees(f: Any, gains: Any, beta: Any, gamma: Any, both: Any, first: int) -> Any:
-    """e^T P^-1 e of beta and gamma, or of the state `first` of them, per state; 0 if P is singular.
+def _nees(f: Any, gains: Any, i: int, j: int, beta: Any, gamma: Any) -> Any:
+    """e^T P^-1 e of the states i (beta) and j (gamma), per state; 0 if P is singular.
 
-    beta, gamma: the true ones.
+    i, j: -1 where it is not to be judged. beta, gamma: the true ones.
     """
-    a, b = f.x[0] - beta, f.x[1] - gamma
-    p, q = covariance_of(f, gains, 0, 0), covariance_of(f, gains, 1, 1)
-    if both:
-        r = covariance_of(f, gains, 0, 1)
+    if i >= 0 and j >= 0:
+        a, b = f.x[i] - beta, f.x[j] - gamma
+        p, q = covariance_of(f, gains, i, i), covariance_of(f, gains, j, j)
+        r = covariance_of(f, gains, i, j)
         det = p * q - r * r
         return 0.5 * (a * a * q - 2.0 * a * b * r + b * b * p) / det if det > 0.0 else 0.0
-    if first == 1:
-        a, p = b, q
+    k = maximum(i, j)
+    if k < 0:
+        return 0.0
+    a = f.x[k] - (beta if i >= 0 else gamma)
+    p = covariance_of(f, gains, k, k)
     return a * a / p if p > 0.0 else 0.0
 
 
@@ -54,19 +57,24 @@ def observe(
 ) -> int:
     """`advance`, then the first `kept` entries of obs and the outputs into out.
 
-    plan: (m, 3), each output's state, whether it is wrapped and whether its truth is known.
-    limits: (m,). out: kept + m entries, or kept + 2 m with standard deviations. said: beta, its
-    standard deviation and the nees. Returns the rows done, as `advance` does.
+    plan: (m, 3), each output's state, counted through the layers, whether it is wrapped and which
+    truth it has (`outputs.TRUTHS`). limits: (m,). out: kept + m entries, or kept + 2 m with
+    standard deviations. said: the first state, its standard deviation and the nees. Returns the
+    rows done, as `advance` does.
     """
-    f = filters[0]
-    done = advance(filters, gains, fast, rows, packets, count, start, fast[:0], fast[:0], said[:0])
+    X, nis = fast[:0], said[:0]  # nothing to be filled
+    done = advance(filters, gains, fast, rows, packets, count, start, X, X, nis)
     if done < rows:
         return done
     for i in range(kept):
         out[i] = obs[i]
-    m, judged, first = len(plan), 0, 0
+    m, beta_at, gamma_at = len(plan), -1, -1
     for i in range(m):
-        state = plan[i, 0]
+        layer, state = 0, plan[i, 0]
+        while state >= filters[layer].n:
+            state -= filters[layer].n
+            layer += 1
+        f = filters[layer]
         value = f.x[state]
         if plan[i, 1] == 1:
             value = wrap(value)
@@ -74,9 +82,12 @@ def observe(
         if len(out) > kept + m:
             out[kept + m + i] = _clipped(deviation(f, gains, state), limits[i])
         if plan[i, 2] == 1:
-            judged, first = judged + 1, state
+            beta_at = state
+        elif plan[i, 2] == 2:
+            gamma_at = state
+    f = filters[0]
     said[0], said[1] = f.x[0], deviation(f, gains, 0)
-    said[2] = _nees(f, gains, beta, gamma, judged == 2, first) if judged > 0 else 0.0
+    said[2] = _nees(f, gains, beta_at, gamma_at, beta, gamma)
     return done
 
 

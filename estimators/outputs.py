@@ -15,14 +15,26 @@ BOUNDS = {
     "gamma": 10.0,
     "psi": np.pi,
     "y_l": 200.0,
+    "psi_late": np.pi,
+    "y_l_late": 200.0,
+    "v_x": 100.0,
+    "v_y": 100.0,
+    "phi": np.pi / 2.0,
+    "phi_rate": 10.0,
+    "F_yf": 1e5,
+    "F_yr": 1e5,
     "d1": 100.0,
     "d2": 1000.0,
+    "d3": 100.0,
+    "d": 1000.0,
     "F_d": 1e5,
     "N_d": 1e5,
 }
-"""Estimates are clipped here, the heading is wrapped."""
+"""Estimates are clipped here, headings are wrapped."""
 
-_TRUE = ("beta", "gamma")  # states whose truth stands in the info
+TRUTHS = {"beta": 1, "gamma": 2}  # states whose truth stands in the info
+BETA, STD, NEES = 0, 1, 2  # places of what `observe` says
+_WRAPPED = ("psi", "psi_late")
 
 
 @dataclass(frozen=True)
@@ -30,16 +42,15 @@ class Outputs:
     """The entries of a wrapped observation.
 
     layout: all of them; the first `kept` are the inner observation's. plan, limits: as `observe`
-    takes them. keys: of `info`, for beta, its standard deviation and the nees. judged: whether
-    the truth of an output is known, so that there is a nees.
+    takes them. keys: of `info`, each with its place in what `observe` said: beta and its standard
+    deviation where the filter estimates it, the nees where the truth of an output is known.
     """
 
     layout: tuple[Entry, ...]
     kept: int
     plan: npt.NDArray[np.int64]
     limits: npt.NDArray[np.float64]
-    keys: tuple[str, str, str]
-    judged: bool
+    keys: tuple[tuple[str, int], ...]
 
     @property
     def bounds(self) -> Any:
@@ -70,14 +81,14 @@ def outputs_of(
     twice = sorted({each for each in names if names.count(each) > 1})
     if twice:
         raise ValueError(f"{', '.join(twice)} would stand twice; give this wrapper a name=...")
-    judged = [s in _TRUE for s in outputs]
-    columns = [states.index(s) for s in outputs], [s == "psi" for s in outputs], judged
-    limits = np.array([BOUNDS[s] for s in outputs]).astype(np.float32).astype(np.float64)
+    truths = [TRUTHS.get(s, 0) for s in outputs]
+    columns = [states.index(s) for s in outputs], [s in _WRAPPED for s in outputs], truths
+    keys = [("beta_hat", BETA), ("beta_std", STD)] if states[0] == "beta" else []
+    keys += [("nees", NEES)] if any(truths) else []
     return Outputs(
         layout,
         len(inner),
         np.array(columns, np.int64).T.copy(),
-        limits,
-        (f"{before}beta_hat", f"{before}beta_std", f"{before}nees"),
-        any(judged),
+        np.array([BOUNDS[s] for s in outputs]).astype(np.float32).astype(np.float64),
+        tuple((before + key, place) for key, place in keys),
     )

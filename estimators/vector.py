@@ -17,7 +17,7 @@ from ..envs.layout import Entry
 from ..envs.vehicle import Vehicle, vehicle_from
 from .batch import BatchEstimator
 from .designs import Told
-from .outputs import outputs_of
+from .outputs import BETA, NEES, outputs_of
 from .records import Batch, BatchedRecords, SyncRecords, records_of
 from .wrappers import EstimateObservation as Single
 
@@ -179,10 +179,13 @@ class EstimateObservation(
             out,
             said,
         )
-        judged = says.judged and known
-        for key, values in zip(says.keys[: 3 if judged else 2], said.T, strict=False):
-            infos[key], infos[f"_{key}"] = values.copy(), mask.copy()
-        self._records.annotate(says.keys[0], said[:, 0], mask)
+        for key, place in says.keys:
+            if place == NEES and not known:
+                continue
+            values = said[:, place].copy()
+            infos[key], infos[f"_{key}"] = values, mask.copy()
+            if place == BETA:
+                self._records.annotate(key, values, mask)
 
 
 def _records_below(env: VectorEnv[Any, Any, Any]) -> SyncRecords | BatchedRecords:

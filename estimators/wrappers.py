@@ -14,7 +14,7 @@ from ..envs.vehicle import Vehicle, vehicle_from
 from .estimator import Estimator
 from .make import make_estimator
 from .observing import observe_entry
-from .outputs import outputs_of
+from .outputs import BETA, outputs_of
 
 _MAY_STAND_BETWEEN = (PassiveEnvChecker, OrderEnforcing)
 _OFFERED = ("rows", "ticks_done", "packets", "delivered", "slow_sensors", "nominal", "layout")
@@ -33,9 +33,9 @@ class EstimateObservation(
     alone. vehicle: what the estimator is told (a preset, a mapping; default the env's nominal).
     options: of `make_estimator`. name: put before every name as `<name>_`.
 
-    `info` gains `beta_hat`, `beta_std` and, if beta or gamma is among the outputs, `nees`: their
-    normalised estimation error squared, divided by their number. `layout` describes the whole
-    observation; `estimator` is the estimator at work.
+    `info` gains `beta_hat` and `beta_std` where the estimator has beta and, if beta or gamma is
+    among the outputs, `nees`: their normalised estimation error squared, divided by their number.
+    `layout` describes the whole observation; `estimator` is the estimator at work.
 
     Raises TypeError if it is not the innermost wrapper or the env has no record; ValueError for an
     unknown output, or where names would stand twice.
@@ -145,12 +145,11 @@ class EstimateObservation(
             if done == rows:
                 break
             estimator.design_missing()
-        hat, std, nees = said.tolist()
-        keys = says.keys
-        info[keys[0]], info[keys[1]] = hat, std
-        if says.judged:
-            info[keys[2]] = nees
-        base.annotate(**{keys[0]: hat})
+        values = said.tolist()
+        for key, place in says.keys:
+            info[key] = values[place]
+            if place == BETA:
+                base.annotate(**{key: values[place]})
         return out
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sideslip.envs import COMS, Log, SlowSensor
-from sideslip.envs.record import FAST_WIDTH, PACKET, PACKET_WIDTH
+from sideslip.envs.record import FAST, FAST_WIDTH, PACKET, PACKET_WIDTH
 from sideslip.estimators import FILTERS, make_estimator
 from sideslip.estimators.batch import BatchEstimator, make_batch
 from sideslip.estimators.designs import Told
@@ -25,7 +25,11 @@ def drives(count: int, sensor: str, clock: SlowSensor, seconds: float = 0.5) -> 
     """Drives whose sensor has the same clock, of another phase each."""
     drive = dataclasses.replace(FIG7, duration=seconds)
     clocks = [dataclasses.replace(clock, phase=0.003 * i) for i in range(count)]
-    return [simulate(drive, {sensor: each}, seed) for seed, each in enumerate(clocks)]
+    logs = [simulate(drive, {sensor: each}, seed) for seed, each in enumerate(clocks)]
+    for seed, log in enumerate(logs):  # the linear car has neither
+        for column in (FAST.accel_y, FAST.roll_rate):
+            log.record.fast[:, column] = np.random.default_rng(seed).normal(size=len(log.time))
+    return logs
 
 
 def feed(batch: BatchEstimator, logs: list[Log], n: int, first: int = 0, last: int = 10**9) -> None:

@@ -17,7 +17,8 @@ from gymnasium.vector.utils import batch_space
 
 import sideslip  # noqa: F401  registers the environments
 from sideslip.envs import COMS
-from sideslip.estimators import FILTERS
+from sideslip.envs.sensor_sets import CAMERA_33_30, GPS_5_HZ
+from sideslip.estimators import FILTERS, make_estimator
 from sideslip.estimators.vector import EstimateObservation
 from sideslip.estimators.wrappers import EstimateObservation as Single
 from tests.envs.helpers import bits
@@ -26,6 +27,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::sideslip.estimators.Unobservabl
 
 VISION, UNEVEN, GPS = (f"sideslip/Yaw{kind}-v0" for kind in ("Vision", "VisionUneven", "Gps"))
 MODES = ("NextStep", "SameStep")
+CLOCKS = {"camera": CAMERA_33_30, "gps": GPS_5_HZ}
 BAD = np.float32(np.nan)  # fails an episode
 
 
@@ -33,6 +35,13 @@ def home(name: str) -> tuple[str, str]:
     """An id whose sensors a filter can use, and the sensor's name."""
     slow = FILTERS[name].slow
     return (GPS, "gps") if slow and "camera" not in slow else (VISION, "camera")
+
+
+def outputs(name: str) -> list[str]:
+    """The first and the last state of a filter (of its second layer, if it has one)."""
+    _, sensor = home(name)
+    states = make_estimator(name, sensors={sensor: CLOCKS[sensor]}).names
+    return [states[0], states[-1]]
 
 
 def fleet(
@@ -109,9 +118,8 @@ def drive_both(alone: Any, together: Any, steps: int, start: int = 0) -> int:
 def test_every_row_is_the_environment_wrapped_alone(name: Any, mode: Any) -> None:
     """Observations, rewards, ends and infos, with `final_obs`, over several episodes."""
     env_id, sensor = home(name)
-    alone, together = pair(
-        env_id, 3, mode, [{"estimator": name}], **{sensor: {"phase": None, "loss": 0.2}}
-    )
+    layer = {"estimator": name, "outputs": outputs(name)}
+    alone, together = pair(env_id, 3, mode, [layer], **{sensor: {"phase": None, "loss": 0.2}})
     same_bits(alone.reset(seed=[11, 5, 7]), together.reset(seed=[11, 5, 7]))
     assert drive_both(alone, together, 40) > 6
 
