@@ -18,13 +18,11 @@ from .programme import DRAWS_WIDTH
 from .record import FAST_WIDTH, PACKET_WIDTH, SLOW_NAMES, TICK, Record, SlowSensor
 from .restart import reset_vehicle
 from .scenario import Scenario
-from .sensor_sets import SENSOR_SETS, in_scenario, most_packets, with_changes
+from .sensor_sets import most_packets
 from .sensors import ticks
+from .setting import Setting
 from .switches import REFUSED, REPORT, RUNNING
-from .template import Template, template_of
 from .vehicle import Vehicle, vehicle_from
-
-_OPTIONS = ("scenario", "vehicle", "friction", "state", "duration")
 
 
 class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
@@ -108,33 +106,30 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
         on_bad_action: str = "raise",
         render_mode: str | None = None,
     ) -> None:
-        if sensors not in SENSOR_SETS:
-            raise ValueError(f"unknown sensors {sensors!r}; known: {', '.join(SENSOR_SETS)}")
-        if isinstance(control_period, bool) or not isinstance(control_period, int | np.integer):
-            raise TypeError(f"control_period is a number of ticks, got {control_period!r}")
-        if not 1 <= control_period <= 1000:
-            raise ValueError(f"control_period is 1 to 1000 ticks, got {control_period}")
-        if fast not in ("summary", "all"):
-            raise ValueError(f"fast is 'summary' or 'all', got {fast!r}")
-        if not isinstance(steering, bool):
-            raise TypeError(f"steering is True or False, got {steering!r}")
-        if on_bad_action not in ("raise", "fail"):
-            raise ValueError(f"on_bad_action is 'raise' or 'fail', got {on_bad_action!r}")
         if render_mode is not None:  # stable-baselines3 tries "rgb_array" and minds TypeError only
             raise TypeError(f"unknown render_mode {render_mode!r}; known: none")
         self.render_mode = render_mode
-        self.control_period = int(control_period)
-        self._sensors = with_changes(SENSOR_SETS[sensors], {"camera": camera, "gps": gps})
-        self.reference, self._fast = reference, fast
-        self._yaw_first, self._fail_bad = yaw_first, on_bad_action == "fail"
-        self._vehicle = vehicle_from(vehicle)
-        self._nominal = self._vehicle if nominal is None else vehicle_from(nominal)
-        self._base = self._template(scenario_from(scenario), self._vehicle)
+        car = vehicle_from(vehicle)
+        self.setting = Setting(
+            sensors,
+            car,
+            car if nominal is None else vehicle_from(nominal),
+            control_period,
+            reference,
+            fast,
+            camera,
+            gps,
+            yaw_first,
+            steering,
+            on_bad_action,
+        )
+        slow, n = self.setting.slow, int(control_period)
+        self.control_period, self.reference = n, reference
+        self._base = self.setting.template(scenario_from(scenario), car)
         self._now = self._base
         self.annotations: dict[str, float] = {}
 
-        n = self.control_period
-        self.layout: tuple[Entry, ...] = observation_layout(tuple(self._sensors), n, fast)
+        self.layout: tuple[Entry, ...] = observation_layout(tuple(slow), n, fast)
         self._bounds = np.array([[entry[2], entry[3]] for entry in self.layout]).T.copy()
         low, high = self._bounds.astype(np.float32)
         self.observation_space = gym.spaces.Box(low, high, dtype=np.float32)
@@ -142,7 +137,7 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
         self.action_space = gym.spaces.Box(-1.0, 1.0, self._action_shape, np.float32)
         self._params, self._state = np.zeros(P.end), np.zeros(Z.end)
         self.rows = np.zeros((n, FAST_WIDTH))
-        room = sum(most_packets(sensor, n) for sensor in self._sensors.values())
+        room = sum(most_packets(sensor, n) for sensor in slow.values())
         self.packets = np.zeros((room, PACKET_WIDTH))
         self._report = np.zeros(len(REPORT))
         self._drawn = np.zeros(DRAWS_WIDTH)
@@ -153,24 +148,13 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
         self.final_ticks_done, self.final_delivered = 0, 0
         self._over = True
 
-    def _template(self, scenario: Scenario, vehicle: Vehicle) -> Template:
-        return template_of(
-            scenario,
-            vehicle,
-            self._nominal,
-            in_scenario(self._sensors, scenario),
-            self.reference,
-            self._fast == "all",
-            self._yaw_first,
-            self._fail_bad,
-        )
-
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[npt.NDArray[np.float32], dict[str, Any]]:
         """Start an episode; see the class docstring for the options."""
-        start = np.full(len(Motion._fields), np.nan)
-        now = self._optioned(dict(options), start) if options else self._base
+        now, start = self._base, np.full(len(Motion._fields), np.nan)
+        if options:
+            now, start = self.setting.optioned(now.scenario, options)
         super().reset(seed=seed)  # refused options leave everything as it was
         self._now = now
         key = int(self.np_random.integers(0, 2**64, dtype=np.uint64))
@@ -198,37 +182,6 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
         self._over = False
         self.annotations = {}
         return obs, self._info(1, False)
-
-    def _optioned(self, options: dict[str, Any], start: npt.NDArray[np.float64]) -> Template:
-        unknown = sorted(set(options) - set(_OPTIONS))
-        if unknown:
-            raise ValueError(
-                f"unknown reset option {', '.join(unknown)}; known: {', '.join(_OPTIONS)}"
-            )
-        scenario = scenario_from(options.get("scenario", self._base.scenario))
-        vehicle = vehicle_from(options.get("vehicle", self._vehicle))
-        if "friction" in options:
-            scenario = scenario.replace(friction=float(options["friction"]))
-        if "duration" in options:
-            scenario = scenario.replace(duration=float(options["duration"]))
-        state = dict(options.get("state", {}))
-        for i, name in enumerate(Motion._fields):
-            value = state.pop(name, None)
-            if value is not None and not abs(value) <= 1e6:
-                raise ValueError(f"reset option state: {name} is {value!r}, not a number up to 1e6")
-            start[i] = np.nan if value is None else value
-            if name.startswith("phi") and value and not scenario.roll:
-                raise ValueError(
-                    f"reset option state: {name} is {value!r}, but scenario {scenario.name!r} "
-                    "has no roll"
-                )
-        if state:
-            known = ", ".join(Motion._fields)
-            raise ValueError(f"unknown state {', '.join(state)}; known: {known}")
-        template = self._template(scenario, vehicle)
-        if not np.isnan(start[0]):  # the car starts at another speed than it holds
-            template = dataclasses.replace(template, held_speed=None)
-        return template
 
     def step(
         self, action: npt.ArrayLike

@@ -1,0 +1,119 @@
+"""What an environment is told once, checked; and the template of an episode with its options."""
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from .dynamics import Motion
+from .manoeuvres import scenario_from
+from .record import SlowSensor
+from .scenario import Scenario
+from .sensor_sets import SENSOR_SETS, in_scenario, with_changes
+from .template import Template, template_of
+from .vehicle import Vehicle, vehicle_from
+
+_OPTIONS = ("scenario", "vehicle", "friction", "state", "duration")
+
+
+@dataclass(frozen=True)
+class Setting:
+    """The arguments of an environment that hold for all its episodes; `StabilityEnv` says what
+    they mean. `nominal` None: the vehicle.
+
+    Raises TypeError or ValueError for an argument out of place.
+    """
+
+    sensors: str
+    vehicle: Vehicle
+    nominal: Vehicle
+    control_period: int
+    reference: str
+    fast: str
+    camera: Mapping[str, Any] | None
+    gps: Mapping[str, Any] | None
+    yaw_first: bool
+    steering: bool
+    on_bad_action: str
+
+    def __post_init__(self) -> None:
+        if self.sensors not in SENSOR_SETS:
+            raise ValueError(f"unknown sensors {self.sensors!r}; known: {', '.join(SENSOR_SETS)}")
+        n = self.control_period
+        if isinstance(n, bool) or not isinstance(n, int | np.integer):
+            raise TypeError(f"control_period is a number of ticks, got {n!r}")
+        if not 1 <= n <= 1000:
+            raise ValueError(f"control_period is 1 to 1000 ticks, got {n}")
+        if self.fast not in ("summary", "all"):
+            raise ValueError(f"fast is 'summary' or 'all', got {self.fast!r}")
+        if not isinstance(self.steering, bool):
+            raise TypeError(f"steering is True or False, got {self.steering!r}")
+        if self.on_bad_action not in ("raise", "fail"):
+            raise ValueError(f"on_bad_action is 'raise' or 'fail', got {self.on_bad_action!r}")
+
+    @property
+    def slow(self) -> dict[str, SlowSensor]:
+        """The slow sensors, with what replaces the set's."""
+        changes = {"camera": self.camera, "gps": self.gps}
+        return with_changes(SENSOR_SETS[self.sensors], changes)
+
+    def template(self, scenario: Scenario, vehicle: Vehicle) -> Template:
+        """What an episode of a scenario with a true vehicle starts from."""
+        return template_of(
+            scenario,
+            vehicle,
+            self.nominal,
+            in_scenario(self.slow, scenario),
+            self.reference,
+            self.fast == "all",
+            self.yaw_first,
+            self.on_bad_action == "fail",
+        )
+
+    def optioned(
+        self, scenario: Scenario, options: Mapping[str, Any]
+    ) -> tuple[Template, npt.NDArray[np.float64]]:
+        """The template of one episode with options of reset, and its start.
+
+        scenario: what is driven without the option. Returns a template and a Motion's numbers, NaN
+        where the option `state` says nothing. Raises ValueError for an unknown option or state.
+        """
+        unknown = sorted(set(options) - set(_OPTIONS))
+        if unknown:
+            raise ValueError(
+                f"unknown reset option {', '.join(unknown)}; known: {', '.join(_OPTIONS)}"
+            )
+        scenario = scenario_from(options.get("scenario", scenario))
+        vehicle = vehicle_from(options.get("vehicle", self.vehicle))
+        if "friction" in options:
+            scenario = scenario.replace(friction=float(options["friction"]))
+        if "duration" in options:
+            scenario = scenario.replace(duration=float(options["duration"]))
+        start = start_of(options.get("state", {}), scenario)
+        template = self.template(scenario, vehicle)
+        if not np.isnan(start[0]):  # the car starts at another speed than it holds
+            template = dataclasses.replace(template, held_speed=None)
+        return template, start
+
+
+def start_of(state: Mapping[str, Any], scenario: Scenario) -> npt.NDArray[np.float64]:
+    """A Motion's numbers (len(Motion),), NaN where the mapping says nothing; ValueError for a name
+    that is no state's, a value that is no number, and roll where the scenario has none."""
+    left, start = dict(state), np.full(len(Motion._fields), np.nan)
+    for i, name in enumerate(Motion._fields):
+        value = left.pop(name, None)
+        if value is not None and not abs(value) <= 1e6:
+            raise ValueError(f"reset option state: {name} is {value!r}, not a number up to 1e6")
+        start[i] = np.nan if value is None else value
+        if name.startswith("phi") and value and not scenario.roll:
+            raise ValueError(
+                f"reset option state: {name} is {value!r}, but scenario {scenario.name!r} "
+                "has no roll"
+            )
+    if left:
+        known = ", ".join(Motion._fields)
+        raise ValueError(f"unknown state {', '.join(left)}; known: {known}")
+    return start
