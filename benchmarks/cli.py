@@ -1,6 +1,5 @@
-"""The command line: list, run, bench, replay."""
+"""The command line: list, run, bench, replay, tune."""
 
-import os
 import platform
 import shlex
 import sys
@@ -11,19 +10,20 @@ from typing import Annotated, Any
 
 import typer
 from gymnasium.error import Error as GymnasiumError
-from rich import box
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table as RichTable
 
 from .. import __version__
-from .rows import Row, Suite, write_json, write_parquet
+from .rows import Row, Suite, check_writable, write_json, write_parquet
+from .screen import print_suite
+from .tune_command import tune_app
 
 app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
 )
+app.add_typer(tune_app, name="tune")
 console = Console()
 
 Quick = Annotated[bool, typer.Option("--quick", help="Few seeds: a first look in seconds.")]
@@ -36,8 +36,6 @@ Mapping = Annotated[
 ]
 Jobs = Annotated[int | None, typer.Option("--jobs", "-j", min=1, help="Processes.")]
 
-_NAME = 32  # letters: a longer text in a table's first column is no name and may wrap
-_LEAST = 22  # letters that the first column keeps on a narrow screen
 _SHOWN = ("numpy", "scipy", "numba", "gymnasium", "control", "plotly")
 
 
@@ -106,7 +104,7 @@ def run(
     from ..agents.rollout import rollout
     from ..estimators import EstimateObservation
 
-    _writable(plot, parquet)
+    check_writable(plot, parquet)
     options: dict[str, Any] = {} if scenario is None else {"scenario": scenario}
     env: gym.Env[Any, Any] = gym.make(env_id, control_period=control_period, **options)
     if estimator is not None:
@@ -172,7 +170,7 @@ def bench(
     unknown = [name for name in names if name not in SUITES]
     if unknown:
         raise ValueError(f"unknown suite {', '.join(unknown)}; known: {', '.join(SUITES)}")
-    _writable(html, json, parquet, picture)
+    check_writable(html, json, parquet, picture)
     done = []
     if log is not None:  # first: a log that cannot be read should not cost minutes
         from .replay import replay_file
@@ -194,12 +192,7 @@ def _give(
 ) -> None:
     """Print the tables and write what was asked for."""
     for suite in suites:
-        console.rule(f"[bold]{suite.title}")
-        console.print(escape(suite.text) + "\n", highlight=False)
-        for table in suite.tables:
-            console.print(_screen(table.title, table.header, table.cells))
-            if table.note:
-                console.print(f"[dim]{escape(table.note)}[/]\n", highlight=False)
+        print_suite(console, suite)
     rows: list[Row] = [row for suite in suites for row in suite.rows]
     if json is not None:
         write_json(json, rows)
@@ -212,18 +205,6 @@ def _give(
 
         write_report(html, list(suites), _command(), environment())
         console.print(f"report: {html}", highlight=False)
-
-
-def _writable(*paths: Path | None) -> None:
-    """OSError before the work, not after it, where a result cannot be written."""
-    for path in paths:
-        if path is None:
-            continue
-        folder = path.absolute().parent
-        if not folder.is_dir():
-            raise FileNotFoundError(f"cannot write {path}: there is no such folder")
-        if not os.access(folder, os.W_OK):
-            raise PermissionError(f"cannot write {path}: its folder is read-only")
 
 
 def _command() -> str:
@@ -239,26 +220,6 @@ def environment() -> dict[str, str]:
         except PackageNotFoundError:
             continue
     return found
-
-
-def _screen(title: str, header: Sequence[str], cells: Sequence[Sequence[str]]) -> RichTable:
-    """Columns of numbers to the right and whole, those of text to the left, wrapped if long."""
-    from .report import numeric
-
-    table = RichTable(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    columns = zip(*cells, strict=True) if cells else [()] * len(header)
-    for i, (name, column) in enumerate(zip(header, columns, strict=True)):
-        right = i > 0 and numeric(column)
-        longest = max(map(len, column), default=0)
-        table.add_column(
-            name,
-            justify="right" if right else "left",
-            no_wrap=right or (i == 0 and longest <= _NAME),
-            min_width=min(longest, _LEAST) if i == 0 else None,
-        )
-    for row in cells:
-        table.add_row(*map(escape, row))
-    return table
 
 
 @app.command()
@@ -278,7 +239,7 @@ def replay(
     """Run the estimators over a recorded drive and score them."""
     from .replay import replay_file
 
-    _writable(html, json, parquet)
+    check_writable(html, json, parquet)
     suite = replay_file(
         log,
         vehicle,

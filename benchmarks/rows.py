@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
@@ -94,6 +95,18 @@ class Suite:
     rows: list[Row] = field(default_factory=list)
     tables: list[Table] = field(default_factory=list)
     figures: list[tuple[str, Any, str]] = field(default_factory=list)
+
+
+def check_writable(*paths: Path | None) -> None:
+    """OSError before the work, not after it, where a result cannot be written."""
+    for path in paths:
+        if path is None:
+            continue
+        folder = path.absolute().parent
+        if not folder.is_dir():
+            raise FileNotFoundError(f"cannot write {path}: there is no such folder")
+        if not os.access(folder, os.W_OK):
+            raise PermissionError(f"cannot write {path}: its folder is read-only")
 
 
 def write_whole(path: str | Path, text: str) -> None:

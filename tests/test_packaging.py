@@ -19,12 +19,15 @@ FACE = ("__init__.py", "__main__.py", "py.typed")
 HEAVY = {
     "control",
     "cv2",
+    "filterpy",
     "highway_env",
     "matplotlib",
     "numba",
+    "optuna",
     "pandas",
     "plotly",
     "scipy",
+    "sqlalchemy",
     "stable_baselines3",
     "torch",
 }

@@ -1,0 +1,108 @@
+"""Question: which process and measurement noise makes an estimator most accurate?
+
+Searched on training seeds, judged on test seeds. `tune_task` says what is searched and what counts
+as error, `tune_study` searches, `tune_file` keeps what was found.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from ..estimators.tunings import TUNINGS
+from .rows import Suite, Table
+from .stats import interval, ratio_of_roots, root_mean
+from .tune_task import SAMPLERS, STORAGE, Array, Drive, Task, simulate, squares
+
+_EDGE = 0.1  # decades: so close to an end of its range a number counts as being there
+
+
+def run(
+    task: Task,
+    trials: int = 200,
+    test_seeds: int = 20,
+    storage: str = STORAGE,
+    sampler: str = SAMPLERS[0],
+    seed: int = 0,
+    jobs: int | None = None,
+    console: Console | None = None,
+) -> tuple[Suite, dict[str, float]]:
+    """Search on the task's seeds, judge on the seeds 0 .. test_seeds-1; a suite and the numbers.
+
+    Raises ValueError for no trials or test seeds, and as `open_study` and `search`.
+    """
+    from .tune_study import open_study, search
+
+    if trials < 1:
+        raise ValueError(f"trials must be at least 1, got {trials}")
+    if not 1 <= test_seeds <= task.seeds[0]:
+        raise ValueError(f"test seeds are 1 to {task.seeds[0]}, got {test_seeds}")
+    study = open_study(task, storage, sampler, seed)
+    training = simulate(task, task.seeds, "training drives", jobs, console)
+    found = search(study, task, training, trials, jobs, console)
+    test = simulate(task, range(test_seeds), "test drives", jobs, console)
+    suite = Suite(
+        "tune",
+        f"Tuning {task.estimator} on {task.scenario}",
+        f"RMSE of {task.target} from 2 s on in {task.unit}, with 95 % bootstrap intervals; "
+        f"{trials} trials. The default is what make_estimator does when it is told no more than "
+        "what is held.",
+        tables=[_comparison(task, training, test, found), _numbers(task, found)],
+    )
+    return suite, found
+
+
+def _comparison(
+    task: Task, training: Sequence[Drive], test: Sequence[Drive], found: dict[str, float]
+) -> Table:
+    default = [_squares(task, drives, {}) for drives in (training, test)]
+    tuned = [_squares(task, drives, found) for drives in (training, test)]
+    ratio, low, high = (
+        interval(tuned[1], ratio_of_roots, default[1])
+        if np.isfinite(default[1]).all() and np.isfinite(tuned[1]).all()
+        else [math.nan] * 3
+    )
+    return Table(
+        f"{task.estimator} on {task.scenario} ({task.env_id})",
+        ("tuning", f"{len(training)} training seeds", f"{len(test)} test seeds"),
+        [["default", *map(_spread, default)], ["found", *map(_spread, tuned)]],
+        f"Found over default on the test seeds: {ratio:.3f} ({low:.3f} .. {high:.3f}).",
+    )
+
+
+def _squares(task: Task, drives: Sequence[Drive], numbers: dict[str, float]) -> Array:
+    """`squares`, infinite where the estimator diverges."""
+    try:
+        return squares(task, drives, numbers)
+    except ValueError:
+        return np.full(len(drives), np.inf)
+
+
+def _spread(errors: Array) -> str:
+    if not np.isfinite(errors).all():
+        return "diverges"
+    value, low, high = interval(errors, root_mean)
+    return f"{value:.4g} ({low:.4g} .. {high:.4g})"
+
+
+def _numbers(task: Task, found: dict[str, float]) -> Table:
+    cells = []
+    for name, value in found.items():
+        low, high = task.search[name]
+        edge = math.log10(value / low) < _EDGE or math.log10(high / value) < _EDGE
+        at = "at its end" if edge else ""
+        cells.append([name, f"{value:g}", f"{low:g} .. {high:g}", at])
+    note = "A number at the end of its range: the optimum does without it, or lies beyond."
+    return Table("Found", ("option", "value", "range", ""), cells, note)
+
+
+def entry(task: Task, found: dict[str, float], command: str, note: str = "") -> dict[str, Any]:
+    """What the estimator used in the end, as an entry of a tunings file."""
+    used = task.options | found
+    q = {key.removeprefix("q_"): value for key, value in used.items() if key.startswith("q_")}
+    q = TUNINGS.get((task.estimator, task.sensors), {}) | q
+    noise = {key: value for key, value in found.items() if not key.startswith("q_")}
+    made = {"estimator": task.estimator, "sensors": task.sensors, "command": command}
+    return made | {"q": q, "noise": noise} | ({"note": note} if note else {})

@@ -1,0 +1,118 @@
+"""`sideslip tune`: what a user types, turned into a tuning's task; what it found, into a file."""
+
+import json
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+
+from .rows import check_writable
+from .screen import print_suite
+
+tune_app = typer.Typer(no_args_is_help=True)
+Texts = list[str] | None
+
+
+@tune_app.callback()
+def face() -> None:
+    """Find the numbers of a method by search."""
+
+
+def _option(text: str) -> tuple[str, Any]:
+    """NAME=VALUE; a value that is no JSON is a word."""
+    name, equals, value = text.partition("=")
+    if not (name and equals):
+        raise ValueError(f"an option is NAME=VALUE, got {text!r}")
+    try:
+        return name, json.loads(value)
+    except json.JSONDecodeError:
+        return name, value
+
+
+def _searched(text: str) -> tuple[str, tuple[float, float] | None]:
+    """NAME or NAME=LOW:HIGH."""
+    name, equals, limits = text.partition("=")
+    if not equals:
+        return name, None
+    try:
+        low, high = map(float, limits.split(":"))
+    except ValueError:
+        raise ValueError(f"what is searched is NAME or NAME=LOW:HIGH, got {text!r}") from None
+    return name, (low, high)
+
+
+@tune_app.command("estimator")
+def tune_estimator(
+    name: Annotated[str, typer.Argument(help="An estimator's name.")],
+    scenario: Annotated[str, typer.Option(help="A scenario's name.")],
+    env: Annotated[str, typer.Option(help="An environment's id; default: one that fits.")] = "",
+    target: Annotated[str, typer.Option(help="The state whose error counts.")] = "beta",
+    option: Annotated[Texts, typer.Option(help="NAME=VALUE, held; repeatable.")] = None,
+    search: Annotated[
+        Texts,
+        typer.Option(help="NAME or NAME=LOW:HIGH; default: every q_STATE not held; repeatable."),
+    ] = None,
+    noise: Annotated[
+        Texts, typer.Option(help="psi_noise or psi_noise=LOW:HIGH, searched too; repeatable.")
+    ] = None,
+    trials: Annotated[int, typer.Option(help="Of the study, the finished ones included.")] = 200,
+    seeds: Annotated[int, typer.Option(help="Training drives.")] = 12,
+    test_seeds: Annotated[int, typer.Option(help="Test drives.")] = 20,
+    sampler: Annotated[str, typer.Option(help="cma (CMA-ES) or tpe.")] = "cma",
+    seed: Annotated[
+        int, typer.Option(help="Of the sampler; another on each machine of a shared study.")
+    ] = 0,
+    storage: Annotated[
+        str | None, typer.Option(help="RDB URL or SQLite file; default: sideslip-tune.db here.")
+    ] = None,
+    jobs: Annotated[int | None, typer.Option("--jobs", "-j", min=1, help="Processes.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Write the entry to a tunings file.")] = None,
+    write: Annotated[bool, typer.Option("--write", help="Make it the shipped tuning.")] = False,
+    note: Annotated[str, typer.Option(help="A note for the entry.")] = "",
+) -> None:
+    """Find an estimator's Q, and R if asked to, on training seeds; report on test seeds.
+
+    A stopped search goes on where it was when the same command is given again.
+    """
+    from ..estimators import tunings
+    from .tune import entry, run
+    from .tune_file import update
+    from .tune_task import STORAGE, make_task
+
+    files = [*([out] if out else []), *([tunings.FILE] if write else [])]
+    check_writable(*files)
+    task = make_task(
+        name,
+        scenario,
+        env or None,
+        target,
+        dict(map(_option, option or [])),
+        dict(map(_searched, search)) if search else None,
+        dict(map(_searched, noise or [])),
+        seeds,
+    )
+    if write and not all(key.startswith("q_") for key in task.search):
+        raise ValueError("shipped tunings hold process noise alone: --out writes the others")
+    console = Console()
+    suite, found = run(task, trials, test_seeds, storage or STORAGE, sampler, seed, jobs, console)
+    print_suite(console, suite)
+    given: list[tuple[str, Sequence[Any]]] = [
+        ("--env", [env] if env else []),
+        ("--target", [target] if target != "beta" else []),
+        ("--option", option or []),
+        ("--search", search or []),
+        ("--noise", noise or []),
+        ("--sampler", [sampler] if sampler != "cma" else []),
+        ("--trials", [trials]),
+        ("--seeds", [seeds]),
+        ("--seed", [seed] if seed else []),
+    ]
+    words = [str(word) for flag, values in given for value in values for word in (flag, value)]
+    command = shlex.join(["sideslip", "tune", "estimator", name, "--scenario", scenario, *words])
+    made = entry(task, found, command, note)
+    for path in files:
+        update(path, made)
+        console.print(f"tuning: {path}", highlight=False, soft_wrap=True)

@@ -1,0 +1,50 @@
+"""The file of tunings: entries are replaced whole, and the file whole or not at all."""
+
+import json
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from ..estimators.tunings import read_tunings
+from .rows import write_whole
+
+_HEAD = """\
+# Tunings: process noise per second, (unit of the state)^2 / s, and measurement noise where it was
+# searched too. Each entry is the output of its command; `sensors` are the slow ones.
+"""
+
+
+def update(path: str | Path, entry: dict[str, Any]) -> None:
+    """Replace or add an entry of a tunings file, which is made if it is not there.
+
+    entry: estimator, sensors, q (by state), command, and noise (by option) and note where there is
+    something to say. The note of what a command found outlives the numbers unless a new one is
+    given; that of what was chosen by hand does not.
+    """
+    target = Path(path)
+    entries = {_key(old): old for old in read_tunings(target)} if target.exists() else {}
+    old = entries.get(_key(entry), {})
+    kept = {"note": old["note"]} if {"note", "command"} <= old.keys() else {}
+    entries[_key(entry)] = kept | entry
+    text = target.read_text(encoding="utf-8") if target.exists() else ""
+    head = text.partition("[[tuning]]")[0] or _HEAD + "\n"
+    write_whole(target, head + "\n".join(map(_text, entries.values())))
+
+
+def _key(entry: dict[str, Any]) -> tuple[str, str]:
+    return entry["estimator"], entry["sensors"]
+
+
+def _text(entry: dict[str, Any]) -> str:
+    lines = ["[[tuning]]"]
+    for key in ("estimator", "sensors", "command", "note"):
+        if key in entry:
+            lines.append(f"{key} = {json.dumps(entry[key], ensure_ascii=False)}")
+    for key in ("q", "noise"):
+        if entry.get(key):
+            lines.append(f"{key} = {_numbers(entry[key].items())}")
+    return "\n".join(lines) + "\n"
+
+
+def _numbers(pairs: Iterable[tuple[str, float]]) -> str:
+    return "{ " + ", ".join(f"{name} = {float(value)!r}" for name, value in pairs) + " }"

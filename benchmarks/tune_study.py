@@ -1,0 +1,169 @@
+"""The search of a tuning with Optuna: the logarithms of the numbers, on the training drives.
+
+A study lives in a database, so that a search that was stopped goes on and several machines can
+share one. Importing this module needs optuna, the extra `tune`.
+"""
+
+import contextlib
+import functools
+import math
+import tempfile
+import warnings
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import joblib
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from .cases import cores
+from .stats import root_mean
+from .tune_task import SAMPLERS, STORAGE, Drive, Task, squares
+
+try:
+    import cmaes  # noqa: F401  Optuna imports it when it is too late
+    import optuna
+    from optuna.trial import FrozenTrial, TrialState
+    from sqlalchemy.engine import make_url
+    from sqlalchemy.exc import SQLAlchemyError
+except ModuleNotFoundError as error:
+    raise ModuleNotFoundError(
+        "tuning needs optuna: pip install 'sideslip[tune]'", name=error.name
+    ) from error
+
+BATCH = 8  # trials asked for before any of them is told: the same search for every number of jobs
+DIGITS = 3  # of what is found
+
+
+@functools.lru_cache(maxsize=1)
+def _loaded(path: str) -> Any:
+    return joblib.load(path)
+
+
+def score(path: str, task: Task, found: dict[str, float]) -> float:
+    """RMSE of the target with some numbers, over the drives in a file; infinite if unstable."""
+    try:
+        return float(root_mean(squares(task, _loaded(path), found)))
+    except ValueError:  # a filter that diverges, a covariance that is none
+        return math.inf
+
+
+def open_study(
+    task: Task, storage: str = STORAGE, sampler: str = SAMPLERS[0], seed: int = 0
+) -> "optuna.Study":
+    """The task's study, made if it is not there.
+
+    storage: an RDB URL, or the path of an SQLite file. Machines that share one take different
+    seeds. Raises ValueError for an unknown sampler, a storage that cannot be used, and a study that
+    holds something else.
+    """
+    url = storage if "://" in storage else f"sqlite:///{storage}"
+    wait = {"connect_args": {"timeout": 60.0}} if url.startswith("sqlite") else {}
+    others = (RuntimeError, ImportError)  # another Optuna's tables, no driver
+    with _quiet(), _storage_errors(storage, *others):
+        study = optuna.create_study(
+            storage=optuna.storages.RDBStorage(url, engine_kwargs=wait),
+            study_name=task.study,
+            direction="minimize",
+            load_if_exists=True,
+        )
+        study.sampler = _sampler(sampler, seed + len(study.trials), len(task.search))
+        _finished(study, task)
+        return study
+
+
+def search(
+    study: "optuna.Study",
+    task: Task,
+    drives: Sequence[Drive],
+    trials: int,
+    jobs: int | None = None,
+    console: Console | None = None,
+) -> dict[str, float]:
+    """The best numbers after so many trials of the task's study, those it holds included.
+
+    Raises ValueError for a storage that fails and where no trial gave a stable filter.
+    """
+    ranges = task.search.items()
+    space: dict[str, optuna.distributions.BaseDistribution] = {
+        name: optuna.distributions.FloatDistribution(*limits, log=True) for name, limits in ranges
+    }
+    with _quiet(), _storage_errors(study.study_name), tempfile.TemporaryDirectory() as folder:
+        done = _finished(study, task)
+        path = str(Path(folder) / "drives")
+        joblib.dump(list(drives), path)
+        with (
+            _progress(console) as bar,
+            joblib.Parallel(n_jobs=min(jobs or cores(), BATCH)) as pool,
+        ):
+            shown = bar.add_task(_best_text(study), total=trials, completed=len(done))
+            while len(done) < trials:
+                batch = [study.ask(space) for _ in range(min(BATCH, trials - len(done)))]
+                values = pool(joblib.delayed(score)(path, task, trial.params) for trial in batch)
+                for trial, value in zip(batch, values, strict=True):
+                    study.tell(trial, value)
+                done = _finished(study, task)
+                bar.update(shown, completed=len(done), description=_best_text(study))
+        best = study.best_trial
+    if best.value is None or not math.isfinite(best.value):
+        squares(task, drives, best.params)  # the estimator's own words, if it has any
+        raise ValueError(f"none of {len(done)} trials of {task.estimator} gave finite estimates")
+    return {name: float(f"{v:.{DIGITS}g}") for name, v in best.params.items()}
+
+
+def _finished(study: "optuna.Study", task: Task) -> list[FrozenTrial]:
+    done = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
+    if len(study.directions) != 1 or any(set(t.params) != set(task.search) for t in done):
+        raise ValueError(f"the study {study.study_name!r} holds something else; delete it")
+    return done
+
+
+def _sampler(name: str, seed: int, size: int) -> "optuna.samplers.BaseSampler":
+    """CMA-ES has no use for a single number."""
+    if name not in SAMPLERS:
+        raise ValueError(f"unknown sampler {name!r}; known: {', '.join(SAMPLERS)}")
+    if name == "tpe" or size == 1:
+        return optuna.samplers.TPESampler(seed=seed)
+    return optuna.samplers.CmaEsSampler(seed=seed)
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Without Optuna's log and its warnings of what is experimental."""
+    before = optuna.logging.get_verbosity()
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+            yield
+    finally:
+        optuna.logging.set_verbosity(before)
+
+
+@contextlib.contextmanager
+def _storage_errors(storage: str, *others: type[Exception]) -> Iterator[None]:
+    """ValueError, without the password, for what databases and Optuna raise."""
+    kinds: tuple[type[Exception], ...] = (SQLAlchemyError, optuna.exceptions.OptunaError, *others)
+    try:
+        yield
+    except kinds as error:
+        try:
+            shown = make_url(storage).render_as_string(hide_password=True)
+        except SQLAlchemyError:
+            shown = storage.rpartition("@")[2]
+        cause = error.__cause__ or error
+        reason = str(getattr(cause, "orig", None) or cause).strip().splitlines()[0]
+        raise ValueError(f"the study's storage failed ({shown}): {reason}") from None
+
+
+def _progress(console: Console | None) -> Progress:
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
+    return Progress(*columns, TimeElapsedColumn(), console=console, disable=console is None)
+
+
+def _best_text(study: "optuna.Study") -> str:
+    try:
+        return f"best RMSE {study.best_value:.4g}"
+    except ValueError:
+        return "search"

@@ -1,0 +1,219 @@
+"""What is tuned: an estimator on a scenario's drives, its error, and the numbers to be found."""
+
+import dataclasses
+import hashlib
+import json
+import math
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import numpy.typing as npt
+from rich.console import Console
+
+from .. import __version__
+from ..agents.rollout import rollout
+from ..envs.backend import source_stamp
+from ..envs.record import Log
+from ..estimators import FILTERS, Estimator, UnobservableWarning, make_estimator
+from .cases import run_cases
+from .estimation import EXPERIMENTS, SETTLED
+
+Array = npt.NDArray[np.float64]
+Range = tuple[float, float]
+
+PROCESS_RANGE = (1e-8, 1e2)  # (unit of the state)^2 / s
+NOISE_RANGE = (1e-5, 1.0)  # unit of the sensor
+SAMPLERS = ("cma", "tpe")
+STORAGE = "sqlite:///sideslip-tune.db"
+FIRST_SEED = 1000  # of training; the test seeds count from 0
+
+
+@dataclass(frozen=True)
+class Drive:
+    """An episode's log, and what an estimator is told about it (arguments of make_estimator)."""
+
+    log: Log
+    told: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Task:
+    """A tuning: which options of an estimator are searched, on which drives, for what.
+
+    options: held. search: option to (low, high), both positive. target: the state whose error
+    counts, in `unit`. sensors: the slow ones that the estimator uses, joined by commas.
+    """
+
+    estimator: str
+    scenario: str
+    env_id: str
+    target: str
+    unit: str
+    sensors: str
+    options: dict[str, Any]
+    search: dict[str, Range]
+    seeds: tuple[int, ...]
+
+    @property
+    def study(self) -> str:
+        """The study's name: the same for the same question asked of the same sources."""
+        question = json.dumps(dataclasses.asdict(self), sort_keys=True, default=str)
+        stamp = f"{question} {source_stamp('estimators')} {__version__}"
+        digest = hashlib.sha256(stamp.encode()).hexdigest()[:12]
+        return f"{self.estimator} on {self.scenario} {digest}"
+
+
+def make_task(
+    estimator: str,
+    scenario: str,
+    env_id: str | None = None,
+    target: str = "beta",
+    options: Mapping[str, Any] | None = None,
+    search: Mapping[str, Range | None] | None = None,
+    noises: Mapping[str, Range | None] | None = None,
+    seeds: int = 12,
+) -> Task:
+    """Check what a user asks for and fill in the rest.
+
+    env_id: default, the first environment with the sensors the estimator needs. search: the
+    options to be found with their range (None: the default one); default, the process noise
+    `q_...` of every state that `options` does not hold. noises: searched as well.
+
+    Raises ValueError or TypeError for unknown names, a scenario without the sensors, an option
+    that the estimator does not have, a range that is none, no seeds.
+    """
+    if seeds < 1:
+        raise ValueError(f"seeds must be at least 1, got {seeds}")
+    held = dict(options or {})
+    if estimator not in FILTERS:
+        make_estimator(estimator)  # says which name is meant
+    env_id, told, filter_ = _fitting(estimator, scenario, env_id, held)
+    states = filter_.names
+    if target not in states:
+        raise ValueError(f"{estimator} has no {target}; a target is one of {', '.join(states)}")
+    (drive,) = drives_of((env_id, scenario, (FIRST_SEED,)))
+    if target not in drive.log.truth:
+        known = ", ".join(state for state in states if state in drive.log.truth) or "none"
+        raise ValueError(f"the truth of {target} is not recorded; of its states: {known}")
+    if search is None:
+        search = {
+            f"q_{state}": None
+            for state in states
+            if f"q_{state}" not in held and _takes(estimator, f"q_{state}", held, told)
+        }
+    wished = {**search, **(noises or {})}
+    if not wished:
+        raise ValueError(f"{estimator} has no process noise to search; say which options to search")
+    for option in wished:
+        if option in held:
+            raise ValueError(f"the option {option} is both held and searched")
+        if not _takes(estimator, option, held, told):
+            build(estimator, told, {**held, option: 1.0})  # says what it has
+    return Task(
+        estimator,
+        scenario,
+        env_id,
+        target,
+        filter_.units[states.index(target)],
+        ",".join(filter_.sensors),
+        held,
+        {option: _range(option, limits) for option, limits in wished.items()},
+        tuple(range(FIRST_SEED, FIRST_SEED + seeds)),
+    )
+
+
+def _range(option: str, limits: Range | None) -> Range:
+    low, high = limits or (PROCESS_RANGE if option.startswith("q_") else NOISE_RANGE)
+    if not 0.0 < low < high < math.inf:
+        raise ValueError(f"the range of {option} is LOW:HIGH with 0 < LOW < HIGH, got {low}:{high}")
+    return float(low), float(high)
+
+
+def build(estimator: str, told: Mapping[str, Any], options: Mapping[str, Any]) -> Estimator:
+    """An estimator, without the warning of what it cannot see."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UnobservableWarning)
+        return make_estimator(estimator, **told, **options)
+
+
+def _takes(estimator: str, option: str, held: Mapping[str, Any], told: Mapping[str, Any]) -> bool:
+    """Whether the estimator has an option; whether the number suits is another matter."""
+    try:
+        build(estimator, told, {"allow_unstable": True, **held, option: 1e-3})
+    except TypeError:
+        return False
+    except ValueError:
+        return True
+    return True
+
+
+def _fitting(
+    estimator: str, scenario: str, env_id: str | None, held: dict[str, Any]
+) -> tuple[str, dict[str, Any], Estimator]:
+    """The environment to use, what it tells an estimator, and the estimator without tuning."""
+    first = [each.env_id for each in EXPERIMENTS if each.scenario == scenario]
+    others = [name for name in gym.registry if name.startswith("sideslip/Yaw")]
+    ids = list(dict.fromkeys([*first, *others])) if env_id is None else [env_id]
+    refused: dict[str, str] = {}
+    for name in ids:
+        env: gym.Env[Any, Any] = gym.make(name, scenario=scenario)
+        env.reset(seed=FIRST_SEED)
+        told = told_by(env.unwrapped)
+        try:
+            return name, told, build(estimator, told, {"allow_unstable": True, **held})
+        except ValueError as error:
+            refused.setdefault(str(error), name)
+    why = "; ".join(f"{name}: {text}" for text, name in refused.items())
+    raise ValueError(f"no environment of {scenario} suits {estimator}: {why}")
+
+
+def told_by(base: Any) -> dict[str, Any]:
+    """What the environment tells estimators about the running episode."""
+    return {
+        "vehicle": base.nominal,
+        "sensors": base.slow_sensors,
+        "dt": base.dt,
+        "speed": base.held_speed,
+    }
+
+
+def drives_of(case: tuple[str, str, tuple[int, ...]]) -> list[Drive]:
+    """The drives of (env id, scenario, seeds)."""
+    env_id, scenario, seeds = case
+    env: gym.Env[Any, Any] = gym.make(env_id, scenario=scenario, control_period=1)
+    return [Drive(rollout(env, seed=seed).log, told_by(env.unwrapped)) for seed in seeds]
+
+
+def simulate(
+    task: Task, seeds: Sequence[int], title: str, jobs: int | None, console: Console | None
+) -> list[Drive]:
+    """The drives of some seeds, four a case, side by side."""
+    cases = [(task.env_id, task.scenario, tuple(seeds[i : i + 4])) for i in range(0, len(seeds), 4)]
+    done = run_cases(drives_of, cases, title, jobs, console)
+    return [drive for drives in done for drive in drives]
+
+
+def squares(task: Task, drives: Sequence[Drive], found: Mapping[str, float]) -> Array:
+    """Mean squared error of the target from `SETTLED` s on, one a drive.
+
+    Raises ValueError where the estimator cannot be built. An estimate that is not finite counts as
+    infinitely wrong.
+    """
+    options, turn = task.options | dict(found), 2.0 * math.pi
+    errors, filters = np.empty(len(drives)), dict[str, Estimator]()
+    for i, (log, told) in enumerate((drive.log, drive.told) for drive in drives):
+        clocks = [dataclasses.replace(sensor, phase=0.0) for sensor in told["sensors"].values()]
+        key = repr(told | {"sensors": clocks})  # a reset tells an estimator the clocks' phases
+        if key not in filters:
+            filters[key] = build(task.estimator, told, options)
+        late = log.time >= SETTLED - 1e-9
+        with np.errstate(all="ignore"):
+            error = (filters[key].run(log)[task.target] - log.truth[task.target])[late]
+            if task.unit == "rad":
+                error = np.remainder(error + math.pi, turn) - math.pi
+            errors[i] = np.mean(error**2)
+    return np.where(np.isfinite(errors), errors, np.inf)

@@ -1,0 +1,363 @@
+"""Tuning: what is found is the best of what was tried, a search goes on, files stay whole."""
+
+import dataclasses
+import errno
+import sys
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sideslip.benchmarks import cli, tune, tune_file, tune_study, tune_task
+from sideslip.benchmarks.tune_task import Drive, Task
+from sideslip.estimators import make_estimator, tunings
+
+Run = Callable[..., tuple[int, str, str]]
+SCENARIO = "tie-vision-fig8"
+optuna = pytest.importorskip("optuna")
+
+
+@pytest.fixture(scope="module")
+def task() -> Task:
+    return tune_task.make_task("bicycle-kf", SCENARIO, seeds=2)
+
+
+@pytest.fixture(scope="module")
+def drives(task: Task) -> list[Drive]:
+    return tune_task.simulate(task, task.seeds, "", 1, None)
+
+
+def storage(folder: Path) -> str:
+    return f"sqlite:///{folder}/study.db"
+
+
+def tried(task: Task, url: str) -> list[Any]:
+    return tune_study.open_study(task, url).trials
+
+
+def test_error_is_the_mean_square_from_two_seconds_on(task: Task, drives: list[Drive]) -> None:
+    found = {"q_beta": 1e-3, "q_gamma": 1e-2}
+    for i, drive in enumerate(drives):
+        filter_ = make_estimator("bicycle-kf", **(drive.told | found))
+        error = filter_.run(drive.log)["beta"] - drive.log.truth["beta"]
+        wanted = np.mean(error[drive.log.time > 1.9995] ** 2)
+        assert tune_task.squares(task, drives, found)[i] == pytest.approx(wanted, rel=1e-12)
+
+
+def test_angles_are_compared_on_the_circle(task: Task, drives: list[Drive]) -> None:
+    log = drives[0].log
+    turned = dataclasses.replace(log, truth={"beta": log.truth["beta"] + 4.0 * np.pi})
+    there, back = (
+        tune_task.squares(task, [Drive(each, drives[0].told)], {}) for each in (log, turned)
+    )
+    assert back == pytest.approx(there, rel=1e-9)
+
+
+def test_found_is_the_best_that_was_tried(task: Task, drives: list[Drive], tmp_path: Path) -> None:
+    url = storage(tmp_path)
+    found = tune_study.search(tune_study.open_study(task, url), task, drives, 12, 1)
+    trials = tried(task, url)
+    assert len(trials) == 12
+    best = min(trials, key=lambda trial: trial.value)
+    for name, value in found.items():
+        low, high = task.search[name]
+        assert low <= value <= high
+        assert value == pytest.approx(best.params[name], rel=5e-3)  # three digits
+    error = np.sqrt(tune_task.squares(task, drives, best.params).mean())
+    assert best.value == pytest.approx(error, rel=1e-12)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("sampler", ["cma", "tpe"])
+def test_the_search_is_the_same_for_any_number_of_jobs(
+    task: Task, drives: list[Drive], tmp_path: Path, sampler: str
+) -> None:
+    found = []
+    for jobs in (1, 2):
+        url = storage(tmp_path) + str(jobs)
+        study = tune_study.open_study(task, url, sampler)
+        found.append(tune_study.search(study, task, drives, 40, jobs))
+    assert found[0] == found[1]
+
+
+@pytest.mark.long
+def test_the_shipped_tuning_of_the_bicycle_model_is_found_again(tmp_path: Path) -> None:
+    """Other seeds, another sampler, fewer trials: the minimum is flat, its error is the same."""
+    task = tune_task.make_task("bicycle-kf", "tie-vision-fig7", seeds=8)
+    drives = tune_task.simulate(task, range(8), "", 1, None)
+    study = tune_study.open_study(task, storage(tmp_path), "tpe", seed=1)
+    found = tune_study.search(study, task, drives, 120, 1)
+    error, shipped = (tune_task.squares(task, drives, numbers).mean() for numbers in (found, {}))
+    assert error == pytest.approx(shipped, rel=0.02)
+
+
+def test_a_stopped_search_goes_on(
+    task: Task, drives: list[Drive], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    url, count = storage(tmp_path), iter(range(12))
+    score = tune_study.score
+
+    def stopping(*arguments: Any) -> float:
+        if next(count) == 11:
+            raise KeyboardInterrupt
+        return score(*arguments)
+
+    monkeypatch.setattr(tune_study, "score", stopping)
+    with pytest.raises(KeyboardInterrupt):
+        tune_study.search(tune_study.open_study(task, url), task, drives, 16, 1)
+    monkeypatch.setattr(tune_study, "score", score)
+    kept = [trial.params for trial in tried(task, url) if trial.value is not None]
+    assert len(kept) == 8  # a whole batch
+    tune_study.search(tune_study.open_study(task, url), task, drives, 16, 1)
+    finished = [trial.params for trial in tried(task, url) if trial.value is not None]
+    assert len(finished) == 16 and finished[:8] == kept
+    assert len({tuple(params.values()) for params in finished}) == 16  # nothing is tried twice
+    monkeypatch.setattr(tune_study, "score", lambda *_: pytest.fail("there is nothing to do"))
+    tune_study.search(tune_study.open_study(task, url), task, drives, 16, 1)
+
+
+def test_a_diverging_filter_is_infinitely_wrong_and_says_why(tmp_path: Path) -> None:
+    task = tune_task.make_task(
+        "multirate-residual-kf",
+        SCENARIO,
+        options={"q_gamma": 0.57, "q_psi": 2e-4, "q_y_l": 7e-5},
+        search={"q_beta": (0.11, 0.13)},
+        seeds=1,
+    )
+    (drive,) = tune_task.simulate(task, task.seeds, "", 1, None)
+    fast = [Drive(drive.log, drive.told | {"speed": 40.0})]
+    study = tune_study.open_study(task, storage(tmp_path))
+    with pytest.raises(ValueError, match="its error grows by a factor"):
+        tune_study.search(study, task, fast, 3, 1)
+    assert [trial.value for trial in tried(task, storage(tmp_path))] == [np.inf] * 3
+
+
+def test_a_study_is_of_one_question(task: Task) -> None:
+    others = [
+        dataclasses.replace(task, scenario="sine"),
+        dataclasses.replace(task, options={"delay": "ignore"}),
+        dataclasses.replace(task, search={"q_beta": (1e-8, 1e2)}),
+        dataclasses.replace(task, seeds=(1000,)),
+    ]
+    assert len({each.study for each in [task, *others]}) == 5
+
+
+def test_everything_not_held_is_searched_and_noise_on_demand() -> None:
+    task = tune_task.make_task(
+        "multirate-kf", SCENARIO, options={"q_psi": 1e-6}, noises={"psi_noise": (1e-4, 1e-2)}
+    )
+    assert list(task.search) == ["q_beta", "q_gamma", "q_y_l", "psi_noise"]
+    assert task.search["psi_noise"] == (1e-4, 1e-2)
+    assert (task.env_id, task.sensors, task.unit) == ("sideslip/YawVision-v0", "camera", "rad")
+
+
+@pytest.mark.parametrize(
+    ("name", "env_id"),
+    [("dakf", "sideslip/YawGps-v0"), ("multirate-kf", "sideslip/YawVision-v0")],
+)
+def test_the_environment_has_the_sensors_the_filter_needs(name: str, env_id: str) -> None:
+    assert tune_task.make_task(name, "slalom", seeds=1).env_id == env_id
+
+
+def test_the_table_shows_both_tunings_and_marks_the_end_of_a_range(tmp_path: Path) -> None:
+    held = {"q_gamma": 1e-2}
+    task = tune_task.make_task(
+        "bicycle-kf", SCENARIO, options=held, search={"q_beta": (1e-12, 1.2e-12)}, seeds=2
+    )
+    suite, found = tune.run(task, 8, 3, storage(tmp_path), jobs=1)
+    comparison, numbers = suite.tables
+    assert comparison.header == ("tuning", "2 training seeds", "3 test seeds")
+    assert [row[0] for row in comparison.cells] == ["default", "found"]
+    assert numbers.cells[0][0] == "q_beta" and "over default" in comparison.note
+    entry = tune.entry(task, found, "a command")
+    assert entry["q"] == {"gamma": 1e-2, "beta": found["q_beta"]}
+    assert numbers.cells[0][3] == "at its end"
+
+
+# The file of tunings.
+
+
+ENTRY = {"estimator": "dakf", "sensors": "gps", "command": 'say "x"', "q": {"beta": 1e-9}}
+
+
+def test_an_entry_is_replaced_and_its_note_and_the_others_stay(tmp_path: Path) -> None:
+    path = tmp_path / "found.toml"
+    by_hand = ENTRY | {"note": "chosen by hand"}
+    by_hand.pop("command")
+    tune_file.update(path, by_hand)
+    tune_file.update(path, ENTRY)
+    assert tunings.read_tunings(path) == [ENTRY]
+    tune_file.update(path, ENTRY | {"note": "why: \\ \u00e4"})
+    tune_file.update(path, ENTRY | {"sensors": "camera", "noise": {"psi_noise": 1.0}})
+    path.write_text("# a remark\n" + path.read_text())
+    tune_file.update(path, ENTRY | {"q": {"beta": 2.0}, "command": "again"})
+    first, second = tunings.read_tunings(path)
+    assert first == ENTRY | {"q": {"beta": 2.0}, "command": "again", "note": "why: \\ \u00e4"}
+    assert second == ENTRY | {"sensors": "camera", "noise": {"psi_noise": 1.0}}
+    assert path.read_text().startswith("# a remark\n")
+
+
+def test_a_full_disk_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "found.toml"
+    tune_file.update(path, ENTRY)
+    before = path.read_bytes()
+
+    def full(self: Path, text: str, **_: Any) -> int:
+        with self.open("w") as part:
+            part.write(text[:10])
+        raise OSError(errno.ENOSPC, "no space left on device")
+
+    monkeypatch.setattr(Path, "write_text", full)
+    with pytest.raises(OSError, match="no space"):
+        tune_file.update(path, ENTRY | {"q": {"beta": 3.0}})
+    assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("text", ["tuning = 1", "[[tuning]]\nq = {}", "][", "[[tuning]]\nq = 1"])
+def test_a_file_that_is_none_is_named(text: str, tmp_path: Path) -> None:
+    path = tmp_path / "bad.toml"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=r"bad\.toml is no file of tunings"):
+        tunings.read_tunings(path)
+
+
+@pytest.mark.smoke
+@pytest.mark.parametrize(
+    "entry", tunings.read_tunings(), ids=lambda e: f"{e['estimator']} {e['sensors']}"
+)
+def test_a_shipped_tuning_says_how_it_was_found(entry: dict[str, Any]) -> None:
+    assert tunings.TUNINGS[entry["estimator"], entry["sensors"]] == entry["q"]
+    assert all(value >= 0.0 for value in entry["q"].values())
+    if "command" not in entry:
+        assert entry["note"]  # why there is none
+        return
+    words = entry["command"].split()
+    assert words[:4] == ["sideslip", "tune", "estimator", entry["estimator"]]
+    held = [words[i + 1] for i, word in enumerate(words) if word == "--option"]
+    for each in held:
+        name, _, value = each.partition("=")
+        assert entry["q"][name.removeprefix("q_")] == float(value)
+
+
+# The command line.
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], tmp_path: Path) -> Run:
+    """Call `sideslip tune estimator` in an empty folder; gives (exit status, stdout, stderr)."""
+    monkeypatch.chdir(tmp_path)
+
+    def call(*arguments: object) -> tuple[int, str, str]:
+        words = ["sideslip", "tune", "estimator", *map(str, arguments)]
+        monkeypatch.setattr("sys.argv", words)
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+            raise SystemExit(0)
+        out, err = capfd.readouterr()
+        return int(ended.value.code or 0), out, err
+
+    return call
+
+
+FEW = ("--trials", 8, "--seeds", 1, "--test-seeds", 2, "--jobs", 1)
+
+
+def test_the_command_prints_and_writes_what_it_found(run: Run, tmp_path: Path) -> None:
+    arguments = ("bicycle-kf", "--scenario", SCENARIO, *FEW, "--out", "found.toml")
+    status, out, _ = run(*arguments, "--note", "a remark")
+    assert status == 0 and "2 test seeds" in out and "q_beta" in out
+    (entry,) = tomllib.loads((tmp_path / "found.toml").read_text())["tuning"]
+    assert entry["command"] == (
+        f"sideslip tune estimator bicycle-kf --scenario {SCENARIO} --trials 8 --seeds 1"
+    )
+    assert set(entry["q"]) == {"beta", "gamma"} and entry["note"] == "a remark"
+    assert (tmp_path / "sideslip-tune.db").exists()
+    run(*arguments)
+    assert tunings.read_tunings(tmp_path / "found.toml") == [entry]  # there was nothing left to do
+
+
+def test_write_changes_the_shipped_file(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tunings, "FILE", tmp_path / "shipped.toml")
+    tune_file.update(tunings.FILE, ENTRY)
+    assert run("bicycle-kf", "--scenario", SCENARIO, *FEW, "--write")[0] == 0
+    assert [e["estimator"] for e in tunings.read_tunings(tunings.FILE)] == ["dakf", "bicycle-kf"]
+
+
+FIG8 = ("bicycle-kf", "--scenario", SCENARIO)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("kalman", "--scenario", SCENARIO), "unknown estimator 'kalman'"),
+        (("dafk", "--scenario", SCENARIO), "did you mean 'dakf'"),
+        (("dakf", "--scenario", "moon"), "unknown scenario 'moon'"),
+        (("dakf", "--scenario", "sine", "--env", "sideslip/YawVision-v0"), "slow sensor gps"),
+        (("dakf", "--scenario", "sine", "--env", "sideslip/Nowhere-v0"), "Nowhere"),
+        ((*FIG8, "--trials", "0"), "trials must be at least 1, got 0"),
+        ((*FIG8, "--seeds", "0"), "seeds must be at least 1, got 0"),
+        ((*FIG8, "--test-seeds", "0"), "test seeds are 1 to 1000, got 0"),
+        ((*FIG8, "--target", "phi"), "bicycle-kf has no phi; a target is one of beta, gamma"),
+        ((*FIG8, "--sampler", "grid"), "unknown sampler 'grid'; known: cma, tpe"),
+        ((*FIG8, "--option", "q_beta"), "an option is NAME=VALUE, got 'q_beta'"),
+        ((*FIG8, "--option", "colour=red"), "bicycle-kf has no option 'colour'"),
+        ((*FIG8, "--search", "q_psi"), "bicycle-kf has no option 'q_psi'"),
+        ((*FIG8, "--search", "q_beta=1"), "NAME or NAME=LOW:HIGH, got 'q_beta=1'"),
+        ((*FIG8, "--search", "q_beta=2:1"), "0 < LOW < HIGH, got 2.0:1.0"),
+        ((*FIG8, "--option", "q_beta=1", "--search", "q_beta"), "both held and searched"),
+        ((*FIG8, "--noise", "gyro_noise", "--write"), "--out writes the others"),
+        ((*FIG8, "--storage", "sqlite:////nowhere/at/all.db"), "unable to open database file"),
+        (
+            (*FIG8, "--storage", "moon://user:secret@host/x"),
+            "storage failed (moon://user:***@host/x",
+        ),
+        ((*FIG8, "--out", "nowhere/found.toml"), "nowhere/found.toml"),
+    ],
+)
+def test_a_mistake_is_one_line_that_names_it(
+    run: Run, arguments: tuple[str, ...], said: str, tmp_path: Path
+) -> None:
+    status, out, err = run(*FEW[2:], *arguments)
+    assert status == 2
+    assert said in " ".join(err.split()) and "secret" not in err
+    assert err.count("\n") == 1 and "Traceback" not in out + err
+    assert not list(tmp_path.glob("*.toml"))
+
+
+def test_a_storage_that_is_no_database_is_refused(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "study.db").write_bytes(b"not a database at all" * 100)
+    status, _, err = run(*FIG8, "--storage", "study.db")
+    assert status == 2 and "file is not a database" in err and err.count("\n") == 1
+
+
+def test_a_study_that_holds_something_else_is_refused(task: Task, tmp_path: Path) -> None:
+    url = storage(tmp_path)
+    study = optuna.create_study(storage=url, study_name=task.study)
+    study.add_trial(optuna.trial.create_trial(value=1.0))
+    with pytest.raises(ValueError, match="holds something else"):
+        tune_study.open_study(task, url)
+
+
+def test_a_damaged_study_is_one_line(task: Task, tmp_path: Path) -> None:
+    url = storage(tmp_path)
+    tune_study.open_study(task, url)
+    with (tmp_path / "study.db").open("r+b") as database:
+        database.seek(2000)
+        database.write(b"?" * 20000)
+    with pytest.raises(ValueError, match="malformed"):
+        tune_study.open_study(task, url)
+
+
+@pytest.mark.parametrize("missing", ["optuna", "cmaes"])
+def test_without_the_extra_the_command_names_it(
+    run: Run, missing: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delitem(sys.modules, tune_study.__name__)
+    monkeypatch.setitem(sys.modules, missing, None)
+    status, _, err = run(*FIG8, *FEW)
+    assert status == 2 and "pip install 'sideslip[tune]'" in err
