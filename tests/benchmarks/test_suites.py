@@ -4,7 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from sideslip.benchmarks import control, estimation, speed
+from sideslip.benchmarks import control, estimation
 from sideslip.benchmarks.cases import run_cases
 
 
@@ -50,11 +50,3 @@ def test_every_contestant_of_the_lane_change_gives_finite_numbers() -> None:
 def test_an_experiment_names_what_exists(experiment: estimation.Experiment) -> None:
     env = gym.make(experiment.env_id, scenario=experiment.scenario)
     assert env.unwrapped.held_speed == pytest.approx(25 / 3.6)  # type: ignore[attr-defined]
-
-
-def test_speed_names_all_contestants(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(speed, "ROUNDS", 1)
-    suite = speed.run()
-    names = [row.scenario for row in suite.rows]
-    assert {"sideslip/YawVision-v0", "CartPole-v1", "lane-keeping-v0 (highway-env)"} <= set(names)
-    assert all(row.value > 0.0 for row in suite.rows)
