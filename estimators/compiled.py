@@ -8,7 +8,7 @@ import numpy as np
 from numba.core.dispatcher import Dispatcher
 
 from ..envs.record import PACKET_WIDTH
-from .core import advance, receive_all
+from .core import advance, receive_all, step_all
 from .memory import FILTER
 
 
@@ -24,11 +24,12 @@ def entry(function: Any, *example: Any) -> Any:
 
 
 @cache
-def entries() -> tuple[Any, Any]:
-    """(`advance`, `receive_all`) as plain calls."""
+def entries() -> tuple[Any, Any, Any]:
+    """(`advance`, `receive_all`, `step_all`) as plain calls."""
     filters, gains = np.zeros(1, FILTER), np.zeros((1, 1, 1))
     matrix, vector = np.zeros((1, 1)), np.zeros(1)
     return (
         entry(advance, filters, gains, matrix, 0, matrix, 0, 0, matrix, matrix, vector),
         entry(receive_all, filters, gains, np.zeros(PACKET_WIDTH)),
+        entry(step_all, filters, gains, matrix, matrix, 0),
     )

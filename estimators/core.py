@@ -186,6 +186,15 @@ def advance(
 
 
 @jit
+def step_all(layers: Any, gains: Any, fast: Any, packets: Any, count: int) -> int:
+    """`advance` over all rows with nothing to be filled: fewer arguments to hand over."""
+    nothing = fast[:0]
+    return advance(
+        layers, gains, fast, len(fast), packets, count, 0, nothing, nothing, nothing[:, 0]
+    )
+
+
+@jit
 def begin_all(layers: Any, first: int) -> None:
     """`begin` for all layers of an estimator."""
     for i in range(len(layers)):

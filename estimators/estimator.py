@@ -27,6 +27,7 @@ CHECKED_SPEEDS = (3.0, 7.0, 14.0)  # m/s, where a filter without a fixed speed i
 
 _NOTHING = np.zeros((0, 0))
 _NO_NIS = np.zeros(0)
+_ROW, _PACKET = (FAST_WIDTH,), (PACKET_WIDTH,)
 _NO_PACKETS = np.zeros((0, PACKET_WIDTH))
 
 
@@ -152,9 +153,14 @@ class Estimator:
         """
         fast = np.ascontiguousarray(fast, np.float64)
         packets = np.ascontiguousarray(packets, np.float64)
-        _check_shape("fast rows", fast, FAST_WIDTH)
-        _check_shape("packets", packets, PACKET_WIDTH)
-        self.take(fast, len(fast), packets, len(packets) if count is None else count)
+        if fast.shape[1:] != _ROW:
+            raise ValueError(f"fast rows have shape (k, {FAST_WIDTH}), got {fast.shape}")
+        if packets.shape[1:] != _PACKET:
+            raise ValueError(f"packets have shape (k, {PACKET_WIDTH}), got {packets.shape}")
+        arrived = len(packets) if count is None else count
+        done = entries()[2](self.filters, self.gains, fast, packets, arrived)
+        if done < len(fast):  # gains are missing
+            self._go_on(done, fast, len(fast), packets, arrived, _NOTHING, _NOTHING, _NO_NIS)
 
     def take(
         self,
@@ -171,11 +177,27 @@ class Estimator:
         X, S: (rows, n), to be filled with states and standard deviations, or empty. nis: (count,),
         to be filled with the normalised innovation squared of each packet, or empty.
         """
-        advance, filters, gains = entries()[0], self.filters, self.gains
-        done = advance(filters, gains, fast, rows, packets, count, 0, X, S, nis)
+        given = fast, rows, packets, count
+        done = entries()[0](self.filters, self.gains, *given, 0, X, S, nis)
+        if done < rows:
+            self._go_on(done, *given, X, S, nis)
+
+    def _go_on(
+        self,
+        done: int,
+        fast: Array,
+        rows: int,
+        packets: Array,
+        count: int,
+        X: Array,
+        S: Array,
+        nis: Array,
+    ) -> None:
+        """The rest of the rows, designing the gains that are asked for on the way."""
         while done < rows:
             self.design_missing()
-            done = advance(filters, gains, fast, rows, packets, count, done, X, S, nis)
+            given = fast, rows, packets, count, done
+            done = entries()[0](self.filters, self.gains, *given, X, S, nis)
 
     def predict(self, fast_row: npt.ArrayLike) -> None:
         """Take one fast row: from the last tick to this one, with the gyro."""
@@ -267,11 +289,6 @@ class Estimator:
 
     def __repr__(self) -> str:
         return f"<{self.name}: {', '.join(self.names)} at tick {self.tick}>"
-
-
-def _check_shape(what: str, array: Array, width: int) -> None:
-    if array.ndim != 2 or array.shape[1] != width:
-        raise ValueError(f"{what} have shape (k, {width}), got {array.shape}")
 
 
 def _clockless(sensor: SlowSensor) -> SlowSensor:
