@@ -4,8 +4,8 @@ predict: nothing. pseudo-residual: tie-vision (19)-(22), which uneven-delay (20)
 (28)-(29), dual-rate (31) and Oh's (35) repeat: the propagated estimate of the error. The fast
 sensors' residuals are always the real ones. One constant gain K serves every tick, its columns in
 the order fast rows, slow rows; where gains are not precomputed, the share of the last sample's.
-hold, from-29: dual-rate's rivals, whose corrections after a sample are a table of shares of its
-innovation (`dual_rate`).
+spread: dual-rate's rules, whose corrections after a sample are a table of shares of its innovation
+(`spread`). single-rate: a filter that listens only at the sensor's rate.
 """
 
 from typing import Any
@@ -49,8 +49,8 @@ def inverse(kind: str, C: Array, P: Array, R: Array) -> Array:
 def constant_gain(K_fast: Array, K_slow: Array, steps: int) -> Array:
     """One gain for every tick from the multirate filter's gains over a period, (N, m + p).
 
-    K_fast: (steps, m, N) gains of the fast rows. K_slow: (p, N), gains of the slow rows at a
-    sample. Every tick of the frame corrects by a pseudo-residual, so each takes its even share of
+    K_fast: (steps, m, N) gains of the fast rows. K_slow: (p, N), the joint gain of the slow rows at
+    a sample. Every tick of the frame corrects by a pseudo-residual, so each takes its even share of
     the gain that the multirate filter applies at once.
     """
     return np.column_stack([K_fast.mean(0).T, K_slow.T / steps])
@@ -159,12 +159,17 @@ def share_sample(f: Any, s: int, first: int, packet: Any) -> None:
             measure_clone(f, first + i, r, 0.0)
         else:
             measure_state(f, f.row[s, i], r, 0.0)
-        f.eps[m + i] = f.residual[i]
+        for k in range(i):  # the rows before it correct what it measures
+            moved = _slow_row(f, s, i, f.share[m + k])
+            for j in range(N):
+                f.share[m + k, j] -= f.gain[j] * moved
         for j in range(N):
             f.share[m + i, j] = f.gain[j] / steps
-            f.x[j] += f.share[m + i, j] * f.residual[i]
+        f.eps[m + i] = f.residual[i]
     for j in range(N):
         f.e[j] = 0.0
+        for i in range(m, m + rows):
+            f.x[j] += f.share[i, j] * f.eps[i]
         for i in range(m + rows):
             f.e[j] += (f.inverse[i, j] - f.share[i, j]) * f.eps[i]
 

@@ -6,6 +6,7 @@ from ..envs.backend import jit, maximum
 from ..envs.elementary import sincos
 from ..envs.record import GPS, PACKET
 from .arrivals import receive
+from .innovation import HDOP, dilution
 from .memory import WINDOW
 
 SPEED = 1  # value of a GPS packet
@@ -15,8 +16,9 @@ SPEED = 1  # value of a GPS packet
 def pass_on(first: Any, second: Any, gains: Any, packet: Any) -> None:
     """Give the second layer a GPS packet as a velocity: v_x = V cos(beta), v_y = V sin(beta).
 
-    double-layer-gps (8)-(9), with the first layer's sideslip angle at the captured tick. The noise
-    across is that of the angle (V sigma_beta)^2 and of the speed (sigma_V sin(beta))^2.
+    double-layer-gps (8)-(9), with the first layer's sideslip angle as it was predicted for the
+    captured tick. The noise along is the speed's, after the table of HDOP; the one across is that
+    of the angle, (V sigma_beta)^2, and of the speed, (sigma_V sin(beta))^2.
     """
     if not (packet[PACKET.sensor] == GPS and packet[PACKET.captured] <= first.tick):
         receive(second, gains, packet)  # drops and counts what is not for it
@@ -32,7 +34,8 @@ def pass_on(first: Any, second: Any, gains: Any, packet: Any) -> None:
         told[i] = packet[i]
     told[PACKET.value] = V * c
     told[PACKET.value + 1] = V * s
-    speed = second.r_speed
+    factor = dilution(first, packet[PACKET.value + HDOP])
+    speed = second.r_speed * factor * factor
     second.r[GPS, 0] = speed
     second.r[GPS, 1] = V * V * first.P[0, 0] + speed * s * s
     receive(second, gains, told)

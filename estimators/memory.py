@@ -49,7 +49,7 @@ _INT, _FLOAT = np.int64, np.float64
 FILTER = np.dtype(
     [
         # the model: dx = A x + B u on the first `dense` states, the rest decay by themselves
-        ("kind", _INT),  # of `models.KINDS`
+        ("kind", _INT),  # of `transition`
         ("n", _INT),  # states
         ("dense", _INT),
         ("delayed", _INT),  # the last dense states that lag behind what the camera sees

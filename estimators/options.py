@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.stats import chi2
 
+from .matrices import check_covariance
 from .memory import KNOTS, ROWS
 from .models import Model
 
@@ -45,7 +46,6 @@ PRIOR = {
     "d3": 0.1,
     "d": 1.0,
 }
-HDOP_TABLE = ((1.0, 1.0), (20.0, 20.0))  # HDOP and the factor on the GPS's noise
 
 
 class Options:
@@ -110,19 +110,8 @@ def process_noise(
             raise ValueError(f"{name}: Q has shape ({n}, {n}) or ({n},), got {np.shape(whole)}")
     for i, state in enumerate(states):
         Q[i, i] = told.number(f"q_{state}", Q[i, i])
-    _covariance(f"{name}: Q", Q)
+    check_covariance(f"{name}: Q", Q)
     return Q
-
-
-def _covariance(what: str, M: Array) -> None:
-    """ValueError unless M is finite, symmetric and positive semidefinite."""
-    if not np.isfinite(M).all():
-        raise ValueError(f"{what} is not finite")
-    if not np.allclose(M, M.T, rtol=1e-9, atol=0.0):
-        raise ValueError(f"{what} is not symmetric")
-    least = np.linalg.eigvalsh(M).min()
-    if least < -1e-12 * max(np.abs(M).max(), 1e-300):
-        raise ValueError(f"{what} is indefinite: its least eigenvalue is {least:.3g}")
 
 
 def noise_levels(name: str, forces: bool, told: Options) -> dict[str, float]:
@@ -165,10 +154,12 @@ def poles_of(name: str, default: tuple[float, ...], told: Options) -> tuple[floa
     return poles
 
 
-def hdop_table(name: str, told: Options) -> list[tuple[float, float]]:
+def hdop_table(
+    name: str, default: tuple[tuple[float, float], ...], told: Options
+) -> list[tuple[float, float]]:
     """Knots (HDOP, factor on the GPS's noise), or none; ValueError for a table that is none."""
-    table = told.take("hdop_table", None)
-    if table is None:
+    table = told.take("hdop_table", default)
+    if table is None or table == ():
         return []
     knots = [(float(hdop), float(factor)) for hdop, factor in table]
     rising = all(a[0] < b[0] for a, b in itertools.pairwise(knots))

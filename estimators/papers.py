@@ -2,6 +2,12 @@
 
 A filter is a model x a rule between slow samples x a rule for late ones x a tuning. A bicycle has
 the states that the slow sensor measures; the tunings stand in `tunings.py`.
+
+Where these filters are not the papers' by the letter: every model is discretised exactly, where
+double-layer-gps (38), (42) take A T + I; disturbances and process noise are per second, where
+double-layer-gps (34) and dual-rate (5) count them per step; the misprints of docs/PAPERS.md are
+corrected; and with pseudo-residuals every tick takes an even share of the gain that the filter
+without them applies at a sample (the papers do not say which gain they use in between).
 """
 
 from dataclasses import dataclass
@@ -15,7 +21,8 @@ class Filter:
     a name of `models.MODELS`. fast: what it measures in every row. intersample: of
     `intersample.RULES`. gains: "periodic", "covariance" or "placed" (what it does when not told).
     disturbances: "none", "walk", "walk-all" or "forces". delay: of `delay.RULES`. poles: rad/s,
-    where gains are placed. second: the model of a second layer. source: where it comes from.
+    where gains are placed. second: the model of a second layer. hdop: pairs (HDOP, factor on the
+    GPS's noise). source: where it comes from, with the equations.
     """
 
     slow: tuple[str, ...] = ()
@@ -27,6 +34,7 @@ class Filter:
     delay: str = "clone"
     poles: tuple[float, ...] = ()
     second: str = ""
+    hdop: tuple[tuple[float, float], ...] = ()
     source: str
 
 
@@ -35,26 +43,30 @@ GPS = ("gps",)
 CAMERA = ("camera",)
 
 FILTERS: dict[str, Filter] = {
-    "bicycle-kf": Filter(source="tie-vision VI.A"),
-    "single-rate-kf": Filter(slow=ANY, intersample="single-rate", source="tie-vision (15)"),
-    "multirate-kf": Filter(slow=ANY, source="tie-vision (16)"),
+    "bicycle-kf": Filter(source="tie-vision VI.A, the model (1)-(2)"),
+    "single-rate-kf": Filter(slow=ANY, intersample="single-rate", source="tie-vision (12)-(15)"),
+    "multirate-kf": Filter(slow=ANY, source="tie-vision (12)-(13), (16)"),
     "multirate-residual-kf": Filter(
-        slow=ANY, intersample="pseudo-residual", source="tie-vision (19)-(22)"
+        slow=ANY, intersample="pseudo-residual", source="tie-vision (12)-(13), (17)-(22)"
     ),
     "uneven-delay-kf": Filter(
         slow=CAMERA,
         intersample="pseudo-residual",
         delay="stored",
-        source="uneven-delay (15)-(16), (19)-(22)",
+        source="uneven-delay (11)-(22)",
     ),
     "constant-delay-kf": Filter(
         slow=CAMERA,
         intersample="pseudo-residual",
         delay="constant",
-        source="uneven-delay V, the rival",
+        source="uneven-delay 5, the rival in Fig. 5",
     ),
-    "vision-only-kf": Filter(slow=CAMERA, fast=(), source="uneven-delay II.3"),
-    "course-kf": Filter(slow=GPS, gains="covariance", source="dakf-stability [10]"),
+    "vision-only-kf": Filter(
+        slow=CAMERA, fast=(), source="uneven-delay (3)-(7), the camera's rows of C alone"
+    ),
+    "course-kf": Filter(
+        slow=GPS, gains="covariance", source="dakf-stability VI.A, [10]: (5)-(20) without d_1, d_2"
+    ),
     "dakf": Filter(
         slow=GPS, gains="covariance", disturbances="walk", source="dakf-stability (5)-(20)"
     ),
@@ -64,12 +76,18 @@ FILTERS: dict[str, Filter] = {
         gains="covariance",
         disturbances="walk",
         second="velocity-roll",
+        hdop=((1.0, 1.0), (20.0, 20.0)),
         source="double-layer-gps (28)-(29), (34)-(42)",
     ),
-    "lob-2": Filter(gains="placed", poles=(-6.0, -8.0), source="double-layer-gps VI.1"),
-    "roll-kf": Filter(model="roll", fast=("roll_rate",), source="double-layer-gps VI.2"),
+    "lob-2": Filter(gains="placed", poles=(-6.0, -8.0), source="double-layer-gps 6.1, Aoki 2005"),
+    "roll-kf": Filter(
+        model="roll", fast=("roll_rate",), source="double-layer-gps 6.2 and (3), Tseng 2003"
+    ),
     "kinematic-velocity-kf": Filter(
-        model="kinematic", fast=("wheel",), gains="covariance", source="double-layer-gps VI.3"
+        model="kinematic",
+        fast=("wheel",),
+        gains="covariance",
+        source="double-layer-gps 6.3 and (4)-(5), Chen 2008",
     ),
     "dual-rate": Filter(
         slow=GPS,
@@ -77,23 +95,23 @@ FILTERS: dict[str, Filter] = {
         intersample="spread",
         disturbances="walk-all",
         delay="ignore",
-        source="dual-rate (4)-(12), (14)-(35)",
+        source="dual-rate (4)-(35), (37)-(38)",
     ),
     "lob": Filter(
         fast=("gyro", "accel_y"),
         gains="placed",
         poles=(-10.0, -10.0),
-        source="dakf-stability VI.A, [5]",
+        source="dakf-stability VI.A, [5]: gamma and a_y of (1)",
     ),
     "yaw-moment-observer": Filter(
-        model="yaw-moment", gains="placed", poles=(-20.0, -25.0), source="dakf-stability [11]"
+        model="yaw-moment", gains="placed", poles=(-20.0, -25.0), source="dakf-stability (2), [11]"
     ),
     "lateral-force-observer": Filter(
         model="tyre-forces",
         fast=("gyro", "accel_y"),
         gains="placed",
         poles=(-20.0, -25.0, -30.0),
-        source="dakf-stability [11]",
+        source="dakf-stability (1)-(2), [11]",
     ),
     "exact-kf": Filter(
         slow=ANY, gains="covariance", disturbances="forces", source="docs/PAPERS.md section 3"

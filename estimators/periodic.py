@@ -105,7 +105,7 @@ def table_shape(f: Any, schedule: Schedule) -> tuple[int, int]:
 def design(f: Any, schedule: Schedule, speed: float, wish: Any) -> tuple[Array, Array]:
     """The table of gains at a speed in m/s, and the transition G there (dense, n).
 
-    f: the filter's record, left as it is. wish: `make.Wish`, how its gains are found.
+    f: the filter's record, left as it is. wish: a `wish.Wish`, how its gains are found.
     """
     twins: Filters = np.array([f])
     twin = twins.view(np.recarray)[0]
@@ -163,11 +163,21 @@ def _pseudo_gains(f: Any, s: int, schedule: Schedule, table: Array, inverse: Arr
     p, m, total = int(f.rows[s]), int(f.fasts), int(f.total)
     cycle, frames, width = schedule.cycle, len(schedule.lags), max(int(f.fasts), 1)
     first = 1 + cycle * width + p * frames
-    slow = table[1 + cycle * width : first, :total].reshape(frames, p, total).mean(0)
+    turns = table[1 + cycle * width : first, :total].reshape(frames, p, total)
+    slow = np.mean([together(gains, measured_rows(f, s, 0)[m:]) for gains in turns], axis=0)
     fast = table[1 : 1 + cycle * width, :total].reshape(cycle, width, total)[:, :m]
     K = constant_gain(fast, slow, schedule.period)
     table[first : first + m + p, :total] = K.T
     table[first + m + p :, :total] = inverse.T
+
+
+def together(K: Array, C: Array) -> Array:
+    """The gains (p, n) of rows that correct together from those of one after the other."""
+    joint = np.zeros_like(K)
+    for i in range(len(K)):
+        joint[:i] -= np.outer(joint[:i] @ C[i], K[i])
+        joint[i] = K[i]
+    return joint
 
 
 def slow_index(f: Any) -> int:

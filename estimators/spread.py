@@ -17,7 +17,7 @@ Array = npt.NDArray[np.float64]
 
 RULES = ("predict", "hold", "oh", "pseudo")
 GAINS = ("constant", "from-29", "placed")
-_CYCLES = 400
+_CYCLES, _SETTLED = 400, 1e-12
 
 
 def sampled_gain(F: Array, Q: Array, C: Array, R: Array, steps: int) -> Array:
@@ -30,18 +30,17 @@ def sampled_gain(F: Array, Q: Array, C: Array, R: Array, steps: int) -> Array:
     for _ in range(_CYCLES):
         before, K = K, kalman.gain(P, C, R)
         P = over @ kalman.joseph(P, K, C, R) @ over.T + noise
-        if np.abs(K - before).max() <= 1e-12 * np.abs(K).max():
+        if np.abs(K - before).max() <= _SETTLED * np.abs(K).max():
             break
     return K
 
 
-def hold(F: Array, Q: Array, C: Array, R: Array, steps: int) -> Array:
+def hold(F: Array, C: Array, K: Array, steps: int) -> Array:
     """Hara: the innovation is held, B_i = L for all i; (steps, n, q).
 
-    L gives the error from sample to sample the poles, and the very map, of the single-rate filter
-    with the low-rate measurement: F^r - sum_{i=1}^{r} F^i L C = F^r (I - K C).
+    K (n, q): the gain of the single-rate filter with the low-rate measurement. L gives the error
+    from sample to sample its poles and its very map: F^r - sum_{i=1}^{r} F^i L C = F^r (I - K C).
     """
-    K = sampled_gain(F, Q, C, R, steps)
     over, total = np.eye(len(F)), np.zeros_like(F)
     for _ in range(steps):
         over = F @ over
@@ -64,16 +63,17 @@ def pseudo(F: Array, C: Array, L: Array, first: Array, steps: int) -> Array:
     return np.array(shares)
 
 
-def from_29(F: Array, Q: Array, C: Array, R: Array, steps: int, cycles: int = 50) -> Array:
-    """B_i = L_i G_i with G_i of (31) and L_i the Kalman gain for the pseudo noise of (29).
+def from_29(F: Array, Q: Array, C: Array, R: Array, steps: int) -> Array:
+    """B_i = L_i G_i with G_i of (31) and L_i the Kalman gain for the pseudo noise of (29): limits.
 
     The covariance recursion is the paper's, which takes pseudo measurements for independent ones;
-    its error grows (spectral radius above 1). Returns (steps, n, q).
+    its error can grow (by 1.17 to 1.22 a sample for a course alone). Returns (steps, n, q).
     """
     n, q = len(F), len(C)
     pinv = inverse("moore-penrose", C, np.eye(n), R)
     P, shares = Q.copy(), np.zeros((steps, n, q))
-    for _ in range(cycles):
+    for _ in range(_CYCLES):
+        before = shares.copy()
         P = F @ P @ F.T + Q
         for i in range(steps):
             if i == 0:
@@ -90,29 +90,34 @@ def from_29(F: Array, Q: Array, C: Array, R: Array, steps: int, cycles: int = 50
             L = kalman.gain(P, C, noise)
             P = kalman.joseph(P, L, C, noise)
             shares[i] = L @ G
+        if np.abs(shares - before).max() <= _SETTLED * np.abs(shares).max():
+            break
     return shares
 
 
 def shares_of(
-    rule: str, gains: str, poles: Array | None, F: Array, Q: Array, C: Array, R: Array, steps: int
+    rule: str, gains: str, poles: Any, F: Array, Q: Array, C: Array, R: Array, steps: int
 ) -> Array:
     """B_i (steps, n, q) of a rule of `RULES` with gains of `GAINS`.
 
-    poles: (n,) of the z-plane, for gains "placed".
+    poles: (n,) of the z-plane for one step, for gains "placed": of the fast-rate filter (I - L C) F
+    where samples are made up in between, of the single-rate one (to the power of `steps`) else.
     """
-    if rule == "hold":
-        return hold(F, Q, C, R, steps)
-    if gains == "from-29" and rule == "pseudo":
+    single = rule in ("predict", "hold")
+    if gains == "from-29":
         return from_29(F, Q, C, R, steps)
     if gains == "placed":
         assert poles is not None
-        L = observer_gain(F, C, poles)
-    elif rule == "predict":
-        L = sampled_gain(F, Q, C, R, steps)
+        over = steps if single else 1
+        L = observer_gain(np.linalg.matrix_power(F, over), C, poles**over)
     else:
-        L = sampled_gain(F, Q, C, R, steps) / steps
+        L = sampled_gain(F, Q, C, R, steps)
+    if rule == "hold":
+        return hold(F, C, L, steps)
     if rule == "predict":
         return np.concatenate([L[None], np.zeros((steps - 1, *L.shape))])
+    if gains == "constant":
+        L = L / steps  # every step takes its even share
     return pseudo(F, C, L, inverse("moore-penrose", C, np.eye(len(F)), R) - L, steps)
 
 
@@ -126,15 +131,26 @@ def frame_map(F: Array, C: Array, shares: Array) -> Array:
 
 def shares(f: Any, G: Array, schedule: Any, wish: Any, table: Array) -> None:
     """Write the shares and the error's covariance after each step into a table of gains."""
-    n, q, r = int(f.n), int(f.rows.max()), int(schedule.period)
+    n, q = int(f.n), int(f.rows.max())
     s = int(np.argmax(f.period > 0))
     F, C, Q = whole(f, G), f.row[s, :q, :n], f.Q[:n, :n]
     R = np.diag(f.r[s, :q])
     poles = np.exp(np.array(wish.poles) * float(f.step)) if wish.poles else None
-    B = shares_of(wish.rule, wish.gains, poles, F, Q, C, R, r)
+    B = shares_of(wish.rule, wish.gains, poles, F, Q, C, R, int(schedule.period))
     first = 1 + schedule.cycle + q * len(schedule.lags)
-    table[first : first + r * q, :n] = B.transpose(0, 2, 1).reshape(r * q, n)
-    _covariances(F, Q, C, R, B, table, int(f.total))
+    write_shares(F, Q, C, R, B, table, first, int(f.total))
+
+
+def write_shares(
+    F: Array, Q: Array, C: Array, R: Array, B: Array, table: Array, first: int, behind: int
+) -> None:
+    """Shares B (steps, n, q), and the covariances they lead to, into a table of gains.
+
+    first: the row at which shares start. behind: the column at which covariances do.
+    """
+    steps, n, q = B.shape
+    table[first : first + steps * q, :n] = B.transpose(0, 2, 1).reshape(steps * q, n)
+    _covariances(F, Q, C, R, B, table, behind)
 
 
 def _covariances(

@@ -1,0 +1,249 @@
+"""The dual-rate estimator for any linear system: dual-rate (1)-(36) as the paper states it.
+
+    x_{k+1} = a x_k + b u_k + x_d,k + w_k,    y_k = c x_k + v_k at k = 0, r, 2 r, ...
+    x_d,k+1 = a_d x_d,k + u_d + w_d,k
+
+It runs on the compiled core of all filters, as the rule "spread" of a model that has its matrices
+from the user. `make_estimator("dual-rate")` is its application to a car's course angle.
+"""
+
+import warnings
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..envs.record import CAMERA, FAST_WIDTH, PACKET, PACKET_WIDTH
+from .compiled import entries
+from .core import begin_all
+from .delay import IGNORE
+from .estimates import Estimates, UnobservableWarning
+from .intersample import SPREAD
+from .matrices import covariance, matrix, square, vector
+from .memory import CORE, FILTER, INPUTS, ROWS
+from .spread import GAINS, RULES, frame_map, shares_of, write_shares
+from .stability import MARGINAL, spectral_radius, unobservable
+from .transition import GIVEN
+
+Array = npt.NDArray[np.float64]
+
+_NO_PACKETS = np.zeros((0, PACKET_WIDTH))
+_NOTHING, _NO_NIS = np.zeros((0, 0)), np.zeros(0)
+
+
+class DualRate:
+    """A filter for x_{k+1} = A x_k + B u_k measured as y = C x once every `ratio` steps.
+
+    A (m, m), B (m, p), C (q, m); ratio: r >= 1. Q (m, m) or (m,): covariance of a step's process
+    noise. R (q, q) or (q,): of the measurement noise.
+    disturbed: rows of x that an extended state x_d pushes, dual-rate (4)-(5); None for no
+    disturbance accommodation. With d of them: leak, a_d of (7), a number, (d,) or (d, d); rate, u_d
+    of (7), a number or (d,); Q_d (d, d), (d,) or a number, covariance of w_d.
+    intersample: "pseudo" (14)-(32), "oh" (35), "hold" (Hara) or "predict" (34). gains: "constant",
+    "from-29" or "placed" with `poles` (m + d,) of the z-plane for one step: of (I - L C) A, (22),
+    for "pseudo" and "oh", of the single-rate filter, each to the power r, for the others.
+    start: x at k = 0, (m,). allow_unstable: accept a filter whose error grows.
+
+    `x` (m + d,), `names` and `k` are those of now; `spectral_radius` of the error from
+    sample to sample; `unobservable`: directions that the measurement cannot see. `shares`
+    (r, m + d, q): L_{k+i} G_{k+i} of (14) and (19).
+
+    Raises
+    ------
+    ValueError: a wrong shape, a Q or R that is no covariance, more states, inputs or outputs than
+        there is room for, poles that cannot be placed, an error that grows.
+    """
+
+    def __init__(
+        self,
+        A: npt.ArrayLike,
+        B: npt.ArrayLike,
+        C: npt.ArrayLike,
+        ratio: int,
+        *,
+        Q: npt.ArrayLike,
+        R: npt.ArrayLike,
+        disturbed: Sequence[int] | None = None,
+        leak: npt.ArrayLike = 1.0,
+        rate: npt.ArrayLike = 0.0,
+        Q_d: npt.ArrayLike = 0.0,
+        intersample: str = "pseudo",
+        gains: str = "constant",
+        poles: npt.ArrayLike | None = None,
+        start: npt.ArrayLike | None = None,
+        allow_unstable: bool = False,
+    ) -> None:
+        a, b, c = (matrix(name, M) for name, M in (("A", A), ("B", B), ("C", C)))
+        m, rows = len(a), _disturbed(disturbed, len(a))
+        _check_sizes(a, b, c, len(rows))
+        if not ratio >= 1 or int(ratio) != ratio:
+            raise ValueError(f"ratio is a whole number of steps, at least 1, got {ratio!r}")
+        n, d, q = m + len(rows), len(rows), len(c)
+        F, drift = np.zeros((n, n)), np.zeros(n)
+        F[:m, :m] = a
+        F[rows, range(m, n)] = 1.0  # (5)
+        F[m:, m:] = square("leak", leak, d)  # (11)
+        drift[m:] = vector("rate", rate, d)
+        noise = np.zeros((n, n))
+        noise[:m, :m] = covariance("Q", Q, m)  # (12)
+        noise[m:, m:] = covariance("Q_d", Q_d, d)
+        seen, r = np.hstack([c, np.zeros((q, d))]), covariance("R", R, q, definite=True)
+        wanted = _poles(intersample, gains, poles, n)
+        with np.errstate(invalid="ignore", over="ignore"):
+            shares = shares_of(intersample, gains, wanted, F, noise, seen, r, int(ratio))
+        self.names = tuple([*(f"x{i + 1}" for i in range(m)), *(f"d{i + 1}" for i in rows)])
+        self.shares, self.ratio, self.inputs = shares, int(ratio), b.shape[1]
+        self._judge(F, seen, allow_unstable)
+        self.gains = np.zeros((1, 1 + q + (1 + q) * self.ratio, n + n * (n + 1) // 2))
+        self.gains[0, 0, 0] = 1.0
+        write_shares(F, noise, seen, r, shares, self.gains[0], 1 + q + self.ratio, n)
+        self._start = np.zeros(n)
+        self._start[:m] = vector("start", 0.0 if start is None else start, m)
+        self._filters = _record(F, b, drift, seen, self.ratio)
+        self.reset()
+
+    def _judge(self, F: Array, C: Array, allow_unstable: bool) -> None:
+        """Refuse an error that grows; name what the measurement cannot see."""
+        M = frame_map(F, C, self.shares)
+        self.spectral_radius = spectral_radius(M) if np.isfinite(M).all() else np.inf
+        self.unobservable: tuple[str, ...] = ()
+        if self.spectral_radius > 1.0 + MARGINAL:
+            if not allow_unstable:
+                raise ValueError(
+                    f"the error grows by a factor of {self.spectral_radius:.6g} from sample to "
+                    "sample (allow_unstable=True builds it all the same)"
+                )
+        elif self.spectral_radius >= 1.0 - MARGINAL:
+            self.unobservable = unobservable(M, self.names)
+            text = f"the measurement cannot see: {'; '.join(self.unobservable)}"
+            warnings.warn(text, UnobservableWarning, stacklevel=3)
+
+    def reset(self) -> None:
+        """Back to k = 0, before the first sample."""
+        self._begin()
+        self._take(np.zeros((1, FAST_WIDTH)), _NO_PACKETS)
+
+    def _begin(self) -> None:
+        begin_all(self._filters, 0)
+        self._filters[0].x[: len(self.names)] = self._start
+
+    def _take(self, fast: Array, packets: Array, X: Array = _NOTHING, S: Array = _NOTHING) -> None:
+        advance, count = entries()[0], len(packets)
+        advance(self._filters, self.gains, fast, len(fast), packets, count, 0, X, S, _NO_NIS)
+
+    def step(self, u: npt.ArrayLike) -> None:
+        """From k to k+1 with the input u (p,) of the step: dual-rate (17), (19)."""
+        fast = np.zeros((1, FAST_WIDTH))
+        fast[0, : self.inputs] = vector("u", u, self.inputs)
+        self._take(fast, _NO_PACKETS)
+
+    def update(self, y: npt.ArrayLike) -> None:
+        """The sample y (q,) of this k, a multiple of r: dual-rate (13).
+
+        Raises ValueError at any other k, for a second one, and for a y that is not finite.
+        """
+        f = self._filters[0]
+        if f.tick % self.ratio:
+            raise ValueError(f"a sample comes every {self.ratio} steps, this is step {f.tick}")
+        if f.since == 0:
+            raise ValueError(f"step {f.tick} has had its sample")
+        entries()[1](self._filters, self.gains, self._packet(vector("y", y, int(f.rows[CAMERA]))))
+
+    def _packet(self, y: Array) -> Array:
+        packet = np.zeros(PACKET_WIDTH)
+        packet[: PACKET.value] = CAMERA, self.k, self.k, 1.0, 0.0
+        packet[PACKET.value : PACKET.value + len(y)] = y
+        return packet
+
+    def run(self, U: npt.ArrayLike, Y: npt.ArrayLike) -> Estimates:
+        """Reset, then filter inputs U (K, p) and samples Y (K // r + 1, q) of k = 0, r, 2 r, ...
+
+        A row of Y that holds a NaN is a sample that never came. Returns estimates of k = 0 .. K,
+        time in steps. Raises ValueError for other shapes or an infinite number.
+        """
+        u, y, q = np.array(U, np.float64), np.array(Y, np.float64), int(self._filters[0].rows[0])
+        u = u.reshape(len(u), -1) if u.ndim else u
+        y = y.reshape(len(y), -1) if y.ndim else y
+        if u.ndim != 2 or u.shape[1] != self.inputs or not np.isfinite(u).all():
+            raise ValueError(f"U is finite and has shape (K, {self.inputs}), got {np.shape(U)}")
+        count = len(u) // self.ratio + 1
+        if y.shape != (count, q) or np.isinf(y).any():
+            raise ValueError(f"Y is finite or NaN and has shape ({count}, {q}), got {np.shape(Y)}")
+        fast, packets = np.zeros((len(u) + 1, FAST_WIDTH)), np.zeros((count, PACKET_WIDTH))
+        fast[1:, : self.inputs] = u
+        packets[:, PACKET.captured] = packets[:, PACKET.arrived] = np.arange(count) * self.ratio
+        packets[:, PACKET.quality] = 1.0
+        packets[:, PACKET.value : PACKET.value + q] = y
+        sound = ~np.isnan(y).any(axis=1)
+        self._begin()
+        X, S = (np.empty((len(fast), len(self.names))) for _ in range(2))
+        self._take(fast, np.ascontiguousarray(packets[sound]), X, S)
+        return Estimates(np.arange(float(len(fast))), X, S, self.names, np.full(count, np.nan))
+
+    @property
+    def x(self) -> Array:
+        """x and x_d now, (m + d,)."""
+        return np.array(self._filters[0].x[: len(self.names)])
+
+    @property
+    def k(self) -> int:
+        """k."""
+        return int(self._filters[0].tick)
+
+
+def _disturbed(rows: Sequence[int] | None, m: int) -> list[int]:
+    """The rows of x that a disturbance pushes; ValueError for one that is not there or twice."""
+    chosen = [] if rows is None else [int(row) for row in rows]
+    if len(set(chosen)) != len(chosen) or any(not 0 <= row < m for row in chosen):
+        raise ValueError(f"disturbed holds different rows from 0 to {m - 1}, got {rows!r}")
+    return chosen
+
+
+def _check_sizes(A: Array, B: Array, C: Array, d: int) -> None:
+    """ValueError where shapes do not fit each other or the room there is."""
+    m = len(A)
+    if A.shape != (m, m) or len(B) != m or C.shape[1] != m:
+        raise ValueError(
+            f"A, B and C have shapes (m, m), (m, p) and (q, m), got {A.shape}, {B.shape}, {C.shape}"
+        )
+    there = (("states with their disturbances", m + d, CORE), ("inputs", B.shape[1], INPUTS))
+    for what, count, most in (*there, ("outputs", len(C), ROWS)):
+        if count > most:
+            raise ValueError(f"{count} {what} are more than there is room for ({most})")
+
+
+def _poles(
+    intersample: str, gains: str, poles: npt.ArrayLike | None, n: int
+) -> npt.NDArray[np.complex128] | None:
+    """The poles to place, (n,); ValueError for an unknown rule or gain, or what does not fit it."""
+    for name, word, known in (("intersample", intersample, RULES), ("gains", gains, GAINS)):
+        if word not in known:
+            raise ValueError(f"{name} is one of {', '.join(known)}, got {word!r}")
+    if gains == "from-29" and intersample != "pseudo":
+        raise ValueError("gains 'from-29' are those of intersample='pseudo'")
+    if (gains == "placed") != (poles is not None):
+        raise ValueError(f"poles are for gains='placed', got gains={gains!r} and poles={poles!r}")
+    if poles is None:
+        return None
+    wanted = np.array(poles, np.complex128)
+    if wanted.shape != (n,) or not np.isfinite(wanted).all():
+        raise ValueError(f"{n} states need {n} finite poles, got {poles!r}")
+    return wanted
+
+
+def _record(F: Array, B: Array, drift: Array, C: Array, ratio: int) -> Any:
+    """The filter's memory: every state is dense, the slow sensor is the first."""
+    filters = np.zeros(1, FILTER).view(np.recarray)
+    f, n, q, p = filters[0], len(F), len(C), B.shape[1]
+    f.kind, f.n, f.total, f.dense, f.step, f.relax = GIVEN, n, n, n, 1.0, 1.0
+    f.G[:n, :n], f.H[: len(B), :p], f.drift[:n] = F, B, drift
+    f.inputs = p
+    f.u_column[:p, 0] = range(p)
+    f.u_factor[:p, 0] = 1.0
+    f.rows[CAMERA], f.row[CAMERA, :q, :n] = q, C
+    f.period[CAMERA] = f.cycle = ratio
+    f.stride = f.pace = f.pattern = f.periodic = 1
+    f.late, f.between, f.speed_state = IGNORE, SPREAD, -1
+    f.speed = 1.0  # no vehicle: any
+    return filters
