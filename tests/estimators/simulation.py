@@ -1,6 +1,7 @@
 """The linear car of the papers' small-angle simulations, exactly, for the estimators' tests.
 
-Inputs and disturbances are held over a tick, so the zero-order hold of `envs.linear` is exact.
+Inputs and disturbances are held over a tick, so the zero-order hold of `envs.linear` is exact. The
+body rolls with the lateral acceleration and does not act back: double-layer-gps (3)-(5).
 """
 
 import math
@@ -9,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import lfilter
 
-from sideslip.envs.linear import vision
+from sideslip.envs.linear import LinearModel, vision
 from sideslip.envs.record import (
     FAST,
     FAST_WIDTH,
@@ -20,7 +21,7 @@ from sideslip.envs.record import (
     Record,
     SlowSensor,
 )
-from sideslip.envs.vehicle import COMS, Vehicle
+from sideslip.envs.vehicle import COMS, GRAVITY, Vehicle
 
 KMH = 1.0 / 3.6
 CAMERA = SlowSensor(period=0.033, delays=(0.030,))
@@ -108,7 +109,36 @@ def simulate(
     fast[0, FAST.steer] = steer[0]
     packets = _packets(drive, slow, x, K, noisy, rng)
     truth = {"beta": x[:, 0], "gamma": x[:, 1], "psi": x[:, 2], "y_l": x[:, 3]}
+    pushed = np.column_stack([steer, np.zeros((K + 1, 2)), ou + blowing])
+    pushed = np.vstack([pushed[:1], pushed[:-1]])  # what acted until this tick
+    truth |= _bodily(drive, fast, x, V * ((x @ wide.A.T + pushed @ wide.B.T)[:, 0] + x[:, 1]))
+    own = np.random.default_rng([seed, 1])
+    for column, level in ((FAST.accel_y, 0.1), (FAST.accel_x, 0.1), (FAST.roll_rate, 0.005)):
+        fast[:, column] += noisy * level * own.standard_normal(K + 1)
     return Log(Record(fast, packets), slow, truth)
+
+
+def _bodily(
+    drive: Drive, fast: np.ndarray, x: np.ndarray, across: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Write what accelerometers and roll gyro feel; the truth of velocities and roll.
+
+    across: (K + 1,) v_y' + gamma v_x in m/s2; a_y is that and gravity's share, (5).
+    """
+    car = drive.truth
+    lift = car.sprung_mass * car.roll_arm / car.roll_inertia
+    A = np.array([[0.0, 1.0], [lift * GRAVITY - car.roll_stiffness / car.roll_inertia, 0.0]])
+    A[1, 1] = -car.roll_damping / car.roll_inertia
+    roll = LinearModel(A, np.array([[0.0], [lift]]), np.eye(2), ("phi", "phi_rate"), (), ())
+    G, H = roll.discrete(0.001)
+    phi = np.zeros((len(x), 2))
+    for k in range(len(x) - 1):
+        phi[k + 1] = G @ phi[k] + H[:, 0] * across[k]
+    fast[:, FAST.accel_y] = across + GRAVITY * phi[:, 0]
+    fast[:, FAST.accel_x] = -x[:, 1] * drive.speed * x[:, 0]  # (4) at a held v_x
+    fast[:, FAST.roll_rate] = phi[:, 1]
+    v_x = np.full(len(x), drive.speed)
+    return {"v_x": v_x, "v_y": drive.speed * x[:, 0], "phi": phi[:, 0], "phi_rate": phi[:, 1]}
 
 
 def _packets(
