@@ -9,7 +9,8 @@ Where to start reading: `papers` has the table of filters; `make` turns a row of
 `arrivals` and `measure` the packets, `layers` tells a second layer. Gains come from `covariance` at
 every step or, for a schedule that repeats, from `periodic`, `placed` and `spread`, in the textbook
 equations of `kalman`; `stability` refuses what diverges. `estimator` and `wrappers` are the faces,
-`dual_rate` that of any linear system, `bound` the ceiling.
+`dual_rate` that of any linear system, `smoother` tells the truth of a log offline, `bound` is the
+ceiling.
 """
 
 from .dual_rate import DualRate
@@ -17,6 +18,7 @@ from .estimates import Estimates, UnobservableWarning
 from .estimator import Estimator
 from .make import make_estimator
 from .papers import FILTERS
+from .smoother import smooth
 from .wrappers import EstimateObservation
 
 __all__ = [
@@ -27,4 +29,5 @@ __all__ = [
     "Estimator",
     "UnobservableWarning",
     "make_estimator",
+    "smooth",
 ]

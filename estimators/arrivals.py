@@ -4,9 +4,9 @@ from typing import Any
 
 import numpy as np
 
-from ..envs.backend import jit
+from ..envs.backend import floor, jit
 from ..envs.record import GPS, PACKET, PACKET_WIDTH
-from .delay import BUFFER, DROPPED, find
+from .delay import BUFFER, DROPPED, find, known
 from .innovation import SATELLITES
 from .measure import measure
 from .memory import COUNTERS, SLOW, WAITING
@@ -15,28 +15,49 @@ from .speed import finite
 
 
 @jit
-def use(f: Any, gains: Any, s: int, packet: Any) -> None:
-    """Use a sound packet of sensor s according to its age."""
+def use(f: Any, gains: Any, s: int, packet: Any) -> bool:
+    """Use a sound packet of sensor s according to its age; whether it was used."""
     if f.late == BUFFER:
-        take_late(f, gains, s, packet)
-        return
+        return take_late(f, gains, s, packet)
     first = find(f, s, int(packet[PACKET.captured]))
-    if first != DROPPED:
-        measure(f, gains, s, first, packet)
+    return first != DROPPED and measure(f, gains, s, first, packet, True)
+
+
+@jit
+def _whole(value: Any) -> bool:
+    return floor(value) == value
+
+
+@jit
+def _timely(f: Any, captured: Any, arrived: Any) -> bool:
+    """Whether stamps are ticks from the first row to now, in their order; else it is counted."""
+    if not (_whole(captured) and _whole(arrived)) or arrived < captured:
+        f.counts[COUNTERS.unknown] += 1
+    elif arrived > f.tick:
+        f.counts[COUNTERS.future] += 1
+    elif captured < f.start:
+        f.counts[COUNTERS.refused] += 1
+    else:
+        return True
+    return False
 
 
 @jit
 def sound(f: Any, packet: Any) -> bool:
-    """Whether a packet is one for this filter and fit for use; what is not is counted."""
+    """Whether a packet is one for this filter and fit for use; what is not is counted.
+
+    Numbers are judged as floats, before any becomes an int.
+    """
     for i in range(PACKET.value):
         if not finite(packet[i]):
             f.counts[COUNTERS.invalid] += 1
             return False
-    s = int(packet[PACKET.sensor])
-    if s < 0 or s >= SLOW:
+    sensor = packet[PACKET.sensor]
+    if sensor < 0.0 or sensor >= SLOW or not _whole(sensor):
         f.counts[COUNTERS.unknown] += 1
         return False
-    if f.period[s] == 0:
+    s = int(sensor)
+    if f.period[s] == 0 or not _timely(f, packet[PACKET.captured], packet[PACKET.arrived]):
         return False
     for i in range(f.rows[s]):
         if not finite(packet[PACKET.value + i]):
@@ -51,17 +72,32 @@ def sound(f: Any, packet: Any) -> bool:
 
 
 @jit
-def receive(f: Any, gains: Any, packet: Any) -> None:
-    """Use a packet that is here now, keep it for the next step, or drop and count it."""
+def _wait(f: Any, s: int, packet: Any) -> bool:
+    """Keep a packet for the next step that listens; whether it is kept."""
+    if known(f, s, int(packet[PACKET.captured])):
+        return False
+    for i in range(f.waits):
+        same = f.waiting[i, PACKET.sensor] == packet[PACKET.sensor]
+        if same and f.waiting[i, PACKET.captured] == packet[PACKET.captured]:
+            f.counts[COUNTERS.duplicates] += 1
+            return False
+    if f.waits == WAITING:
+        f.counts[COUNTERS.refused] += 1
+        return False
+    for i in range(PACKET_WIDTH):
+        f.waiting[f.waits, i] = packet[i]
+    f.waits += 1
+    return True
+
+
+@jit
+def receive(f: Any, gains: Any, packet: Any) -> bool:
+    """Use a packet that is here now, keep it for the next step, or drop and count it; whether it
+    was used or kept."""
     f.nis = np.nan
     if not sound(f, packet):
-        return
+        return False
+    s = int(packet[PACKET.sensor])
     if f.pace > 1 and not (f.begun == 1 and (f.tick - f.origin) % f.pace == 0):
-        if f.waits == WAITING:
-            f.counts[COUNTERS.refused] += 1
-            return
-        for i in range(PACKET_WIDTH):
-            f.waiting[f.waits, i] = packet[i]
-        f.waits += 1
-        return
-    use(f, gains, int(packet[PACKET.sensor]), packet)
+        return _wait(f, s, packet)
+    return use(f, gains, s, packet)

@@ -161,7 +161,7 @@ def advance(
     are missing, `wanted` of the first layer says which; call again from there.
     """
     f = layers[0]
-    at = 0 if start == 0 else f.cursor
+    at, last = 0 if start == 0 else f.cursor, f.tick + rows - start
     for j in range(start, rows):
         now = 0.5 * (fast[j, FAST.wheel_left] + fast[j, FAST.wheel_right])
         if f.periodic == 1:
@@ -172,16 +172,16 @@ def advance(
         for layer in range(len(layers)):
             read(layers[layer], fast[j], now)
             tick(layers[layer], gains)
-        while at < count and not packets[at, PACKET.arrived] > f.tick:
-            receive(f, gains, packets[at])
+        while at < count and not (f.tick < packets[at, PACKET.arrived] <= last):
+            used = receive(f, gains, packets[at])  # from beyond the last row: counted here
             if len(nis) > 0:
                 nis[at] = f.nis
-            if len(layers) > 1:
+            if used and len(layers) > 1:
                 pass_on(f, layers[1], gains, packets[at])
             at += 1
         if len(X) > 0:
             _write(layers, gains, j, X, S)
-    f.counts[COUNTERS.future] += count - at
+    f.counts[COUNTERS.future] += count - at  # of a call without rows
     return rows
 
 
@@ -204,6 +204,5 @@ def begin_all(layers: Any, first: int) -> None:
 @jit
 def receive_all(layers: Any, gains: Any, packet: Any) -> None:
     """`receive` for all layers of an estimator."""
-    receive(layers[0], gains, packet)
-    if len(layers) > 1:
+    if receive(layers[0], gains, packet) and len(layers) > 1:
         pass_on(layers[0], layers[1], gains, packet)

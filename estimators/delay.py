@@ -5,7 +5,9 @@ measurement of its clones, so it is used exactly. The delayed states of tie-visi
 between the camera's triggers, are these clones: one algorithm under two names. The clones of frame
 i lie in slot i mod frames. They are made in the step *after* the capture, as (12) has it, when
 everything that is known at the captured tick has been used.
-buffer: the window is told again from the capture on (`rewind`): exact for any clock.
+buffer: the window is told again from the capture on (`rewind`): exact for any clock. A sample that
+is older than what a rule holds (clone, larsen: its frames; buffer, stored: `WINDOW` ticks) is
+refused and counted; a sensor whose longest delay is that long is refused when the filter is built.
 larsen: the covariance takes the sample at its capture, the states when it arrives (Larsen 1998);
 exact where exactly one sample is under way and none is lost.
 stored: its residual is taken against the prediction stored at the capture and used as if it were
@@ -18,9 +20,9 @@ import math
 from typing import Any
 
 from ..envs.backend import jit
-from ..envs.record import SLOW_NAMES, SlowSensor
+from ..envs.record import GPS, SLOW_NAMES, SlowSensor
 from .covariance import clone_covariance, measure_state
-from .memory import COUNTERS, FRAMES, SEEN, SLOW, WIDTH, WINDOW
+from .memory import COUNTERS, EVERY, FRAMES, RECENT, SEEN, SLOW, WIDTH, WINDOW
 
 RULES = ("clone", "ignore", "stored", "constant", "larsen", "buffer", "literal", "lag")
 CLONE, IGNORE, STORED, CONSTANT, LARSEN, BUFFER = range(6)
@@ -67,6 +69,40 @@ def place_clones(f: Any, sensors: dict[str, SlowSensor], rule: str, who: str) ->
         )
 
 
+def check_window(f: Any, sensors: dict[str, SlowSensor], who: str) -> None:
+    """ValueError for a sensor that can be later than the filter's window, and for what a rule
+    cannot do."""
+    dt = float(f.step / f.stride)
+    if f.late == CONSTANT and f.assumed >= WINDOW:
+        raise ValueError(
+            f"{who}: assumed_delay of {f.assumed * dt:g} s is not within the window of "
+            f"{WINDOW * dt:g} s ({WINDOW} ticks)"
+        )
+    if f.late == LARSEN and (f.gate.any() or f.knots > 0):
+        raise ValueError(
+            f"{who}: delay='larsen' weighs a sample before it is here, so it takes neither gate nor "
+            "hdop_table"
+        )
+    if f.late == BUFFER and f.pace > 1:
+        raise ValueError(f"{who}: delay='buffer' is for filters that listen at every tick")
+    if f.late not in (BUFFER, STORED):
+        return
+    window = WINDOW - EVERY if f.late == BUFFER else WINDOW - 1
+    kept = 0
+    for name, sensor in sensors.items():
+        if sensor.longest_delay > (window + 1e-6) * dt:
+            raise ValueError(
+                f"{who}: the {name} can be {sensor.longest_delay:g} s late; "
+                f"delay={RULES[f.late]!r} has a window of {window * dt:g} s ({window} ticks)"
+            )
+        kept += 2 + math.ceil((sensor.longest_delay + EVERY * dt) / sensor.period)
+    if f.late == BUFFER and kept > RECENT:
+        raise ValueError(
+            f"{who}: {kept} samples of {' and '.join(sensors)} can come within the longest delay; "
+            f"delay='buffer' keeps {RECENT}"
+        )
+
+
 @jit
 def _clone(f: Any, s: int, slot: int) -> None:
     """Clone what sensor s captured at the last tick: tie-vision (12) at a trigger."""
@@ -79,6 +115,8 @@ def _clone(f: Any, s: int, slot: int) -> None:
             error += row[k] * f.e[k]
         f.x[clone] = value
         f.e[clone] = error
+        if s == GPS:
+            f.r_held[slot] = f.r_before
         if f.periodic == 0:
             clone_covariance(f, row, clone)
 
@@ -91,7 +129,7 @@ def _promise(f: Any, s: int) -> None:
         for k in range(f.n):
             value += row[k] * f.x[k]
         f.promised[s, i] = value
-        measure_state(f, row, f.r[s, i], 0.0)
+        measure_state(f, row, f.r_before if s == GPS and i == 0 else f.r[s, i], 0.0)
         for j in range(i):
             keep_promise(f, s, j, row)
         for k in range(f.n):
@@ -134,7 +172,7 @@ def latch_due(f: Any, last: int) -> None:
 
 
 @jit
-def _known(f: Any, s: int, captured: int) -> bool:
+def known(f: Any, s: int, captured: int) -> bool:
     """Whether a sample of a sensor on its clock came before or is refused; it is counted."""
     frame = (captured - f.phase[s]) // f.period[s]
     if f.phase[s] + frame * f.period[s] != captured:
@@ -154,13 +192,7 @@ def _known(f: Any, s: int, captured: int) -> bool:
 def find(f: Any, s: int, captured: int) -> Any:
     """The first clone that a sample measures, DIRECT for the states, HELD for what else is held of
     its capture, or DROPPED (and counted)."""
-    if captured > f.tick:
-        f.counts[COUNTERS.future] += 1
-        return DROPPED
-    if captured < f.start:
-        f.counts[COUNTERS.refused] += 1
-        return DROPPED
-    if _known(f, s, captured):
+    if known(f, s, captured):
         return DROPPED
     frame = (captured - f.phase[s]) // f.period[s]
     if f.late == CONSTANT:

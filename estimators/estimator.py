@@ -215,17 +215,7 @@ class Estimator:
 
         Raises ValueError if the record is empty, has another tick than `dt`, or lacks a column.
         """
-        record = source.record if isinstance(source, Log) else source
-        if len(record.fast) == 0:
-            raise ValueError(f"{self.name}: the record is empty")
-        if abs(record.dt - self.dt) > 1e-9:
-            raise ValueError(
-                f"{self.name} was built for ticks of {self.dt:g} s, the record has {record.dt:g} s"
-            )
-        for column in self.needs:
-            if column not in record.present:
-                raise ValueError(f"{self.name} needs the column {column!r}, the log has none")
-        self.reset(source.slow if isinstance(source, Log) else None, record.first)
+        record = self.accept(source)
         fast = np.ascontiguousarray(record.fast, np.float64)
         packets = np.ascontiguousarray(record.packets, np.float64)
         n = len(self.names)
@@ -237,6 +227,21 @@ class Estimator:
         self.take(fast, len(fast), packets, len(packets), X, S, nis)
         time = np.asarray(record.ticks * record.dt, np.float64)
         return Estimates(time, X, S, self.names, nis)
+
+    def accept(self, source: Log | Record) -> Record:
+        """Reset for a record, which is returned; raises as `run`."""
+        record = source.record if isinstance(source, Log) else source
+        if len(record.fast) == 0:
+            raise ValueError(f"{self.name}: the record is empty")
+        if abs(record.dt - self.dt) > 1e-9:
+            raise ValueError(
+                f"{self.name} was built for ticks of {self.dt:g} s, the record has {record.dt:g} s"
+            )
+        for column in self.needs:
+            if column not in record.present:
+                raise ValueError(f"{self.name} needs the column {column!r}, the log has none")
+        self.reset(source.slow if isinstance(source, Log) else None, record.first)
+        return record
 
     def get_state(self) -> Any:
         """A snapshot that `set_state` continues from, bit for bit."""

@@ -5,6 +5,7 @@ from typing import Any
 from ..envs.backend import jit, maximum, minimum, sqrt
 from ..envs.record import GPS, PACKET
 from .covariance import project, project_clone
+from .delay import CLONE
 
 HDOP, SATELLITES = 4, 5  # values of a GPS packet
 _LEAST, _MOST = 0.05, 100.0  # of the scale of R
@@ -26,10 +27,22 @@ def dilution(f: Any, hdop: Any) -> Any:
 
 
 @jit
+def _at_capture(f: Any, packet: Any) -> Any:
+    """The variance of a GPS packet's first row at the speed at which it was captured."""
+    captured = int(packet[PACKET.captured])
+    if f.late == CLONE and f.r_course > 0.0 and captured < f.tick:
+        return f.r_held[(captured - f.phase[GPS]) // f.period[GPS] % f.frames[GPS]]
+    return f.r[GPS, 0]
+
+
+@jit
 def noise_of(f: Any, s: int, i: int, packet: Any) -> Any:
     """The variance of row i of a packet of sensor s."""
-    factor = dilution(f, packet[PACKET.value + HDOP]) if s == GPS else 1.0
-    return f.r[s, i] * f.scale[s, i] * factor * factor
+    if s != GPS:
+        return f.r[s, i] * f.scale[s, i]
+    factor = dilution(f, packet[PACKET.value + HDOP])
+    r = _at_capture(f, packet) if i == 0 else f.r[s, i]
+    return r * f.scale[s, i] * factor * factor
 
 
 @jit
@@ -78,9 +91,12 @@ def innovate(f: Any, s: int, first: int, packet: Any) -> bool:
 
 
 @jit
-def adapt(f: Any, s: int, i: int, own: Any, residual: Any) -> None:
-    """Innovation-based R: the mean of residual^2 - C P C^T, as a multiple of what was told."""
-    if f.adapt > 0.0 and f.r[s, i] > 0.0:
-        seen = (residual * residual - own) / f.r[s, i]
+def adapt(f: Any, s: int, i: int, own: Any, residual: Any, r: Any) -> None:
+    """Innovation-based R: the mean of residual^2 - C P C^T, as a multiple of what was told.
+
+    r: the sample's variance by the present scale.
+    """
+    if r > 0.0:
+        seen = (residual * residual - own) / r * f.scale[s, i]
         scale = f.scale[s, i] + f.adapt * (seen - f.scale[s, i])
         f.scale[s, i] = minimum(maximum(scale, _LEAST), _MOST)

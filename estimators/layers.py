@@ -7,28 +7,30 @@ from ..envs.elementary import sincos
 from ..envs.record import GPS, PACKET
 from .arrivals import receive
 from .innovation import HDOP, dilution
-from .memory import WINDOW
+from .memory import COUNTERS, WINDOW
+from .speed import finite
 
 SPEED = 1  # value of a GPS packet
 
 
 @jit
 def pass_on(first: Any, second: Any, gains: Any, packet: Any) -> None:
-    """Give the second layer a GPS packet as a velocity: v_x = V cos(beta), v_y = V sin(beta).
+    """Give the second layer a GPS packet that the first has used as a velocity: v_x = V cos(beta),
+    v_y = V sin(beta).
 
     double-layer-gps (8)-(9), with the first layer's sideslip angle as it was predicted for the
     captured tick. The noise along is the speed's, after the table of HDOP; the one across is that
     of the angle, (V sigma_beta)^2, and of the speed, (sigma_V sin(beta))^2.
     """
-    if not (packet[PACKET.sensor] == GPS and packet[PACKET.captured] <= first.tick):
-        receive(second, gains, packet)  # drops and counts what is not for it
-        return
     captured = int(packet[PACKET.captured])
     beta = first.x[0]
     if captured >= maximum(first.start, first.tick - WINDOW + 1) and captured < first.tick:
         beta = first.trail[captured % WINDOW, 0]
     s, c = sincos(beta)
     V = packet[PACKET.value + SPEED]
+    if not finite(V):
+        first.counts[COUNTERS.invalid] += 1
+        return
     told = second.waiting[0]  # its place for packets that wait, which it never uses
     for i in range(len(packet)):
         told[i] = packet[i]

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..envs.record import TICK, SlowSensor
 from ..envs.vehicle import COMS, Vehicle, vehicle_from
-from .delay import place_clones
+from .delay import check_window, place_clones
 from .estimator import Estimator
 from .memory import FILTER
 from .models import write_model
@@ -70,7 +70,8 @@ def make_estimator(
     Raises
     ------
     ValueError: unknown name, a sensor that is absent, a Q or noise that is no covariance, a
-        schedule that does not repeat, options that exclude each other, a filter that diverges.
+        schedule that does not repeat, a sensor that can be later than the filter's window, options
+        that exclude each other, a filter that diverges.
     TypeError: unknown option.
     """
     if name not in FILTERS:
@@ -117,6 +118,8 @@ def make_estimator(
         planned = plans(filters[0], row, slow, dt, wish)
         for f in filters:
             write_rules(name, f, row, wish, len(used), planned)
+            f.assumed = filters[0].assumed
+            check_window(f, {sensor: there[sensor] for sensor in sensors_used}, name)
         filters[0].trailing = max(filters[0].trailing, int(len(models) > 1))
         return filters, planned
 

@@ -8,10 +8,10 @@ from ..envs.backend import absolute, jit, maximum
 from ..envs.elementary import wrap
 from ..envs.record import GPS, PACKET
 from .covariance import measure_clone, measure_state
-from .delay import CONSTANT, HELD, LARSEN, keep_promises
+from .delay import BUFFER, CONSTANT, HELD, LARSEN, keep_promises
 from .innovation import adapt, innovate, noise_of, project_row
 from .intersample import NONE, PSEUDO, correct_sample, share_sample, spread_sample
-from .memory import COUNTERS, WINDOW
+from .memory import COUNTERS, SNAPSHOTS, WINDOW
 
 ASTRAY = 0.5  # rad: the first course sets the heading where it is so far off
 
@@ -42,13 +42,16 @@ def _expected(f: Any, s: int, i: int, first: int, captured: int) -> Any:
 
 @jit
 def _align(f: Any, turn: Any) -> None:
-    """Turn the heading, and all that is held of courses, onto a first course that is far off."""
+    """Turn the heading, now and as far as it is held, onto a first course that is far off."""
     f.x[2] += turn
     f.expected[0] += turn
     if f.home[GPS] > 0:
         for i in range(f.frames[GPS]):
             f.x[f.home[GPS] + i] += turn
     f.promised[GPS, 0] += turn
+    if f.late == BUFFER:
+        for i in range(SNAPSHOTS + 1):
+            f.shot_x[i, 2] += turn
 
 
 @jit
@@ -58,7 +61,7 @@ def _residuals(f: Any, s: int, first: int, packet: Any) -> None:
     for i in range(f.rows[s]):
         residual = packet[PACKET.value + i] - _expected(f, s, i, first, captured)
         f.residual[i] = wrap(residual) if f.angle[s, i] == 1 else residual
-    if s == GPS and f.angle[s, 0] == 1 and (f.first_fix < 0 or f.first_fix == captured):
+    if s == GPS and f.angle[s, 0] == 1 and f.first_fix < 0:
         f.first_fix = captured
         if absolute(f.residual[0]) > ASTRAY:
             _align(f, f.residual[0])
@@ -92,7 +95,7 @@ def _correct(f: Any, s: int, first: int, packet: Any) -> None:
     for i in range(f.rows[s]):
         residual, r = f.residual[i], noise_of(f, s, i, packet)
         if f.adapt > 0.0:
-            adapt(f, s, i, project_row(f, s, i, first), residual)
+            adapt(f, s, i, project_row(f, s, i, first), residual, r)
         if first >= 0:
             measure_clone(f, first + i, r, residual)
         else:
@@ -111,9 +114,14 @@ def _deliver_promise(f: Any, s: int) -> None:
 
 
 @jit
-def measure(f: Any, gains: Any, s: int, first: int, packet: Any) -> bool:
-    """Correct by one packet of sensor s whose values are sound; False if the gate refused it."""
-    f.nis = np.nan
+def measure(f: Any, gains: Any, s: int, first: int, packet: Any, judge: bool) -> bool:
+    """Correct by one packet of sensor s whose values are sound; False if the gate refused it.
+
+    judge: whether the gate judges it and its NIS is taken (not when it is told again).
+    """
+    if judge:
+        f.nis = np.nan
+    fix = f.first_fix
     _residuals(f, s, first, packet)
     if f.between == PSEUDO and f.periodic == 1:
         correct_sample(f, gains, s)
@@ -126,8 +134,9 @@ def measure(f: Any, gains: Any, s: int, first: int, packet: Any) -> bool:
     elif first == HELD and f.late == LARSEN:
         _deliver_promise(f, s)
     else:
-        if not innovate(f, s, first, packet):
+        if judge and not innovate(f, s, first, packet):
             f.counts[COUNTERS.gated] += 1
+            f.first_fix = fix
             return False
         _correct(f, s, first, packet)
     return True

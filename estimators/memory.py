@@ -36,9 +36,9 @@ class Counters(NamedTuple):
     refused: int = 0  # captured before the oldest state the filter still holds
     duplicates: int = 1  # same sensor and captured tick as an earlier packet
     future: int = 2  # captured or arriving after "now"
-    invalid: int = 3  # not finite, in a packet or in a fast row
+    invalid: int = 3  # not finite (or beyond all measure), in a packet or in a fast row
     poor: int = 4  # quality 0, or too few satellites
-    unknown: int = 5  # no sensor of ours, or a stamp off the sensor's clock
+    unknown: int = 5  # no sensor of ours, or a stamp that is no tick of the sensor's clock
     gated: int = 6  # an innovation that chi-square calls impossible
 
 
@@ -135,6 +135,8 @@ FILTER = np.dtype(
         ("y", _FLOAT, (FASTS,)),  # of this tick; NaN: none
         ("next", _INT, (SLOW,)),  # tick of the next capture
         ("stamp", _INT, (SLOW, FRAMES)),  # captured tick of each frame held; -1: none waits
+        ("r_before", _FLOAT),  # variance of the course at the row before
+        ("r_held", _FLOAT, (FRAMES,)),  # variance of the course in each frame held of the GPS
         ("seen", _INT, (SLOW, SEEN)),
         ("first_fix", _INT),  # captured tick of the first course used; -1: none yet
         ("waiting", _FLOAT, (WAITING, PACKET_WIDTH)),
@@ -164,10 +166,11 @@ FILTER = np.dtype(
         ("told_u", _FLOAT, (WINDOW, INPUTS)),
         ("told_y", _FLOAT, (WINDOW, FASTS)),
         ("told_speed", _FLOAT, (WINDOW, 2)),  # the model's speed, the yaw rate it was told
-        ("shot_x", _FLOAT, (SNAPSHOTS, CORE)),
-        ("shot_P", _FLOAT, (SNAPSHOTS, CORE, CORE)),
+        ("shot_x", _FLOAT, (SNAPSHOTS + 1, CORE)),  # the last is "now", while the past is told
+        ("shot_P", _FLOAT, (SNAPSHOTS + 1, CORE, CORE)),
         ("recent", _FLOAT, (RECENT, PACKET_WIDTH)),
-        ("recents", _INT),  # packets ever kept
+        ("recent_r", _FLOAT, (RECENT, ROWS)),  # variances as they were told with each of them
+        ("lost", _INT),  # captured tick of the newest packet that is no longer kept
         ("replay", _INT, (RECENT,)),  # those that are told again
     ],
     align=True,

@@ -5,13 +5,14 @@ from typing import Any
 from ..envs.backend import absolute, jit, maximum, minimum
 from .transition import SLOWEST
 
+LARGEST = 1e15  # of a number that a filter takes: below it, whole floats are exact as int
 MOVED = 0.005  # the model is built anew where the speed moved by this share
 
 
 @jit
 def finite(value: Any) -> Any:
-    """Whether a number is neither NaN nor infinite."""
-    return value - value == 0.0
+    """Whether a number is one to calculate with: not NaN, infinite or beyond all measure."""
+    return absolute(value) < LARGEST
 
 
 @jit

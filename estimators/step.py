@@ -3,7 +3,7 @@
 from typing import Any
 
 from ..envs.backend import jit
-from ..envs.record import FAST
+from ..envs.record import FAST, GPS
 from .covariance import measure_state, predict_covariance
 from .delay import LARSEN, keep_promises
 from .intersample import (
@@ -26,6 +26,7 @@ def read(f: Any, row: Any, now: Any) -> None:
 
     now: this sample of the speed, m/s. The model is built anew where it has to be.
     """
+    f.r_before = f.r[GPS, 0]
     fine = True
     for i in range(f.inputs):
         value = f.u_factor[i, 0] * row[f.u_column[i, 0]] + f.u_factor[i, 1] * row[f.u_column[i, 1]]

@@ -1,0 +1,160 @@
+"""The offline truth of a log: a fixed-lag smoother around any filter with a covariance.
+
+Offline every packet is there, so each is used at the tick at which it was captured. The filter goes
+forwards block by block; Rauch, Tung and Striebel's recursion then comes backwards from the end of
+the *next* block, so that every estimate knows at least one lag of its future, and at most two.
+"""
+
+import copy
+import math
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..envs.backend import jit
+from ..envs.record import FAST, PACKET, Log
+from .arrivals import receive
+from .core import tick
+from .delay import IGNORE
+from .estimates import Estimates
+from .estimator import Estimator
+from .intersample import NONE
+from .make import make_estimator
+from .memory import WINDOW
+from .schedule import whole_ticks
+from .step import read
+
+Array = npt.NDArray[np.float64]
+
+
+def smooth(
+    estimator: Estimator | str, log: Log, lag_seconds: float = 1.0, **options: Any
+) -> Estimates:
+    """Every state of a log given what was measured up to `lag_seconds` later, or longer.
+
+    estimator: one with gains "covariance" that listens at every tick, whatever its rule for late
+    samples, or the name of one, to be built for the log's sensors with `options` as in
+    `make_estimator`. lag_seconds: whole ticks; a tick of block i (blocks of this length) knows what
+    was captured before block i + 2; `math.inf` for the whole log. Returns states and standard
+    deviations, and the NIS of each packet used at its capture.
+
+    Raises ValueError as `run`, for a lag that is none, and for a filter that is more, or less, than
+    one Kalman filter: two layers, precomputed gains, corrections between samples.
+    Source: Rauch, Tung and Striebel, AIAA J. 3 (1965) 1445.
+    """
+    if isinstance(estimator, str):
+        told = {"sensors": log.slow, "dt": log.record.dt, "gains": "covariance"}
+        estimator = make_estimator(estimator, **(told | options))
+    elif options:
+        raise TypeError(f"{estimator.name} is built, got {', '.join(options)}")
+    if not lag_seconds > 0.0:
+        raise ValueError(f"the lag is in s and positive, got {lag_seconds!r}")
+    twin = _in_time(estimator)
+    record = twin.accept(log)
+    rows = len(record.fast)
+    lag = rows
+    if math.isfinite(lag_seconds):
+        lag = min(rows, whole_ticks(lag_seconds, twin.dt, "the lag"))
+    packets = np.array(record.packets, np.float64)
+    packets[:, PACKET.arrived] = packets[:, PACKET.captured]
+    by = (record.packets[:, PACKET.arrived], packets[:, PACKET.sensor], packets[:, PACKET.captured])
+    order = np.lexsort(by)
+    x, std, nis = _blocks(twin, np.ascontiguousarray(record.fast), packets[order], lag)
+    found = np.empty_like(nis)
+    found[order] = nis
+    return Estimates(np.asarray(record.ticks * record.dt), x, std, twin.names, found)
+
+
+def _in_time(estimator: Estimator) -> Estimator:
+    """The same filter for samples that are never late."""
+    f = estimator.filters[0]
+    plain = f.between == NONE and f.periodic == 0 and f.delayed == 0 and f.pace == 1
+    if len(estimator.filters) > 1 or not plain:
+        raise ValueError(
+            f"{estimator.name}: a smoother needs one layer with gains='covariance', samples used "
+            "when they come and no states that lag"
+        )
+    twin = copy.copy(estimator)
+    twin.filters = estimator.filters.copy()
+    f = twin.filters[0]
+    f.late, f.total, f.trailing = IGNORE, f.n, 1
+    f.frames[:] = 0
+    return twin
+
+
+@jit
+def _forwards(
+    f: Any,
+    gains: Any,
+    fast: Any,
+    packets: Any,
+    at: int,
+    nis: Any,
+    F: Any,
+    before: Any,
+    x: Any,
+    P: Any,
+) -> int:
+    """Filter some rows; returns the packets done.
+
+    F (K, n, n): each row's transition from the one before. before (K, n): its prediction. x (K, n),
+    P (K, n, n): after its samples.
+    """
+    n, dense = f.n, f.dense
+    for j in range(len(fast)):
+        read(f, fast[j], 0.5 * (fast[j, FAST.wheel_left] + fast[j, FAST.wheel_right]))
+        tick(f, gains)
+        for i in range(n):
+            before[j, i] = f.trail[f.tick % WINDOW, i]
+            for k in range(n):
+                same = f.decay[i] if i == k else 0.0
+                F[j, i, k] = f.G[i, k] if i < dense else same
+        while at < len(packets) and not packets[at, PACKET.arrived] > f.tick:
+            receive(f, gains, packets[at])
+            nis[at] = f.nis
+            at += 1
+        for i in range(n):
+            x[j, i] = f.x[i]
+            for k in range(n):
+                P[j, i, k] = f.P[i, k]
+    return at
+
+
+def _blocks(twin: Estimator, fast: Array, packets: Array, lag: int) -> tuple[Array, Array, Array]:
+    """Smoothed states and standard deviations of all rows, and the packets' NIS."""
+    f, rows, n = twin.filters[0], len(fast), len(twin.names)
+    Q = np.array(f.Q[:n, :n])
+    X, S, nis = np.empty((rows, n)), np.empty((rows, n)), np.full(len(packets), np.nan)
+    span = min(2 * lag, rows)
+    told = np.empty((span, n, n)), np.empty((span, n)), np.empty((span, n)), np.empty((span, n, n))
+    done = at = 0  # rows, packets
+    for start in range(0, rows, lag):
+        for kept in told if start > 0 else ():  # what was the next block is the present one
+            kept[: span - lag] = kept[lag:]
+        first = done - start
+        end = min(start + span, rows)
+        views = (kept[first : end - start] for kept in told)
+        at = _forwards(f, twin.gains, fast[done:end], packets, at, nis, *views)
+        done = end
+        x, std = _backwards(*(kept[: end - start] for kept in told), Q)
+        stop = min(start + lag, rows)
+        X[start:stop], S[start:stop] = x[: stop - start], std[: stop - start]
+    return X, S, nis
+
+
+def _backwards(F: Array, before: Array, x: Array, P: Array, Q: Array) -> tuple[Array, Array]:
+    """Rauch, Tung and Striebel: from the last filtered state to the first."""
+    predicted = F[1:] @ P[:-1] @ F[1:].transpose(0, 2, 1) + Q
+    sd = np.sqrt(np.einsum("kii->ki", predicted))
+    known = sd == 0.0  # exactly: nothing to learn
+    sd[known] = 1.0
+    scaled = predicted / (sd[:, :, None] * sd[:, None, :])
+    np.einsum("kii->ki", scaled)[known] = 1.0
+    J = np.linalg.solve(scaled, (F[1:] @ P[:-1]) / sd[:, :, None])
+    J = J.transpose(0, 2, 1) / sd[:, None, :]  # P F^T (F P F^T + Q)^-1
+    x, P = x.copy(), P.copy()
+    for k in range(len(J) - 1, -1, -1):
+        x[k] += J[k] @ (x[k + 1] - before[k + 1])
+        P[k] += J[k] @ (P[k + 1] - predicted[k]) @ J[k].T
+    return x, np.sqrt(np.maximum(np.einsum("kii->ki", P), 0.0))

@@ -1,0 +1,164 @@
+"""Conditioning the joint Gaussian of all ticks on everything that arrived, for bicycle models.
+
+The states of all ticks are an affine map of z ~ N(0, I), the scaled prior and process noise, and so
+is every measurement: the posterior of z is one least-squares problem. Nothing is recursive, and no
+covariance is squared that would lose half the digits.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+from scipy.linalg import expm, solve_triangular
+
+from sideslip.envs.linear import vision
+from sideslip.envs.record import FAST, FAST_WIDTH, PACKET, PACKET_WIDTH, SLOW_NAMES, Record
+from sideslip.envs.vehicle import COMS
+
+STATES = ("beta", "gamma", "psi", "y_l")
+PUSHED = {"d1": 0, "d2": 1, "d3": 2}
+NOISE = {"camera": (3.5e-3, 0.02), "gps": (math.radians(0.14) * 60.0 / 3.6,)}  # course: x 1/V
+MEASURED = {"camera": (("psi",), ("y_l",)), "gps": (("beta", "psi"),)}
+GYRO = 0.005
+ARM = COMS.rear_track / (2.0 * COMS.wheel_radius)
+
+
+def transition(names: Any, V: float, dt: float) -> Any:
+    """F (n, n) and B (n, 2) of a tick; disturbances and inputs are held over it."""
+    model = vision(COMS, V)
+    behind = [name for name in names if name not in STATES]
+    block = np.zeros((6 + len(behind), 6 + len(behind)))
+    block[:4, :4], block[:4, 4:6] = model.A, model.B[:, :2]
+    for j, name in enumerate(behind, 6):
+        if name in ("F_d", "N_d"):
+            at, push = (0, 1.0 / (COMS.mass * V)) if name == "F_d" else (1, 1.0 / COMS.yaw_inertia)
+            block[at, j] = push
+        else:
+            block[PUSHED[name], j] = 1.0
+    exact = expm(block * dt)
+    keep = math.exp(-dt / 0.3) if "F_d" in names else 1.0
+    rows = [STATES.index(name) for name in names if name in STATES]
+    n, m = len(names), len(rows)
+    F, B = np.zeros((n, n)), np.zeros((n, 2))
+    F[:m, :m], F[:m, m:] = exact[np.ix_(rows, rows)], exact[rows, 6:]
+    F[m:, m:] = keep * np.eye(n - m)
+    B[:m] = exact[rows, 4:6]
+    return F, B
+
+
+def speeds(fast: Any, dt: float) -> Any:
+    """The speed of the model in every row: low-passed, and renewed where it moved by 0.5 %."""
+    share = 1.0 - math.exp(-dt / 0.2)
+    now = 0.5 * (fast[:, FAST.wheel_left] + fast[:, FAST.wheel_right])
+    smooth = model = max(now[0], 1.5)
+    found = [model]
+    for V in now[1:]:
+        smooth += share * (V - smooth)
+        if abs(max(smooth, 1.5) - model) > 0.005 * model:
+            model = max(smooth, 1.5)
+        found.append(model)
+    return np.array(found)
+
+
+def first_of_each(packets: Any) -> Any:
+    """Packets without the later copies of the same sample."""
+    seen: Any = set()
+    kept = []
+    for packet in packets:
+        if (stamp := (packet[PACKET.sensor], packet[PACKET.captured])) not in seen:
+            kept.append(packet)
+        seen.add(stamp)
+    return kept
+
+
+class Posterior:
+    """The states of every tick given a record.
+
+    prior: variances. Q: variances of a tick's noise (n,). V: speeds of all rows. factor: on the
+    course's noise by HDOP.
+    """
+
+    def __init__(
+        self,
+        names: Any,
+        record: Record,
+        prior: Any,
+        Q: Any,
+        V: Any,
+        gyro: bool = True,
+        factor: Any = lambda hdop: 1.0,
+    ) -> None:
+        n, K = len(names), len(record.fast)
+        noisy = np.flatnonzero(Q)
+        q = len(noisy)
+        self.mean, self.T = np.zeros((K, n)), np.zeros((K, n, n + (K - 1) * q))
+        self.T[0, :, :n] = np.diag(np.sqrt(prior))
+        models: Any = {}
+        for k in range(1, K):
+            row, a = record.fast[k], n + (k - 1) * q
+            if V[k] not in models:
+                models[V[k]] = transition(names, V[k], record.dt)
+            F, B = models[V[k]]
+            u = row[FAST.steer], ARM * (row[FAST.torque_right] - row[FAST.torque_left])
+            self.mean[k] = F @ self.mean[k - 1] + B @ u
+            self.T[k, :, :a] = F @ self.T[k - 1, :, :a]
+            self.T[k, noisy, np.arange(a, a + q)] = np.sqrt(Q[noisy])
+        M, b = [np.eye(n + (K - 1) * q)], [np.zeros(n + (K - 1) * q)]
+        if gyro:
+            g = names.index("gamma")
+            M.append(self.T[:, g] / GYRO)
+            b.append((record.fast[:, FAST.gyro] - self.mean[:, g]) / GYRO)
+        for packet in first_of_each(record.packets):
+            name, k = SLOW_NAMES[int(packet[PACKET.sensor])], int(packet[PACKET.captured])
+            for i, states in enumerate(MEASURED[name]):
+                sd = NOISE[name][i]
+                if name == "gps":
+                    sd *= factor(packet[PACKET.value + 4]) / V[k]
+                at = [names.index(state) for state in states]
+                M.append(self.T[k, at].sum(0)[None] / sd)
+                b.append(np.array([(packet[PACKET.value + i] - self.mean[k, at].sum()) / sd]))
+        A = np.column_stack([np.concatenate(M), np.concatenate(b)])
+        self.R = np.linalg.qr(A, "r")
+        self.z = solve_triangular(self.R[:-1, :-1], self.R[:-1, -1])
+
+    def at(self, k: int) -> Any:
+        """Mean and covariance of the states at row k."""
+        root = solve_triangular(self.R[:-1, :-1], self.T[k].T, trans="T")
+        return self.mean[k] + self.T[k] @ self.z, root.T @ root
+
+
+def inputs(rng: Any, rows: int) -> Any:
+    """Fast rows with random inputs and gyro samples, and a car that gets faster."""
+    fast = np.zeros((rows, FAST_WIDTH))
+    fast[:, FAST.steer] = 0.05 * rng.standard_normal(rows)
+    fast[:, FAST.torque_right] = 20.0 * rng.standard_normal(rows)
+    fast[:, FAST.gyro] = 0.1 * rng.standard_normal(rows)
+    V = rng.uniform(2.0, 15.0) + np.linspace(0.0, 3.0, rows)
+    fast[:, FAST.wheel_left] = fast[:, FAST.wheel_right] = V
+    return fast
+
+
+def arrivals(rng: Any, sensors: Any, rows: int, dt: float, clock: bool = True) -> Any:
+    """Packets that come late, in any order, twice (with other values) or never, by arrival.
+
+    clock: captured on the sensor's clock, else at random ticks.
+    """
+    packets: Any = []
+    for name, sensor in sensors.items():
+        captures = np.arange(round((sensor.phase or 0.0) / dt), rows, round(sensor.period / dt))
+        if not clock:
+            captures = np.sort(rng.choice(rows, len(captures), replace=False))
+        for i, k in enumerate(captures):
+            if rng.random() < 0.2:
+                continue
+            for _ in range(1 + int(rng.random() < 0.2)):
+                late = round(sensor.delays[i % len(sensor.delays)] / dt)
+                late += int(rng.integers(0, round(sensor.jitter / dt) + 1))
+                row = np.zeros(PACKET_WIDTH)
+                row[: PACKET.value] = SLOW_NAMES.index(name), k, k + late, 1.0, i
+                row[PACKET.value :] = 0.05 * rng.standard_normal(6)
+                row[PACKET.value + 4 :] = rng.uniform(0.5, 6.0), 12.0
+                if k + late < rows:
+                    packets.append(row)
+    packets = np.array(packets).reshape(-1, PACKET_WIDTH)
+    return packets[np.lexsort((packets[:, 0], packets[:, 1], packets[:, 2]))]
