@@ -80,7 +80,7 @@ def check_window(f: Any, sensors: dict[str, SlowSensor], who: str) -> None:
         )
     if f.late == LARSEN and (f.gate.any() or f.knots > 0):
         raise ValueError(
-            f"{who}: delay='larsen' weighs a sample before it is here, so it takes neither gate nor "
+            f"{who}: delay='larsen' weighs a sample before it is here, so it takes no gate and no "
             "hdop_table"
         )
     if f.late == BUFFER and f.pace > 1:

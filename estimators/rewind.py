@@ -124,10 +124,9 @@ def _measure_again(f: Any, gains: Any, tick: int, count: int, new: int) -> bool:
     for s in range(SLOW):
         for i in range(count):
             place = f.replay[i]
-            captured = int(f.recent[place, PACKET.captured])
-            if captured == tick and int(f.recent[place, PACKET.sensor]) == s:
-                if not _measure(f, gains, s, place, place == new):
-                    return False
+            due = f.recent[place, PACKET.captured] == tick and f.recent[place, PACKET.sensor] == s
+            if due and not _measure(f, gains, s, place, place == new):
+                return False
     return True
 
 

@@ -27,6 +27,8 @@ from .step import read
 
 Array = npt.NDArray[np.float64]
 
+_RANK = 1e-14  # of a correlation matrix, what counts as nothing
+
 
 def smooth(
     estimator: Estimator | str, log: Log, lag_seconds: float = 1.0, **options: Any
@@ -147,12 +149,10 @@ def _backwards(F: Array, before: Array, x: Array, P: Array, Q: Array) -> tuple[A
     """Rauch, Tung and Striebel: from the last filtered state to the first."""
     predicted = F[1:] @ P[:-1] @ F[1:].transpose(0, 2, 1) + Q
     sd = np.sqrt(np.einsum("kii->ki", predicted))
-    known = sd == 0.0  # exactly: nothing to learn
-    sd[known] = 1.0
+    sd[sd == 0.0] = 1.0
     scaled = predicted / (sd[:, :, None] * sd[:, None, :])
-    np.einsum("kii->ki", scaled)[known] = 1.0
-    J = np.linalg.solve(scaled, (F[1:] @ P[:-1]) / sd[:, :, None])
-    J = J.transpose(0, 2, 1) / sd[:, None, :]  # P F^T (F P F^T + Q)^-1
+    known = np.linalg.pinv(scaled, _RANK, hermitian=True)  # singular where a state is known exactly
+    J = P[:-1] @ F[1:].transpose(0, 2, 1) / sd[:, None, :] @ known / sd[:, None, :]
     x, P = x.copy(), P.copy()
     for k in range(len(J) - 1, -1, -1):
         x[k] += J[k] @ (x[k + 1] - before[k + 1])

@@ -1,5 +1,10 @@
 """What all tests share."""
 
+import os
+
+# Before numpy comes: on small matrices BLAS's threads only wait for each other.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 from hypothesis import settings
 
 # The first example of a property pays for compilation; the same examples come every time.

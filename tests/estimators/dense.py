@@ -50,7 +50,7 @@ def speeds(fast: Any, dt: float) -> Any:
     """The speed of the model in every row: low-passed, and renewed where it moved by 0.5 %."""
     share = 1.0 - math.exp(-dt / 0.2)
     now = 0.5 * (fast[:, FAST.wheel_left] + fast[:, FAST.wheel_right])
-    smooth = model = max(now[0], 1.5)
+    smooth, model = now[0], max(now[0], 1.5)
     found = [model]
     for V in now[1:]:
         smooth += share * (V - smooth)

@@ -1,130 +1,205 @@
 """The filter equals conditioning the joint Gaussian of all ticks on everything that arrived."""
 
+import dataclasses
 import math
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import pytest
-from scipy.linalg import expm
 
-from sideslip.envs.linear import vision
-from sideslip.envs.record import FAST, FAST_WIDTH, PACKET_WIDTH, Record, SlowSensor
-from sideslip.envs.vehicle import COMS
+from sideslip.envs.record import PACKET, Log, Record, SlowSensor
 from sideslip.estimators import make_estimator
+from tests.estimators.dense import GYRO, Posterior, arrivals, inputs, speeds
 
-SPEED, DT = 7.0, 0.001
-TICKS = 60
+pytestmark = pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning")
+
 PRIOR = {"beta": 0.02, "gamma": 0.05, "psi": 0.05, "y_l": 0.3, "F_d": 50.0, "N_d": 20.0}
-NOISE = {"camera": (3.5e-3, 0.02), "gps": (math.radians(0.14) * (60.0 / 3.6) / SPEED,)}
-MEASURED = {"camera": ((2,), (3,)), "gps": ((0, 2),)}
+PRIOR |= {"d1": 0.1, "d2": 1.0}
+HDOP = ((1.0, 1.0), (2.0, 1.5), (5.0, 4.0))
+EXACT = 1e-10  # of the posterior's standard deviation
+SCHEDULES = 20  # of each case
+
+CAMERA = SlowSensor(0.035, (0.0, 0.050, 0.020), jitter=0.100)
+GPS = SlowSensor(0.050, (0.030,), jitter=0.120)
+FAST_GPS = SlowSensor(0.025, (0.0,), jitter=0.150)
 
 
-def disturbed_model() -> Any:
-    """F, B, Q of beta, gamma, psi, y_l, force, moment; the disturbances are held over a tick."""
-    model = vision(COMS, SPEED)
-    push = np.zeros((4, 2))
-    push[0, 0], push[1, 1] = 1.0 / (COMS.mass * SPEED), 1.0 / COMS.yaw_inertia
-    block = np.zeros((8, 8))
-    block[:4, :4], block[:4, 4:6], block[:4, 6:] = model.A, model.B[:, :2], push
-    exact = expm(block * DT)
-    keep = math.exp(-DT / 0.3)
-    F = np.zeros((6, 6))
-    F[:4, :4], F[:4, 4:], F[4:, 4:] = exact[:4, :4], exact[:4, 6:], keep * np.eye(2)
-    B = np.zeros((6, 2))
-    B[:4] = exact[:4, 4:6]
-    Q = np.diag([0.0, 0.0, 0.0, 0.0, (1 - keep**2) * 50.0**2, (1 - keep**2) * 20.0**2])
-    return F, B, Q
+@dataclass
+class Case:
+    """A filter, what it is told, and its ticks."""
+
+    name: str
+    sensors: Any
+    speed: Any = None
+    Q: tuple[float, ...] = ()
+    options: Any = field(default_factory=dict)
+    dt: float = 0.005
+    rows: int = 80
+
+    def build(self, delay: str) -> Any:
+        told: Any = {"slow": list(self.sensors), "dt": self.dt, "gains": "covariance"}
+        if self.Q:
+            told["Q"] = self.Q
+        return make_estimator(
+            self.name,
+            sensors=self.sensors,
+            speed=self.speed,
+            delay=delay,
+            **(told | self.options),
+        )
+
+    def schedule(self, seed: int, clock: bool = True) -> Log:
+        """A record and clocks of their own."""
+        rng = np.random.default_rng(seed)
+        slow = {}
+        for name, sensor in self.sensors.items():
+            ticks = int(rng.integers(0, round(sensor.period / self.dt)))
+            slow[name] = dataclasses.replace(sensor, phase=ticks * self.dt)
+        fast = inputs(rng, self.rows)
+        return Log(Record(fast, arrivals(rng, slow, self.rows, self.dt, clock), dt=self.dt), slow)
+
+    def posterior(self, names: Any, record: Record) -> Posterior:
+        """Of the states at all ticks."""
+        noise = np.array(self.Q) * self.dt if self.Q else np.zeros(len(names))
+        if "F_d" in names:
+            noise[-2:] = (1.0 - math.exp(-self.dt / 0.3) ** 2) * np.array([50.0, 20.0]) ** 2
+        V = speeds(record.fast, record.dt)
+        return Posterior(
+            list(names),
+            record,
+            np.array([PRIOR[name] for name in names]) ** 2,
+            noise,
+            V if self.speed is None else np.full_like(V, self.speed),
+            gyro=self.name != "vision-only-kf",
+            factor=lambda hdop: np.interp(hdop, *zip(*HDOP, strict=True)),
+        )
 
 
-def random_record(rng: Any, sensors: Any) -> Any:
-    """Inputs, gyro samples and packets that come late, out of order or never."""
-    fast = np.zeros((TICKS + 1, FAST_WIDTH))
-    fast[:, FAST.steer] = 0.05 * rng.standard_normal(TICKS + 1)
-    fast[:, FAST.torque_right] = 20.0 * rng.standard_normal(TICKS + 1)
-    fast[:, FAST.gyro] = 0.1 * rng.standard_normal(TICKS + 1)
-    packets: Any = []
-    for code, (name, sensor) in enumerate(sensors.items()):
-        for i, k in enumerate(range(round(sensor.phase / DT), TICKS, round(sensor.period / DT))):
-            late = int(rng.integers(0, round(sensor.longest_delay / DT) + 1))
-            if rng.random() < 0.8 and k + late <= TICKS:
-                row = np.zeros(PACKET_WIDTH)
-                row[:5] = code, k, k + late, 1.0, i
-                row[5 : 5 + len(NOISE[name])] = 0.05 * rng.standard_normal(len(NOISE[name]))
-                packets.append(row)
-    packets = np.array(packets)
-    return Record(fast, packets[np.lexsort((packets[:, 0], packets[:, 1], packets[:, 2]))])
+CASES = {
+    "forces, camera and gps": Case("exact-kf", {"camera": CAMERA, "gps": GPS}, 7.0),
+    "forces, camera": Case("exact-kf", {"camera": CAMERA}, 3.0),
+    "forces, gps": Case("exact-kf", {"gps": FAST_GPS}, 15.0),
+    "forces, both, measured speed": Case("exact-kf", {"camera": CAMERA, "gps": FAST_GPS}),
+    "forces at 1 ms": Case(
+        "exact-kf",
+        {
+            "camera": SlowSensor(0.007, (0.003,), 0.0, 0.015),
+            "gps": SlowSensor(0.011, (0.0,), 0, 0.03),
+        },
+        7.0,
+        dt=0.001,
+        rows=100,
+    ),
+    "none, camera": Case("multirate-kf", {"camera": CAMERA}, 7.0, (3e-3, 2e-2, 1e-4, 1e-4)),
+    "none, both": Case(
+        "multirate-kf", {"camera": CAMERA, "gps": GPS}, 12.0, (3e-3, 2e-2, 0.0, 0.0)
+    ),
+    "none, vision alone": Case("vision-only-kf", {"camera": CAMERA}, None, (3e-3, 2e-2, 0.0, 0.0)),
+    "walk, gps": Case("dakf", {"gps": GPS}, 7.0, (4e-4, 4e-4, 1e-8, 3e-2, 0.2)),
+    "walk, gps, measured speed": Case("dakf", {"gps": GPS}, None, (4e-4, 4e-4, 1e-8, 3e-2, 0.2)),
+}
+for _case in CASES.values():  # HDOP is told to all that hear a GPS
+    if "gps" in _case.sensors:
+        _case.options["hdop_table"] = HDOP
 
 
-def dense_posterior(record: Any) -> Any:
-    """Mean and covariance at the last tick from the joint Gaussian of all ticks."""
-    F, B, Q = disturbed_model()
-    n, K = 6, TICKS
-    mean, cov = np.zeros(n * (K + 1)), np.zeros((n * (K + 1), n * (K + 1)))
-    cov[:n, :n] = np.diag([v**2 for v in PRIOR.values()])
-    arm = COMS.rear_track / (2.0 * COMS.wheel_radius)
-    for k in range(K):
-        a, b = n * k, n * (k + 1)
-        row = record.fast[k + 1]
-        u = [row[FAST.steer], arm * (row[FAST.torque_right] - row[FAST.torque_left])]
-        mean[b : b + n] = F @ mean[a:b] + B @ u
-        cov[b : b + n, :b] = F @ cov[a:b, :b]
-        cov[:b, b : b + n] = cov[b : b + n, :b].T
-        cov[b : b + n, b : b + n] = F @ cov[a:b, a:b] @ F.T + Q
-    C: Any = []
-    y: Any = []
-    r: Any = []
-    for k in range(K + 1):
-        C.append(np.eye(1, len(mean), n * k + 1)[0])
-        y.append(record.fast[k, FAST.gyro])
-        r.append(0.005**2)
-    for packet in record.packets:
-        name = ("camera", "gps")[int(packet[0])]
-        for i, states in enumerate(MEASURED[name]):
-            row = np.zeros(len(mean))
-            row[[n * int(packet[1]) + state for state in states]] = 1.0
-            C.append(row)
-            y.append(packet[5 + i])
-            r.append(NOISE[name][i] ** 2)
-    C, y, r = np.array(C), np.array(y), np.array(r)
-    now = np.arange(n * K, n * (K + 1))
-    scale = 1.0 / np.sqrt(np.einsum("ij,jk,ik->i", C, cov, C) + r)  # for the solver's sake
-    S = (C @ cov @ C.T + np.diag(r)) * np.outer(scale, scale)
-    cross = (cov @ C.T)[now] * scale
-    gain = np.linalg.solve(S, cross.T).T
-    return mean[now] + gain @ (scale * (y - C @ mean)), cov[np.ix_(now, now)] - gain @ cross.T
-
-
-CAMERA = SlowSensor(period=0.007, delays=(0.003,), jitter=0.015, phase=0.002)
-GPS = SlowSensor(period=0.011, delays=(0.0,), jitter=0.030, phase=0.0)
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_the_filter_equals_dense_gaussian_conditioning(seed: Any) -> None:
-    sensors = {"camera": CAMERA, "gps": GPS}
-    record = random_record(np.random.default_rng(seed), sensors)
-    prior = {name: PRIOR[name] for name in ("beta", "gamma", "psi", "y_l")}
-    filter_ = make_estimator(
-        "exact-kf", sensors=sensors, speed=SPEED, slow=["camera", "gps"], prior=prior
-    )
-    filter_.run(record)
-    assert filter_.counts == dict.fromkeys(filter_.counts, 0)
-    mean, cov = dense_posterior(record)
+def differences(filter_: Any, mean: Any, cov: Any) -> float:
+    """The largest in states, standard deviations and covariances, over the standard deviation."""
     sd = np.sqrt(np.diag(cov))
-    assert np.abs((filter_.x - mean) / sd).max() < 1e-10
-    assert np.abs((filter_.P - cov) / np.outer(sd, sd)).max() < 1e-9
+    return float(
+        max(
+            np.abs((filter_.x - mean) / sd).max(),
+            np.abs(np.sqrt(np.diag(filter_.P)) / sd - 1.0).max(),
+            np.abs((filter_.P - cov) / np.outer(sd, sd)).max(),
+        )
+    )
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_clone_and_buffer_equal_dense_gaussian_conditioning(case: Any) -> None:
+    """Of the whole problem, whatever is late, out of order, lost or here twice."""
+    told = CASES[case]
+    clone, buffer = told.build("clone"), told.build("buffer")
+    twice = late = 0
+    for seed in range(SCHEDULES):
+        log = told.schedule(seed)
+        mean, cov = told.posterior(clone.names, log.record).at(told.rows - 1)
+        for filter_ in (clone, buffer):
+            filter_.run(log)
+            skipped = {name for name, count in filter_.counts.items() if count}
+            assert skipped <= {"duplicates"}
+            assert differences(filter_, mean, cov) < EXACT
+        assert clone.counts == buffer.counts
+        assert differences(clone, buffer.x, buffer.P) < EXACT
+        twice += clone.duplicates
+        late += int((np.diff(log.record.packets[:, PACKET.captured]) < 0).sum())
+    assert twice > SCHEDULES // 4 and late > SCHEDULES // 4  # that the schedules were hard
+
+
+def test_so_they_do_at_every_tick_on_the_way() -> None:
+    told = CASES["forces, camera and gps"]
+    clone = told.build("clone")
+    log = told.schedule(99)
+    for rows in (1, 2, 17, 40, 63):
+        here = log.record.packets[:, PACKET.arrived] < rows
+        record = Record(log.record.fast[:rows], log.record.packets[here], dt=told.dt)
+        clone.run(Log(record, log.slow))
+        mean, cov = told.posterior(clone.names, record).at(rows - 1)
+        assert differences(clone, mean, cov) < EXACT
+
+
+@pytest.mark.parametrize("case", ["forces, camera and gps", "walk, gps, measured speed"])
+def test_the_buffer_needs_no_clock(case: Any) -> None:
+    """Samples captured at any ticks; what a clone has no place for."""
+    told = CASES[case]
+    buffer, clone = told.build("buffer"), told.build("clone")
+    for seed in range(SCHEDULES):
+        log = told.schedule(seed, clock=False)
+        buffer.run(log)
+        mean, cov = told.posterior(buffer.names, log.record).at(told.rows - 1)
+        assert buffer.unknown == buffer.refused == 0
+        assert differences(buffer, mean, cov) < EXACT
+    clone.run(log)
+    assert clone.unknown > 0
+
+
+def test_the_textbooks_formula_says_the_same_as_least_squares() -> None:
+    """mean + P_xy P_yy^-1 (y - C mean), for a record that is short enough to square."""
+    told = dataclasses.replace(CASES["forces, camera"], rows=20)
+    log = told.schedule(3)
+    names = ["beta", "gamma", "psi", "y_l", "F_d", "N_d"]
+    whole = told.posterior(names, log.record)
+    quiet = told.posterior(names, Record(log.record.fast, log.record.packets[:0], dt=told.dt))
+    T, m, n = whole.T.reshape(-1, whole.T.shape[2]), quiet.mean.ravel(), len(names)
+    C: Any = [np.eye(1, len(m), n * k + 1)[0] for k in range(20)]
+    y, r = list(log.record.fast[:, 0]), [GYRO**2] * 20
+    seen: Any = set()
+    for packet in log.record.packets:
+        k = int(packet[PACKET.captured])
+        if k not in seen:
+            C += [np.eye(1, len(m), n * k + 2)[0], np.eye(1, len(m), n * k + 3)[0]]
+            y += [packet[PACKET.value], packet[PACKET.value + 1]]
+            r += [3.5e-3**2, 0.02**2]
+        seen.add(k)
+    C, P = np.array(C), T @ T.T
+    gain = np.linalg.solve(C @ P @ C.T + np.diag(r), C @ P).T
+    mean, cov = m + gain @ (np.array(y) - C @ m), P - gain @ C @ P
+    found, spread = whole.at(19)
+    sd = np.sqrt(np.diag(spread))
+    assert np.abs((mean[-n:] - found) / sd).max() < 1e-8
+    assert np.abs((cov[-n:, -n:] - spread) / np.outer(sd, sd)).max() < 1e-8
 
 
 def test_a_late_sample_used_at_once_is_the_sample_used_in_time() -> None:
     """With all samples in, the order of arrival has left no trace."""
-    sensors = {"camera": CAMERA}
-    record = random_record(np.random.default_rng(7), sensors)
-    in_time = record.packets.copy()
-    in_time[:, 2] = in_time[:, 1]
-    in_time = in_time[np.argsort(in_time[:, 1])]
-    filter_ = make_estimator("exact-kf", sensors=sensors, speed=SPEED)
-    filter_.run(record)
+    told = CASES["forces, camera and gps"]
+    log = told.schedule(7)
+    in_time = log.record.packets.copy()
+    in_time[:, PACKET.arrived] = in_time[:, PACKET.captured]
+    in_time = in_time[np.lexsort((in_time[:, PACKET.sensor], in_time[:, PACKET.captured]))]
+    filter_ = told.build("clone")
+    filter_.run(log)
     late = filter_.x, filter_.P
-    filter_.run(Record(record.fast, in_time))
-    sd = np.sqrt(np.diag(late[1]))
-    assert np.abs((filter_.x - late[0]) / sd).max() < 1e-10
-    assert np.abs((filter_.P - late[1]) / np.outer(sd, sd)).max() < 1e-9
+    filter_.run(Log(Record(log.record.fast, in_time, dt=told.dt), log.slow))
+    assert differences(filter_, *late) < EXACT

@@ -1,0 +1,332 @@
+"""The rules for late samples that are not exact, written out slowly; what is too late."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sideslip.envs.linear import vision
+from sideslip.envs.record import FAST, FAST_WIDTH, PACKET, PACKET_WIDTH, Record, SlowSensor
+from sideslip.envs.vehicle import COMS
+from sideslip.estimators import FILTERS, make_estimator
+from sideslip.estimators.memory import EVERY, RECENT, WINDOW
+from sideslip.estimators.papers import Filter
+from tests.estimators.simulation import CAMERA, FIG7, Drive, simulate
+
+V = FIG7.speed
+QUICK = Drive(duration=0.6)
+Q = {"q_beta": 2e-3, "q_gamma": 2e-2, "q_psi": 1e-5, "q_y_l": 1e-4}
+NOISE = np.diag([2e-3, 2e-2, 1e-5, 1e-4]) * 0.001
+R_CAMERA = np.diag([3.5e-3**2, 0.02**2])
+UNEVEN = SlowSensor(0.033, (0.020, 0.015, 0.010, 0.025))
+
+
+# Larsen's update (T. D. Larsen and others, 1998)
+def gaps(x: Any, other: Any) -> Any:
+    """The largest difference of a row, in standard deviations."""
+    states = np.abs((x.x - other.x) / other.std).max(1)
+    return np.maximum(states, np.abs(x.std / other.std - 1.0).max(1))
+
+
+@pytest.mark.parametrize("fast", [("gyro",), ("gyro", "accel_y")])
+@pytest.mark.parametrize("delays", [(0.030,), (0.033,), (0.020, 0.0, 0.010, 0.031)])
+def test_larsen_is_optimal_when_its_one_sample_is_here(
+    fast: Any, delays: Any, monkeypatch: Any
+) -> None:
+    row = Filter(slow=("camera",), fast=fast, gains="covariance", disturbances="forces", source="")
+    monkeypatch.setitem(FILTERS, "ours", row)
+    sensors = {"camera": SlowSensor(0.033, delays)}
+    log = simulate(QUICK, sensors, 0)
+    log.record.fast[:, FAST.accel_y] = np.random.default_rng(0).normal(0.0, 0.3, 601)
+    optimal = make_estimator("ours", sensors=sensors, speed=V).run(log)
+    larsen = make_estimator("ours", sensors=sensors, speed=V, delay="larsen").run(log)
+    captured, arrived = log.record.packets[:, [PACKET.captured, PACKET.arrived]].T.astype(int)
+    under_way = np.zeros(601, bool)
+    for c, a in zip(captured, arrived, strict=True):
+        under_way[c + 1 : a] = True
+    under_way[captured[-1] + 34 :] = True  # the last sample may have missed the record
+    apart = gaps(larsen, optimal)
+    assert under_way.sum() > 100 and (~under_way).sum() > len(captured)
+    assert apart[~under_way].max() < 1e-10
+    if 0.030 in delays:
+        assert apart[under_way].max() > 1e-2  # in between it is another filter
+
+
+def test_larsen_believes_in_a_sample_that_never_comes() -> None:
+    """Its known flaw: the covariance has taken the sample at its capture."""
+    sensors = {"camera": CAMERA}
+    log = simulate(QUICK, sensors, 0)
+    lost = Record(log.record.fast, np.delete(log.record.packets, 5, 0))
+    optimal = make_estimator("exact-kf", sensors=sensors, speed=V)
+    larsen = make_estimator("exact-kf", sensors=sensors, speed=V, delay="larsen")
+    whole, without = larsen.run(log), larsen.run(lost)
+    np.testing.assert_array_equal(whole.std, without.std)
+    true = optimal.run(lost)
+    between = slice(5 * 33 + 30, 6 * 33 + 30)  # until the next sample
+    assert (without.std[between] < true.std[between]).all()
+    assert gaps(without, true)[between].min() > 1e-2
+
+
+# stored, constant
+def held_residuals(log: Any, age: Any) -> Any:
+    """uneven-delay (15): a Kalman filter that uses y - C x^-_{k - age} as if it were of now.
+
+    age: of a packet that arrives at tick k, in ticks.
+    """
+    G, H = vision(COMS, V).discrete(0.001)
+    gyro, camera = np.eye(1, 4, 1), np.eye(2, 4, 2)
+    x, P = np.zeros(4), np.diag([0.02**2, 0.05**2, 0.05**2, 0.3**2])
+    due = {int(packet[PACKET.arrived]): packet for packet in log.record.packets}
+    predicted, states, stds = [], [], []
+    for k, row in enumerate(log.record.fast):
+        if k > 0:
+            x = G @ x + H[:, :2] @ [row[FAST.steer], 0.0]
+            P = G @ P @ G.T + NOISE
+        predicted.append(x)
+        K = P @ gyro.T / (gyro @ P @ gyro.T + 0.005**2)
+        x, P = x + K @ (row[FAST.gyro] - gyro @ x), (np.eye(4) - K @ gyro) @ P
+        if k in due:
+            held = predicted[max(k - age(due[k]), 0)]
+            eps = due[k][PACKET.value : PACKET.value + 2] - camera @ held  # (15)
+            K = P @ camera.T @ np.linalg.inv(camera @ P @ camera.T + R_CAMERA)
+            x, P = x + K @ eps, (np.eye(4) - K @ camera) @ P
+        states.append(x)
+        stds.append(np.sqrt(np.diag(P)))
+    return np.array(states), np.array(stds)
+
+
+@pytest.mark.plain
+def test_stored_compares_a_sample_with_the_prediction_of_its_capture() -> None:
+    log = simulate(QUICK, {"camera": UNEVEN}, 3)
+    filter_ = make_estimator(
+        "multirate-kf", sensors=log.slow, speed=V, gains="covariance", delay="stored", **Q
+    )
+    found = filter_.run(log)
+    x, std = held_residuals(log, lambda packet: int(packet[2] - packet[1]))
+    np.testing.assert_allclose(found.x, x, rtol=0.0, atol=1e-11)
+    np.testing.assert_allclose(found.std, std, rtol=1e-8)
+
+
+@pytest.mark.plain
+def test_constant_compares_it_with_the_prediction_of_an_assumed_one() -> None:
+    log = simulate(QUICK, {"camera": UNEVEN}, 3)
+    filter_ = make_estimator(
+        "multirate-kf",
+        sensors=log.slow,
+        speed=V,
+        gains="covariance",
+        delay="constant",
+        assumed_delay=0.017,
+        **Q,
+    )
+    x, std = held_residuals(log, lambda packet: 17)
+    found = filter_.run(log)
+    np.testing.assert_allclose(found.x, x, rtol=0.0, atol=1e-11)
+    np.testing.assert_allclose(found.std, std, rtol=1e-8)
+
+
+def test_samples_are_as_far_apart_as_their_delays_make_them() -> None:
+    """uneven-delay (16): T_smp = T_l - T_d^{i-1} + T_d^i is between two arrivals; a filter that
+    goes by the stamps is nowhere told of it, and its estimates jump there."""
+    log = simulate(QUICK, {"camera": UNEVEN}, 3)
+    told = [0.020, 0.015, 0.010, 0.025]
+    arrived = log.record.packets[:, PACKET.arrived]
+    expected = [0.033 - told[(i - 1) % 4] + told[i % 4] for i in range(1, len(arrived))]
+    np.testing.assert_allclose(np.diff(arrived) * 0.001, expected, atol=1e-12)
+
+
+# literal, lag: tie-vision (12)-(13) at every step
+@pytest.mark.plain
+@pytest.mark.parametrize("rule", ["literal", "lag"])
+def test_late_states_that_follow_at_every_step(rule: Any) -> None:
+    """literal: psi_bar_{k+1} = psi_k (12) at T = 1 ms, a delay of 1 ms. lag: psi_bar follows psi
+    as a first-order lag of the camera's mean delay."""
+    log = simulate(QUICK, {"camera": UNEVEN}, 4)
+    mean = (0.020 + 0.015 + 0.010 + 0.025) / 4.0
+    follow = 1.0 if rule == "literal" else 1.0 - math.exp(-0.001 / mean)
+    G, H = vision(COMS, V).discrete(0.001)
+    G_a = np.zeros((6, 6))  # (13)
+    G_a[:4, :4] = G
+    G_a[4, 2] = G_a[5, 3] = follow
+    G_a[4, 4] = G_a[5, 5] = 1.0 - follow
+    H_a = np.vstack([H[:, :2], np.zeros((2, 2))])
+    C_a = np.zeros((3, 6))
+    C_a[0, 1] = C_a[1, 4] = C_a[2, 5] = 1.0
+    R = np.diag([0.005**2, 3.5e-3**2, 0.02**2])
+    x, P = np.zeros(6), np.diag([0.02**2, 0.05**2, 0.05**2, 0.3**2, 0.05**2, 0.3**2])
+    noise = np.diag([*np.diag(NOISE), 0.0, 0.0])
+    due = {int(packet[PACKET.arrived]): packet for packet in log.record.packets}
+    states, stds = [], []
+    for k, row in enumerate(log.record.fast):
+        if k > 0:
+            x, P = G_a @ x + H_a @ [row[FAST.steer], 0.0], G_a @ P @ G_a.T + noise
+        used = [0, 1, 2] if k in due else [0]
+        y = np.array([row[FAST.gyro], *(due[k][5:7] if k in due else ())])
+        C = C_a[used]
+        K = P @ C.T @ np.linalg.inv(C @ P @ C.T + R[np.ix_(used, used)])
+        x, P = x + K @ (y - C @ x), (np.eye(6) - K @ C) @ P
+        states.append(x)
+        stds.append(np.sqrt(np.diag(P)))
+    found = make_estimator(
+        "multirate-kf", sensors=log.slow, speed=V, gains="covariance", delay=rule, **Q
+    ).run(log)
+    assert found.names[4:] == ("psi_late", "y_l_late")
+    np.testing.assert_allclose(found.x, np.array(states), rtol=0.0, atol=1e-11)
+    np.testing.assert_allclose(found.std, np.array(stds), rtol=1e-7)
+
+
+# too late
+def rows(count: int) -> Any:
+    fast = np.zeros((count, FAST_WIDTH))
+    fast[:, FAST.gyro] = 0.02 * np.random.default_rng(0).standard_normal(count)
+    return fast
+
+
+def sample(captured: int, sensor: int = 1, value: float = 0.02) -> Any:
+    packet = np.zeros(PACKET_WIDTH)
+    packet[: PACKET.value + 2] = sensor, captured, captured, 1.0, 0, value, value
+    return packet
+
+
+NO_PACKETS = np.zeros((0, PACKET_WIDTH))
+
+
+def test_buffer_goes_back_as_far_as_its_window_and_no_further() -> None:
+    """Every sample up to WINDOW - EVERY ticks old is used as if it had come in time."""
+    sensors = {"gps": SlowSensor(0.2)}
+    late = make_estimator("exact-kf", sensors=sensors, speed=V, delay="buffer")
+    in_time = make_estimator("exact-kf", sensors=sensors, speed=V, delay="buffer")
+    now = 3 * WINDOW + 7
+    for age in (1, EVERY, WINDOW // 2, WINDOW - EVERY):
+        late.reset()
+        late.step(rows(now + 1), NO_PACKETS)
+        late.update(sample(now - age))
+        in_time.run(Record(rows(now + 1), sample(now - age)[None]))
+        assert late.refused == 0
+        sd = np.sqrt(np.diag(in_time.P))
+        assert np.abs((late.x - in_time.x) / sd).max() < 1e-10
+    for age in (WINDOW, WINDOW + 1, now):
+        late.reset()
+        late.step(rows(now + 1), NO_PACKETS)
+        before = late.x, late.P
+        late.update(sample(now - age))
+        assert late.refused == 1
+        np.testing.assert_array_equal(late.x, before[0])
+        np.testing.assert_array_equal(late.P, before[1])
+
+
+def test_buffer_refuses_what_is_older_than_a_sample_it_had_to_give_up() -> None:
+    """More samples than there is room for: none is ever left out of what is told again."""
+    filter_ = make_estimator("exact-kf", sensors={"gps": SlowSensor(0.2)}, speed=V, delay="buffer")
+    packets = [sample(k) for k in range(100, 100 + 2 * RECENT)]
+    filter_.run(Record(rows(300), np.array(packets)))
+    before = filter_.x
+    filter_.update(sample(100 + RECENT - 1 - EVERY))
+    assert filter_.refused == 1
+    np.testing.assert_array_equal(filter_.x, before)
+    filter_.update(sample(100))  # it was used; that is forgotten, but not that it was
+    assert filter_.refused == 2
+    filter_.update(sample(120 + RECENT + EVERY))
+    assert filter_.duplicates == 1
+    filter_.update(sample(250))
+    assert filter_.refused == 2
+    whole = make_estimator("exact-kf", sensors={"gps": SlowSensor(0.2)}, speed=V, delay="buffer")
+    whole.run(Record(rows(300), np.array([*packets, sample(250)])))
+    sd = np.sqrt(np.diag(whole.P))
+    assert np.abs((filter_.x - whole.x) / sd).max() < 1e-10
+
+
+@pytest.mark.parametrize("rule", ["clone", "larsen", "stored"])
+def test_a_sample_that_nothing_is_held_of_changes_nothing(rule: Any) -> None:
+    filter_ = make_estimator("exact-kf", sensors={"camera": CAMERA}, speed=V, delay=rule)
+    filter_.step(rows(1000), NO_PACKETS)
+    before = filter_.x, filter_.P
+    for k in (0, 33, 33 * 12):
+        filter_.update(sample(k, 0))
+    assert filter_.refused == 3 and sum(filter_.counts.values()) == 3
+    np.testing.assert_array_equal(filter_.x, before[0])
+    np.testing.assert_array_equal(filter_.P, before[1])
+
+
+@pytest.mark.parametrize(
+    ("name", "sensors", "options", "message"),
+    [
+        (
+            "exact-kf",
+            {"gps": SlowSensor(0.2, (0.3,), jitter=0.2)},
+            {"delay": "buffer"},
+            r"exact-kf: the gps can be 0.5 s late; delay='buffer' has a window of 0.496 s \(496 t",
+        ),
+        (
+            "exact-kf",
+            {"camera": SlowSensor(0.033, (0.512,))},
+            {"delay": "stored"},
+            r"the camera can be 0.512 s late; delay='stored' has a window of 0.511 s \(511 ticks",
+        ),
+        (
+            "exact-kf",
+            {"camera": SlowSensor(0.033)},
+            {"delay": "constant", "assumed_delay": 0.512},
+            r"assumed_delay of 0.512 s is not within the window of 0.512 s \(512 ticks\)",
+        ),
+        (
+            "exact-kf",
+            {"gps": SlowSensor(0.005, (0.4,))},
+            {"delay": "buffer"},
+            "86 samples of gps can come within the longest delay; delay='buffer' keeps 64",
+        ),
+        (
+            "exact-kf",
+            {"camera": SlowSensor(0.033, (0.100,))},
+            {"delay": "larsen"},
+            "the camera can be 0.1 s late, 4 of its periods .* delay='larsen' can hold 1",
+        ),
+        (
+            "exact-kf",
+            {"camera": CAMERA},
+            {"delay": "larsen", "gate": 0.99},
+            "delay='larsen' weighs a sample before it is here, so it takes no gate",
+        ),
+        (
+            "exact-kf",
+            {"gps": SlowSensor(0.2, (0.1,))},
+            {"delay": "larsen", "hdop_table": [(1.0, 1.0), (2.0, 2.0)]},
+            "no hdop_table",
+        ),
+        (
+            "single-rate-kf",
+            {"camera": CAMERA},
+            {"delay": "buffer"},
+            "delay='buffer' is for filters that listen at every tick",
+        ),
+    ],
+)
+def test_a_sensor_later_than_the_window_is_refused_when_the_filter_is_built(
+    name: Any, sensors: Any, options: Any, message: Any
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        make_estimator(name, sensors=sensors, speed=V, **options)
+
+
+def test_the_longest_delays_that_fit() -> None:
+    make_estimator("exact-kf", sensors={"gps": SlowSensor(0.2, (0.496,))}, delay="buffer")
+    make_estimator("exact-kf", sensors={"gps": SlowSensor(0.2, (0.511,))}, delay="stored")
+    sensors = {"camera": SlowSensor(0.033, (0.264,))}
+    make_estimator("exact-kf", sensors=sensors, delay="clone")
+
+
+@pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning")
+def test_clone_and_buffer_agree_in_both_layers() -> None:
+    """The second layer's samples keep the noise they were told with."""
+    sensors = {"gps": SlowSensor(0.1, (0.020, 0.070), jitter=0.060)}
+    log = simulate(Drive(duration=2.0), sensors, 5)
+    log.record.fast[:, FAST.accel_y] = 5.0 * log.truth["gamma"]
+    clone, buffer = (
+        make_estimator(
+            "double-layer", sensors=sensors, speed=V, intersample="predict", delay=rule
+        ).run(log)
+        for rule in ("clone", "buffer")
+    )
+    assert clone.names[5:] == ("v_x", "v_y", "phi", "phi_rate", "d")
+    assert gaps(clone, buffer).max() < 1e-9
