@@ -24,7 +24,7 @@ def use(f: Any, gains: Any, s: int, packet: Any) -> bool:
 
 
 @jit
-def _whole(value: Any) -> bool:
+def _whole(value: Any) -> Any:
     return floor(value) == value
 
 

@@ -46,7 +46,7 @@ def smooth(
     Source: Rauch, Tung and Striebel, AIAA J. 3 (1965) 1445.
     """
     if isinstance(estimator, str):
-        told = {"sensors": log.slow, "dt": log.record.dt, "gains": "covariance"}
+        told: dict[str, Any] = {"sensors": log.slow, "dt": log.record.dt, "gains": "covariance"}
         estimator = make_estimator(estimator, **(told | options))
     elif options:
         raise TypeError(f"{estimator.name} is built, got {', '.join(options)}")
@@ -139,13 +139,13 @@ def _blocks(twin: Estimator, fast: Array, packets: Array, lag: int) -> tuple[Arr
         views = (kept[first : end - start] for kept in told)
         at = _forwards(f, twin.gains, fast[done:end], packets, at, nis, *views)
         done = end
-        x, std = _backwards(*(kept[: end - start] for kept in told), Q)
+        x, std = _backwards(Q, *(kept[: end - start] for kept in told))
         stop = min(start + lag, rows)
         X[start:stop], S[start:stop] = x[: stop - start], std[: stop - start]
     return X, S, nis
 
 
-def _backwards(F: Array, before: Array, x: Array, P: Array, Q: Array) -> tuple[Array, Array]:
+def _backwards(Q: Array, F: Array, before: Array, x: Array, P: Array) -> tuple[Array, Array]:
     """Rauch, Tung and Striebel: from the last filtered state to the first."""
     predicted = F[1:] @ P[:-1] @ F[1:].transpose(0, 2, 1) + Q
     sd = np.sqrt(np.einsum("kii->ki", predicted))

@@ -91,7 +91,8 @@ class Posterior:
         n, K = len(names), len(record.fast)
         noisy = np.flatnonzero(Q)
         q = len(noisy)
-        self.mean, self.T = np.zeros((K, n)), np.zeros((K, n, n + (K - 1) * q))
+        self.mean: Any = np.zeros((K, n))
+        self.T: Any = np.zeros((K, n, n + (K - 1) * q))
         self.T[0, :, :n] = np.diag(np.sqrt(prior))
         models: Any = {}
         for k in range(1, K):
@@ -103,7 +104,8 @@ class Posterior:
             self.mean[k] = F @ self.mean[k - 1] + B @ u
             self.T[k, :, :a] = F @ self.T[k - 1, :, :a]
             self.T[k, noisy, np.arange(a, a + q)] = np.sqrt(Q[noisy])
-        M, b = [np.eye(n + (K - 1) * q)], [np.zeros(n + (K - 1) * q)]
+        M: Any = [np.eye(n + (K - 1) * q)]
+        b: Any = [np.zeros(n + (K - 1) * q)]
         if gyro:
             g = names.index("gamma")
             M.append(self.T[:, g] / GYRO)
@@ -118,7 +120,7 @@ class Posterior:
                 M.append(self.T[k, at].sum(0)[None] / sd)
                 b.append(np.array([(packet[PACKET.value + i] - self.mean[k, at].sum()) / sd]))
         A = np.column_stack([np.concatenate(M), np.concatenate(b)])
-        self.R = np.linalg.qr(A, "r")
+        self.R: Any = np.linalg.qr(A, "r")
         self.z = solve_triangular(self.R[:-1, :-1], self.R[:-1, -1])
 
     def at(self, k: int) -> Any:

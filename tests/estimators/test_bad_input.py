@@ -199,7 +199,8 @@ def test_rows_that_are_not_finite_are_skipped(name: Any) -> None:
 
 
 def everywhere(name: Any, **options: Any) -> Any:
-    return make_estimator(name, **({"sensors": BOTH, "speed": 7.0} | options))
+    told: dict[str, Any] = {"sensors": BOTH, "speed": 7.0}
+    return make_estimator(name, **(told | options))
 
 
 @pytest.mark.parametrize("name", list(FILTERS))
@@ -304,7 +305,7 @@ def test_a_car_that_stands_is_no_division_by_zero(name: Any, speed: Any) -> None
     log = simulate(SHORT, BOTH, 0)
     rows = np.concatenate([log.record.fast] * 3)
     still = np.abs(np.arange(len(rows)) - len(rows) // 2) > 150
-    rows[np.ix_(still, [FAST.wheel_left, FAST.wheel_right])] = 0.0
+    rows[still, FAST.wheel_left] = rows[still, FAST.wheel_right] = 0.0
     found = filter_.run(Record(rows, log.record.packets))
     assert np.isfinite(found.x).all() and np.isfinite(found.std).all()
     assert (found.std >= 0.0).all()

@@ -72,7 +72,7 @@ class Case:
             noise,
             V if self.speed is None else np.full_like(V, self.speed),
             gyro=self.name != "vision-only-kf",
-            factor=lambda hdop: np.interp(hdop, *zip(*HDOP, strict=True)),
+            factor=lambda hdop: np.interp(hdop, *np.array(HDOP).T),
         )
 
 
@@ -137,16 +137,18 @@ def test_clone_and_buffer_equal_dense_gaussian_conditioning(case: Any) -> None:
     assert twice > SCHEDULES // 4 and late > SCHEDULES // 4  # that the schedules were hard
 
 
-def test_so_they_do_at_every_tick_on_the_way() -> None:
+@pytest.mark.plain
+@pytest.mark.parametrize("delay", ["clone", "buffer"])
+def test_so_they_do_at_every_tick_on_the_way(delay: Any) -> None:
     told = CASES["forces, camera and gps"]
-    clone = told.build("clone")
+    filter_ = told.build(delay)
     log = told.schedule(99)
     for rows in (1, 2, 17, 40, 63):
         here = log.record.packets[:, PACKET.arrived] < rows
         record = Record(log.record.fast[:rows], log.record.packets[here], dt=told.dt)
-        clone.run(Log(record, log.slow))
-        mean, cov = told.posterior(clone.names, record).at(rows - 1)
-        assert differences(clone, mean, cov) < EXACT
+        filter_.run(Log(record, log.slow))
+        mean, cov = told.posterior(filter_.names, record).at(rows - 1)
+        assert differences(filter_, mean, cov) < EXACT
 
 
 @pytest.mark.parametrize("case", ["forces, camera and gps", "walk, gps, measured speed"])

@@ -16,7 +16,7 @@ from tests.estimators.simulation import CAMERA, FIG7, Drive, simulate
 
 V = FIG7.speed
 QUICK = Drive(duration=0.6)
-Q = {"q_beta": 2e-3, "q_gamma": 2e-2, "q_psi": 1e-5, "q_y_l": 1e-4}
+Q: Any = {"q_beta": 2e-3, "q_gamma": 2e-2, "q_psi": 1e-5, "q_y_l": 1e-4}
 NOISE = np.diag([2e-3, 2e-2, 1e-5, 1e-4]) * 0.001
 R_CAMERA = np.diag([3.5e-3**2, 0.02**2])
 UNEVEN = SlowSensor(0.033, (0.020, 0.015, 0.010, 0.025))

@@ -149,9 +149,10 @@ def test_adapt_is_a_share(adapt: Any) -> None:
 def scales(filter_: Any, log: Any) -> Any:
     """The scales of the camera's R, (k, 2), after every 100 ticks."""
     filter_.accept(log)
-    record, found, at = log.record, [], 0
+    found: Any = []
+    record, at = log.record, 0
     for start in range(0, len(record.fast) - 1, 100):
-        until = np.searchsorted(record.packets[:, PACKET.arrived], start + 100)
+        until = int(np.searchsorted(record.packets[:, PACKET.arrived], start + 100))
         filter_.step(record.fast[start : start + 100], record.packets[at:until])
         at = until
         found.append(filter_.filters[0].scale[CAMERA_CODE, :2].copy())
