@@ -64,10 +64,29 @@ def riccati(
     seconds: float = 8.0,
     **options: float,
 ) -> Array:
-    """The bound's limit where delays repeat: standard deviation of beta over the last `seconds` / 4
-    of a periodic Riccati recursion, in NumPy and textbook letters; tick by tick, rad.
+    """The bound's limit where delays repeat: standard deviation of beta in rad over the last
+    `seconds` / 4 of `riccati_variances`, which says what it takes and raises."""
+    P = riccati_variances(vehicle, sensors=sensors, speed=speed, dt=dt, seconds=seconds, **options)[
+        "beta"
+    ]
+    beta: Array = np.sqrt(P[-(len(P) // 4) :])
+    return beta
 
-    options: the standard deviations of `NOISE` and `DISTURBANCE` of `estimators.make`. Raises
+
+def riccati_variances(
+    vehicle: Vehicle,
+    *,
+    sensors: Mapping[str, SlowSensor],
+    speed: float,
+    dt: float = TICK,
+    seconds: float = 8.0,
+    **options: float,
+) -> dict[str, Array]:
+    """Variances of the optimal estimates by state, (ticks,) each, from a start that is known: a
+    periodic Riccati recursion in NumPy and textbook letters.
+
+    States are the bicycle's with the camera's, and the disturbing force and moment "F_d", "N_d".
+    options: the standard deviations of `NOISE` and `DISTURBANCE` of `estimators.options`. Raises
     TypeError for others, ValueError for a sensor with random delay.
     """
     unknown = sorted(set(options) - set(NOISE) - set(DISTURBANCE))
@@ -90,9 +109,8 @@ def riccati(
     noise[:n, :n] = Q
     P, gyro = np.zeros((N, N)), np.eye(1, N, 1)
     P[n - 2, n - 2], P[n - 1, n - 1] = sd["force_sd"] ** 2, sd["moment_sd"] ** 2
-    ticks = round(seconds / dt)
-    x, beta = np.zeros(N), np.zeros(ticks)
-    for k in range(ticks):
+    x, variances = np.zeros(N), np.zeros((round(seconds / dt), n))
+    for k in range(len(variances)):
         for link in links:
             L = link.latch(k - 1, N)
             P = L @ P @ L.T
@@ -102,8 +120,8 @@ def riccati(
         for link in links:
             for C in link.arriving(k, N):
                 _, P = kalman.update(x, P, C, link.R, np.zeros(len(C)))
-        beta[k] = math.sqrt(P[0, 0])
-    return beta[-ticks // 4 :]
+        variances[k] = np.diag(P)[:n]
+    return dict(zip(names, variances.T, strict=True))
 
 
 def _disturbed(
