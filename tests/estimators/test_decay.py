@@ -95,7 +95,7 @@ VARIANTS = [
 
 
 def frames(sensor: str, clock: SlowSensor, ticks: int) -> np.ndarray:
-    """Packets of zeros that arrive before a tick."""
+    """Packets of zeros that arrive before a tick, in the order in which they do."""
     captured = np.arange(0, ticks, round(1e3 * clock.period))
     delays = np.resize(np.round(1e3 * np.array(clock.delays)), len(captured))
     packets = np.zeros((len(captured), PACKET_WIDTH))
@@ -105,6 +105,7 @@ def frames(sensor: str, clock: SlowSensor, ticks: int) -> np.ndarray:
         captured + delays,
     )
     packets[:, 3], packets[:, 4] = 1.0, np.arange(len(captured))
+    packets = packets[np.argsort(packets[:, 2], kind="stable")]
     return packets[packets[:, 2] < ticks]
 
 
@@ -167,6 +168,7 @@ def shrinks(case: Case) -> None:
     [
         case("constant-delay-kf", CAMERA),
         case("uneven-delay-kf", SlowSensor(0.033, (0.040,))),
+        case("uneven-delay-kf", SlowSensor(0.033, (0.070, 0.010))),
         case("multirate-kf", SlowSensor(0.033, (0.060, 0.090)), delay="stored"),
     ],
 )
