@@ -50,7 +50,8 @@ def error_map(f: Any, table: Array, G: Array, schedule: Schedule) -> Array:
     F[: f.n, : f.n] = whole(f, G)
     if f.between == SPREAD:
         return _spread_map(f, table, F, s, schedule)
-    stored = schedule.cycle // schedule.period if f.late in (STORED, CONSTANT) and s >= 0 else 0
+    late = f.late in (STORED, CONSTANT) and s >= 0
+    stored = max(schedule.lags) // schedule.period + 1 if late else 0  # the newest first
     rows = int(f.rows[s]) if s >= 0 else 0
     twice = 2 if f.between == PSEUDO else 1
     width = twice * size + stored * rows
@@ -60,11 +61,11 @@ def error_map(f: Any, table: Array, G: Array, schedule: Schedule) -> Array:
         one = F @ _latched(f, s, schedule, step)
         for k in range(twice):
             move[k * size : (k + 1) * size, k * size : (k + 1) * size] = one
-        frame, rest = divmod(step, schedule.period)
-        if stored and rest == 0:  # the prediction of what is captured now
-            at = twice * size + frame * rows
+        if stored and step % schedule.period == 0:  # the prediction of what is captured now
+            at, end = twice * size, width - rows
             store = np.eye(width)
-            store[at : at + rows] = 0.0
+            store[at:] = 0.0
+            store[at + rows :, at:end] = np.eye(end - at)
             store[at : at + rows, : f.n] = f.row[s, :rows, : f.n]
             move = store @ move
         correct = _pseudo_correction if f.between == PSEUDO else _correction
@@ -94,7 +95,8 @@ def _seen(f: Any, s: int, schedule: Schedule, frame: int, width: int, held: int)
     if held >= 0:
         m, p = int(f.fasts), int(f.rows[s])
         C[m:] = 0.0
-        C[m:, held + frame * p : held + (frame + 1) * p] = np.eye(p)
+        at = held + lag // schedule.period * p
+        C[m:, at : at + p] = np.eye(p)
     return C
 
 

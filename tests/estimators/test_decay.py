@@ -162,7 +162,6 @@ def shrinks(case: Case) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.xfail(strict=True, reason="the map overwrites a stored prediction before its use")
 @pytest.mark.parametrize(
     "case",
     [
