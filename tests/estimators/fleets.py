@@ -1,0 +1,103 @@
+"""Vector environments whose rows end at different times, and their comparison bit for bit."""
+
+import functools
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import SyncVectorEnv
+
+import sideslip  # noqa: F401  registers the environments
+from sideslip.envs.sensor_sets import CAMERA_33_30, GPS_5_HZ
+from sideslip.estimators import FILTERS, make_estimator
+from sideslip.estimators.vector import EstimateObservation
+from sideslip.estimators.wrappers import EstimateObservation as Single
+from tests.envs.helpers import bits
+
+VISION, UNEVEN, GPS = (f"sideslip/Yaw{kind}-v0" for kind in ("Vision", "VisionUneven", "Gps"))
+MODES = ("NextStep", "SameStep")
+CLOCKS = {"camera": CAMERA_33_30, "gps": GPS_5_HZ}
+BAD = np.float32(np.nan)  # fails an episode
+
+
+def home(name: str) -> tuple[str, str]:
+    """An id whose sensors a filter can use, and the sensor's name."""
+    slow = FILTERS[name].slow
+    return (GPS, "gps") if slow and "camera" not in slow else (VISION, "camera")
+
+
+def outputs(name: str) -> list[str]:
+    """The first and the last state of a filter (of its second layer, if it has one)."""
+    _, sensor = home(name)
+    states = make_estimator(name, sensors={sensor: CLOCKS[sensor]}).names
+    return [states[0], states[-1]]
+
+
+def fleet(
+    env_id: str,
+    count: int,
+    mode: str,
+    wrap: Any = None,
+    changes: Sequence[dict[str, Any]] | None = None,
+    **kwargs: Any,
+) -> SyncVectorEnv[Any, Any]:
+    """Environments whose episodes have different lengths, up to a quarter of a second."""
+
+    def made(i: int) -> Any:
+        scenario = {"base": "random-steering", "duration": 0.09 + 0.02 * i}
+        own = changes[i % len(changes)] if changes else {}
+        told = {"scenario": scenario, "on_bad_action": "fail"} | kwargs | own
+        env = gym.make(env_id, **told)
+        return env if wrap is None else wrap(env)
+
+    return SyncVectorEnv([functools.partial(made, i) for i in range(count)], autoreset_mode=mode)
+
+
+def pair(
+    env_id: str, count: int, mode: str, layers: Sequence[dict[str, Any]], **kwargs: Any
+) -> tuple[Any, Any]:
+    """The environments wrapped one by one, and the same ones wrapped together."""
+
+    def wrap(env: Any, kind: Any) -> Any:
+        for layer in layers:
+            env = kind(env, **layer)
+        return env
+
+    alone = fleet(env_id, count, mode, functools.partial(wrap, kind=Single), **kwargs)
+    return alone, wrap(fleet(env_id, count, mode, **kwargs), EstimateObservation)
+
+
+def actions(count: int, step: int) -> Any:
+    """Any action, now and then a bad one, which ends a row's episode at once."""
+    drawn = np.random.default_rng(step).uniform(-1.0, 1.0, (count, 1)).astype(np.float32)
+    if step % 7 == 6:
+        drawn[step % count] = BAD
+    return drawn
+
+
+def plain(infos: Any) -> Any:
+    """`infos` with the objects in `final_obs` taken out, for comparison."""
+    if isinstance(infos, dict):
+        return {key: plain(value) for key, value in infos.items()}
+    return list(infos) if infos.dtype.kind == "O" else infos
+
+
+def same_bits(one: Any, other: Any) -> None:
+    assert bits(one[0]) == bits(other[0])
+    assert bits(list(one[1:-1])) == bits(list(other[1:-1]))
+    first, second = plain(one[-1]), plain(other[-1])
+    assert first.keys() == second.keys()
+    for key in first:
+        assert bits(first[key]) == bits(second[key]), key
+
+
+def drive_both(alone: Any, together: Any, steps: int, start: int = 0) -> int:
+    """Step both and compare everything; returns the episodes that ended."""
+    ended = 0
+    for step in range(start, start + steps):
+        told = actions(alone.num_envs, step)
+        one, other = alone.step(told), together.step(told)
+        same_bits(one, other)
+        ended += int(np.logical_or(one[2], one[3]).sum())
+    return ended
