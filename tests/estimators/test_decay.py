@@ -90,7 +90,6 @@ VARIANTS = [
     ),
     case("dual-rate", GPS, disturbances="none", gains="from-29"),
     case("dual-rate", GPS, gains="from-29"),
-    case("dual-rate", GPS, intersample="hold", gains="placed", poles=[*SLOWER, -6.0, -7.0, -8.0]),
 ]
 
 
@@ -109,8 +108,11 @@ def frames(sensor: str, clock: SlowSensor, ticks: int) -> np.ndarray:
     return packets[packets[:, 2] < ticks]
 
 
-def decay(filter_: Estimator) -> float:
-    """By how much an error shrinks in a cycle: the slope of its logarithm, late."""
+def decay(filter_: Estimator, error: float = 1.0) -> float:
+    """By how much an error shrinks in a cycle: the slope of its logarithm, late.
+
+    error: at the start; small where it grows, since residuals of angles are wrapped.
+    """
     f, schedule = filter_.filters[0], filter_._schedules[-1]
     cycle = schedule.cycle * int(f.stride)
     slowness = max(-math.log(filter_.spectral_radius), 1e-6)
@@ -125,7 +127,7 @@ def decay(filter_: Estimator) -> float:
     filter_.step(np.zeros((settle, FAST_WIDTH)), packets[early])
     state = filter_.get_state()
     for layer in state:
-        layer["x"][: layer["n"]] += 1.0
+        layer["x"][: layer["n"]] += error
     filter_.set_state(state)
     x, std = np.empty((2 * half, n)), np.empty((2 * half, n))
     rest = packets[~early]
@@ -205,9 +207,9 @@ def test_what_grows_is_refused_and_nothing_else(case: Case) -> None:
 
 
 def test_a_filter_that_is_let_through_grows_by_its_radius() -> None:
-    filter_ = Case("multirate-residual-kf", CAMERA, {}).build(40.0, allow_unstable=True)
+    filter_ = Case("multirate-residual-kf", CAMERA, {}).build(30.0, allow_unstable=True)
     assert filter_.spectral_radius > 1.0 + MARGINAL
-    assert agrees(decay(filter_), filter_.spectral_radius)
+    assert agrees(decay(filter_, 1e-40), filter_.spectral_radius)
 
 
 def test_a_radius_of_one_is_named_and_warned_about_and_no_other() -> None:
