@@ -10,44 +10,62 @@ from ..envs.backend import jit
 
 
 @jit
+def _plus(a: Any, g: Any, v: Any, j: int) -> Any:
+    """a + g v[j : j + 8], eight sums at once: compiled, they stay in registers."""
+    return (
+        a[0] + g * v[j],
+        a[1] + g * v[j + 1],
+        a[2] + g * v[j + 2],
+        a[3] + g * v[j + 3],
+        a[4] + g * v[j + 4],
+        a[5] + g * v[j + 5],
+        a[6] + g * v[j + 6],
+        a[7] + g * v[j + 7],
+    )
+
+
+@jit
+def _predict_rows(f: Any) -> None:
+    """f.FP = F P for the dense states, clones' columns included (and zeros up to a full eight)."""
+    G, P, T = f.G, f.P, f.FP
+    for i in range(f.dense):
+        for j in range(0, f.total, 8):
+            a = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+            for k in range(f.n):
+                a = _plus(a, G[i, k], P[k], j)
+            for m in range(8):
+                T[i, j + m] = a[m]
+
+
+@jit
 def predict_covariance(f: Any) -> None:
     """P <- F P F^T + Q with F = [[G, 0], [0, diag(decay)]] on the states, I on the clones."""
     n, dense, N = f.n, f.dense, f.total
-    G, P, T, decay = f.G, f.P, f.work[0], f.decay
-    for i in range(dense):  # T = F P on the states
-        for j in range(n):
-            T[i, j] = 0.0
-        for k in range(n):
-            g = G[i, k]
-            for j in range(n):
-                T[i, j] += g * P[k, j]
-    for i in range(dense):  # P = T F^T + Q
+    G, P, Q, T, decay = f.G, f.P, f.Q, f.FP, f.decay
+    _predict_rows(f)
+    for i in range(dense):
         for j in range(i, dense):
-            total = f.Q[i, j]
+            total = Q[i, j]
             for k in range(n):
                 total += T[i, k] * G[j, k]
             P[i, j] = total
             P[j, i] = total
         for j in range(dense, n):
-            value = T[i, j] * decay[j] + f.Q[i, j]
+            value = T[i, j] * decay[j] + Q[i, j]
             P[i, j] = value
             P[j, i] = value
+        for c in range(n, N):  # the clones' covariance with the states
+            P[i, c] = T[i, c]
+            P[c, i] = T[i, c]
     for i in range(dense, n):
         for j in range(i, n):
-            value = decay[i] * P[i, j] * decay[j] + f.Q[i, j]
+            value = decay[i] * P[i, j] * decay[j] + Q[i, j]
             P[i, j] = value
             P[j, i] = value
-    for c in range(n, N):  # the clones' covariance with the states
-        for i in range(dense):
-            total = 0.0
-            for k in range(n):
-                total += G[i, k] * P[k, c]
-            f.ph[i] = total
-        for i in range(dense, n):
-            f.ph[i] = decay[i] * P[i, c]
-        for i in range(n):
-            P[i, c] = f.ph[i]
-            P[c, i] = f.ph[i]
+        for c in range(n, N):
+            value = decay[i] * P[i, c]
+            P[i, c] = value
+            P[c, i] = value
 
 
 @jit

@@ -160,6 +160,7 @@ FILTER = np.dtype(
         ("gain", _FLOAT, (WIDTH,)),  # of the last measurement
         ("residual", _FLOAT, (ROWS,)),
         ("S", _FLOAT, (ROWS, ROWS)),
+        ("FP", _FLOAT, (CORE, WIDTH)),
         ("work", _FLOAT, (3, CORE, INPUTS + CORE)),
         # what happened in the window
         ("trail", _FLOAT, (WINDOW, CORE)),  # predicted states

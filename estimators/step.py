@@ -137,7 +137,8 @@ def correct_fast(f: Any, gains: Any) -> None:
                 f.x[j] += K[j] * residual
             continue
         measure_state(f, f.y_row[i], f.r_fast[i], residual)
-        f.share[i] = f.gain
+        for j in range(f.total):
+            f.share[i, j] = f.gain[j]
         if f.between == PSEUDO:
             share_fast(f, i, residual)
         if f.late == LARSEN:
