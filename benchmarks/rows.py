@@ -27,6 +27,9 @@ METRICS = {
     "rank": "-",
     "share": "-",
     "spectral_radius": "-",
+    "decibels": "dB",
+    "hertz": "Hz",
+    "count": "-",
 }
 """The vocabulary of metrics with their units; a new one is added here first."""
 

@@ -1,14 +1,30 @@
-"""The papers' claims: one module a paper, with its simulations, claims and figures."""
+"""The papers' claims: one or two modules a paper, with its simulations, claims and figures."""
 
-from . import dakf_stability, dual_rate, tie_vision, uneven_delay
+from . import (
+    dakf_stability,
+    double_layer,
+    dual_rate,
+    dual_rate_gains,
+    tie_vision,
+    tie_vision_control,
+    uneven_delay,
+)
 from .claim import Claim
 from .draw import PaperFigure
 from .simulations import Simulation
 
-_PAPERS = (tie_vision, uneven_delay, dual_rate, dakf_stability)
+_MODULES = (
+    tie_vision,
+    tie_vision_control,
+    uneven_delay,
+    double_layer,
+    dual_rate,
+    dual_rate_gains,
+    dakf_stability,
+)
 
 SIMULATIONS: dict[str, Simulation] = {
-    simulation.name: simulation for paper in _PAPERS for simulation in paper.SIMULATIONS
+    simulation.name: simulation for module in _MODULES for simulation in module.SIMULATIONS
 }
-CLAIMS: tuple[Claim, ...] = tuple(claim for paper in _PAPERS for claim in paper.CLAIMS)
-FIGURES: tuple[PaperFigure, ...] = tuple(f for paper in _PAPERS for f in paper.FIGURES)
+CLAIMS: tuple[Claim, ...] = tuple(claim for module in _MODULES for claim in module.CLAIMS)
+FIGURES: tuple[PaperFigure, ...] = tuple(f for module in _MODULES for f in module.FIGURES)

@@ -215,3 +215,16 @@ def over_others(
         )
 
     return of
+
+
+def smaller(
+    label: str,
+    scenario: str,
+    one: str,
+    other: str,
+    most: float | None = None,
+    metric: str = "beta",
+) -> Part:
+    """The paper says that one's number is smaller than the other's; most: the ratio's threshold."""
+    threshold = None if most is None else Bound("<=", most)
+    return Part(label, scenario, ratio(scenario, one, other, metric), Bound("<", 1.0), threshold)

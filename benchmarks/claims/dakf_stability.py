@@ -1,27 +1,34 @@
-"""dakf-stability: slip from a GPS course and a gyro by disturbance accommodation."""
+"""dakf-stability: slip from a GPS course and a gyro by disturbance accommodation, and control."""
 
-from .claim import Bound, Claim, Part, number, ratio
+from .claim import Bound, Claim, Part, number, smaller
+from .controlled import Following
 from .draw import PaperFigure, course, curves
+from .estimation import Estimation, Filter
 from .observability import coms_ranks
-from .simulations import Analysis, Estimation, Filter
+from .simulations import Analysis
 
 PAPER = "dakf-stability"
-FIG6, FASTER = "dakf-fig6", "dakf-fig6-faster"
+FIG6, FASTER, FIG8 = "dakf-fig6", "dakf-fig6-faster", "dakf-fig8"
+FIG7, LARGER, FIG9 = "dakf-fig7", "dakf-fig7-larger", "dakf-fig9"
 BIAS, RANKS = "dakf-bias", "dakf-rank"
-DAKF, KF = "dakf", "course-kf"
+DAKF, KF, LOB = "dakf", "course-kf", "lob"
+WITHOUT, WITH, FEEDBACK = "without control", "with control", "with control, no rejection"
 GYRO_BIAS = 8.7266e-4  # rad/s, 0.05 deg/s
 
+_ENV = "sideslip/YawGps-v0"
+_FILTERS = tuple(Filter(name, name) for name in (DAKF, KF, LOB))
+_AGENTS = {WITHOUT: {"agent": "none"}, WITH: {}}
+
 SIMULATIONS = (
-    Estimation(FIG6, "sideslip/YawGps-v0", FIG6, (Filter(DAKF, DAKF), Filter(KF, KF))),
-    Estimation(
-        FASTER,
-        "sideslip/YawGps-v0",
-        {"base": FIG6, "name": FASTER, "frequency": 0.4},
-        (Filter(DAKF, DAKF), Filter(KF, KF)),
-    ),
+    Following(FIG7, FIG7, {**_AGENTS, FEEDBACK: {"rejection": False}}),
+    Following(LARGER, {"base": FIG7, "name": LARGER, "amplitude": 0.1}, _AGENTS, share=0.25),
+    Following(FIG9, FIG9, _AGENTS, share=0.5),
+    Estimation(FIG6, _ENV, FIG6, _FILTERS),
+    Estimation(FASTER, _ENV, {"base": FIG6, "name": FASTER, "frequency": 0.4}, _FILTERS),
+    Estimation(FIG8, _ENV, FIG8, _FILTERS),
     Estimation(
         BIAS,
-        "sideslip/YawGps-v0",
+        _ENV,
         {
             "base": FIG6,
             "name": BIAS,
@@ -33,20 +40,30 @@ SIMULATIONS = (
             "disturbance_moment": 0.0,
             "noise": {"gyro_bias": GYRO_BIAS},
         },
-        (Filter(DAKF, DAKF), Filter(KF, KF)),
+        _FILTERS[:2],
         control_period=100,
     ),
     Analysis(RANKS, coms_ranks, random=False),
 )
 
+
+def _tracks(scenario: str, beta: float | None, gamma: float | None) -> tuple[Part, ...]:
+    return (
+        smaller("sideslip error, with / without", scenario, WITH, WITHOUT, beta, "rms_beta"),
+        smaller("yaw rate error, with / without", scenario, WITH, WITHOUT, gamma, "rms_gamma"),
+    )
+
+
 CLAIMS = (
     Claim(
         PAPER,
         "Fig. 6",
-        "the DAKF beats the three-state Kalman filter",
+        "the DAKF beats the three-state Kalman filter, and this the linear observer",
         (
-            Part("DAKF / KF", FIG6, ratio(FIG6, DAKF, KF), Bound("<", 1.0), Bound("<=", 0.75)),
-            Part("DAKF / KF at 0.4 Hz", FASTER, ratio(FASTER, DAKF, KF), Bound("<", 1.0)),
+            smaller("DAKF / KF", FIG6, DAKF, KF, 0.75),
+            smaller("KF / LOB", FIG6, KF, LOB, 0.80),
+            smaller("DAKF / KF at 0.4 Hz", FASTER, DAKF, KF),
+            smaller("KF / LOB at 0.4 Hz", FASTER, KF, LOB),
         ),
     ),
     Claim(
@@ -54,13 +71,9 @@ CLAIMS = (
         "Fig. 6",
         "the DAKF is better during the outage too",
         tuple(
-            Part(
-                f"DAKF / KF, 4 to 6 s{text}",
-                scenario,
-                ratio(scenario, DAKF, KF, "outage"),
-                Bound("<", 1.0),
-            )
-            for scenario, text in ((FIG6, ""), (FASTER, " at 0.4 Hz"))
+            smaller(f"DAKF / {rival}, 4 to 6 s{text}", name, DAKF, filter_, metric="outage")
+            for name, text in ((FIG6, ""), (FASTER, " at 0.4 Hz"))
+            for rival, filter_ in (("KF", KF), ("LOB", LOB))
         ),
     ),
     Claim(
@@ -96,28 +109,116 @@ CLAIMS = (
         "A constant slip is the same to the sensors as a heading the other way with constant d1 "
         "and d2.",
     ),
+    Claim(
+        PAPER,
+        "Fig. 7",
+        "with control sideslip angle and yaw rate track their references",
+        (
+            *_tracks(FIG7, 0.80, 0.50),
+            smaller("peak of the slip, with / without", FIG7, WITH, WITHOUT, metric="peak_beta"),
+            Part(
+                "share of time at the yaw moment's limit",
+                FIG7,
+                number(FIG7, WITH, "saturated"),
+                metric="share",
+            ),
+            Part(
+                "the same, a step of 0.1 rad",
+                LARGER,
+                number(LARGER, WITH, "saturated"),
+                metric="share",
+            ),
+        ),
+    ),
+    Claim(
+        PAPER,
+        "Sec. V.B",
+        "disturbance rejection makes the car the nominal one",
+        tuple(
+            smaller(f"{text} error, with / without rejection", FIG7, WITH, FEEDBACK, metric=metric)
+            for text, metric in (("sideslip", "rms_beta"), ("yaw rate", "rms_gamma"))
+        ),
+        "The feedback's integrals already take away what is constant.",
+    ),
+    Claim(
+        PAPER,
+        "Fig. 8 (twin)",
+        "the same order of the filters on the road, during the outage too",
+        (
+            smaller("DAKF / KF", FIG8, DAKF, KF),
+            smaller("KF / LOB", FIG8, KF, LOB),
+            smaller("DAKF / KF, 10.5 to 13 s", FIG8, DAKF, KF, metric="outage"),
+            smaller("DAKF / LOB, 10.5 to 13 s", FIG8, DAKF, LOB, metric="outage"),
+        ),
+        "At 20 km/h, close to 20.7 km/h where the slip of the stationary turn changes its sign, "
+        "there is little slip to see, and no course while it is there.",
+    ),
+    Claim(
+        PAPER,
+        "Fig. 9 (twin)",
+        "with control the car tracks on the road too",
+        _tracks(FIG9, None, None),
+    ),
 )
 
+_SLIP, _RATE = "sideslip angle / rad", "yaw rate / (rad/s)"
 FIGURES = (
-    PaperFigure(
-        PAPER,
-        "Fig. 6 (a): sideslip angle",
-        FIG6,
-        curves("beta", "sideslip angle / rad"),
-        "Lane change at 25 km/h; wind from 4 to 8 s, no GPS from 4 to 6 s.",
-    ),
-    PaperFigure(
-        PAPER,
-        "Fig. 6 (b): course angle",
-        FIG6,
-        course("course angle / rad", ("truth", DAKF, KF)),
-        "The receiver is silent from 4 to 6 s.",
+    *(
+        PaperFigure(PAPER, f"{figure} {panel}", name, draw, caption)
+        for name, figure, caption in (
+            (FIG6, "Fig. 6", "Lane change at 25 km/h; wind from 4 to 8 s, no GPS from 4 to 6 s."),
+            (FIG8, "Fig. 8 (twin)", "Lane change at 20 km/h; course unused from 10.5 to 13.0 s."),
+        )
+        for panel, draw in (
+            ("(a): sideslip angle", curves("beta", _SLIP, ("truth", LOB, KF, DAKF))),
+            ("(b): course angle", course("course angle / rad", ("truth", KF, DAKF))),
+        )
     ),
     PaperFigure(
         PAPER,
         "Sec. IV.D: slip with a gyro bias of 0.05 deg/s",
         BIAS,
-        curves("beta", "sideslip angle / rad"),
+        curves("beta", _SLIP),
         "Straight on at 25 km/h: the direction that the DAKF cannot see fills up.",
+    ),
+    *(
+        PaperFigure(PAPER, f"Fig. 7 {panel}", FIG7, draw, caption)
+        for panel, draw, caption in (
+            (
+                "(a): sideslip angle",
+                curves("beta", _SLIP, ("reference", WITHOUT, WITH, FEEDBACK)),
+                "A step of 0.06 rad at 1 s, wind from 4 to 8 s.",
+            ),
+            (
+                "(b): yaw rate",
+                curves("gamma", _RATE, ("reference", WITHOUT, WITH, FEEDBACK)),
+                "Tyres 7000 real, 10000 N/rad nominal.",
+            ),
+            (
+                "(c): front steering angle",
+                curves("steer", "front steering angle / rad", (WITHOUT, WITH, FEEDBACK)),
+                "Behind the EPS motor's lag of 30 ms.",
+            ),
+            (
+                "(d): yaw moment",
+                curves("yaw_moment", "yaw moment / (N m)", (WITHOUT, WITH, FEEDBACK)),
+                "What the motors deliver.",
+            ),
+        )
+    ),
+    *(
+        PaperFigure(
+            PAPER,
+            f"Fig. 9 (twin) ({panel}): {text}: {who}",
+            FIG9,
+            curves(signal, label, ("reference", who)),
+            "Cornering by wire at 20 km/h, with everything that the plant has.",
+        )
+        for panel, who, text, signal, label in (
+            ("a", WITHOUT, "sideslip angle", "beta", _SLIP),
+            ("b", WITHOUT, "yaw rate", "gamma", _RATE),
+            ("c", WITH, "sideslip angle", "beta", _SLIP),
+            ("d", WITH, "yaw rate", "gamma", _RATE),
+        )
     ),
 )

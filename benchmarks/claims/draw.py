@@ -24,7 +24,11 @@ class PaperFigure:
 
 
 def curves(
-    signal: str, y_label: str, who: Sequence[str] = (), window: tuple[float, float] | None = None
+    signal: str,
+    y_label: str,
+    who: Sequence[str] = (),
+    window: tuple[float, float] | None = None,
+    x_label: str = "time / s",
 ) -> Draw:
     """A signal of everybody (or of those named) over time. window: s, of the time axis."""
 
@@ -34,20 +38,37 @@ def curves(
         shown = [name for name in who or example.curves if signal in example.curves.get(name, {})]
         inside = _inside(example.time, window)
         series = {name: example.curves[name][signal][inside] for name in shown}
-        return time_series("", example.time[inside], series, y_label)
+        return time_series("", example.time[inside], series, y_label, x_label)
 
     return draw
 
 
-def course(y_label: str, who: Sequence[str]) -> Draw:
+def loops(y_label: str) -> Draw:
+    """Open loops over frequency in Hz, on a logarithmic axis."""
+
+    def draw(example: Example) -> Any:
+        from ..figures import time_series
+
+        series = {name: signals["magnitude"] for name, signals in example.curves.items()}
+        figure = time_series("", example.time, series, y_label, "frequency / Hz")
+        ends = np.log10(example.time[[0, -1]])
+        figure.update_xaxes(type="log", range=[float(end) for end in ends])
+        return figure
+
+    return draw
+
+
+def course(y_label: str, who: Sequence[str], window: tuple[float, float] | None = None) -> Draw:
     """The course psi + beta: the truth, the receiver's samples and each filter's."""
 
     def draw(example: Example) -> Any:
         from ..figures import time_series
 
+        inside = _inside(example.time, window)
         series = {name: example.curves[name]["psi"] + example.curves[name]["beta"] for name in who}
         series["measured"] = samples(example, "gps", 0, "arrived")
-        return time_series("", example.time, series, y_label, dots=("measured",))
+        shown = {name: signal[inside] for name, signal in series.items()}
+        return time_series("", example.time[inside], shown, y_label, dots=("measured",))
 
     return draw
 

@@ -1,138 +1,40 @@
-"""The papers' simulations: driven once a seed, and every number that claims need taken from them.
+"""What a simulation of the ledger is: seeds in cases, and the numbers that they give.
 
 A simulation is data and gives the same `Measured` whatever it is: filters over one drive
-(`Estimation`), controllers over the same lane (`Control`), or a computation without a car
+(`estimation`), controllers over the same manoeuvre (`controlled`), or a computation without a car
 (`Analysis`).
 """
 
-import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Protocol
 
 import gymnasium as gym
 import numpy as np
+import numpy.typing as npt
 
-from ...agents import make_agent
-from ...agents.rollout import Rollout, rollout
-from ...envs.record import PACKET, Log
-from ...envs.vehicle import Vehicle
-from ...estimators import UnobservableWarning, make_estimator
-from ...estimators.bound import bound
-from .. import control
-from .claim import Array, Example, Measured
+from ...agents.rollout import Rollout
+from .claim import Array, Measured
 
-SETTLED = 2.0  # s: errors count from here on
 FIRST = 0  # the seed of the figures
-_CHUNK = 5
+CHUNK = 5  # seeds of a case that is over in seconds
 
 Numbers = dict[tuple[str, str], float]
+"""One seed's numbers, by who and metric."""
+
+TRUTH = ("beta", "gamma", "psi", "v_x", "v_y", "phi", "y_l")
+"""The states whose truth is known, named as the filters name them."""
 
 
-@dataclass(frozen=True)
-class Filter:
-    """label: its name in the ledger. name, options: of `make_estimator`. told: the "nominal"
-    vehicle or the "truth"."""
+class Simulation(Protocol):
+    """name: unique. chunks: the seeds of each case, of so many. measure: on a case's seeds."""
 
-    label: str
-    name: str
-    options: Mapping[str, Any] = field(default_factory=dict)
-    told: str = "nominal"
+    @property
+    def name(self) -> str: ...  # noqa: D102
 
+    def chunks(self, seeds: int) -> list[tuple[int, ...]]: ...  # noqa: D102
 
-@dataclass(frozen=True)
-class Estimation:
-    """Filters over the same uncontrolled drives.
-
-    Numbers of each filter: the RMSE of every state whose truth is known, from `SETTLED` on;
-    "outage", that of beta while the GPS is out; "jump", the RMS change of beta in the milliseconds
-    in which a packet arrives; "last", the mean of beta's error over the last second, its size.
-    bound: whether "bound" is wanted, the RMS of the optimal standard deviation. times: that many
-    times the seeds, where a ratio is close to its threshold. control_period: ticks between rows of
-    the truth; in between it is interpolated.
-    """
-
-    name: str
-    env_id: str
-    scenario: str | Mapping[str, Any]
-    filters: tuple[Filter, ...]
-    bound: bool = False
-    times: int = 1
-    control_period: int = 1
-
-    def chunks(self, seeds: int) -> list[tuple[int, ...]]:
-        """The seeds of each case."""
-        return _chunks(range(self.times * seeds))
-
-    def measure(self, seeds: tuple[int, ...]) -> Measured:
-        """Drive each seed once and run every filter over its record."""
-        env: gym.Env[Any, Any] = gym.make(
-            self.env_id, scenario=self.scenario, control_period=self.control_period
-        )
-        base: Any = env.unwrapped
-        estimators: dict[str, Any] = {}
-        lines, example = [], None
-        for seed in seeds:
-            drive = rollout(env, seed=seed)
-            truth = _truth(drive, base.vehicle, base.held_speed)
-            told = {"nominal": base.nominal, "truth": base.vehicle}
-            common = {"sensors": drive.log.slow, "dt": base.dt, "speed": base.held_speed}
-            numbers: Numbers = {}
-            curves = {"truth": truth}
-            for each in self.filters:
-                if each.label not in estimators:
-                    estimators[each.label] = _built(each, told[each.told], common)
-                estimates = estimators[each.label].run(drive.log)
-                curves[each.label] = {name: estimates[name] for name in estimates.names}
-                numbers |= _errors(each.label, curves[each.label], truth, drive.log, base.scenario)
-            if self.bound:
-                std = bound(base.vehicle, record=drive.log.record, **common)
-                late = drive.log.time >= SETTLED - 1e-9
-                numbers["bound", "beta"] = float(np.sqrt(np.mean(std[late] ** 2)))
-            lines.append(numbers)
-            if seed == FIRST:
-                record = drive.log.record
-                packets = {sensor: record.packets_of(sensor) for sensor in drive.log.slow}
-                example = Example(drive.log.time, curves, packets)
-        return Measured(_stacked(lines), example)
-
-
-@dataclass(frozen=True)
-class Control:
-    """Contestants of the suite `control` on the same seeds of a scenario.
-
-    Numbers of each: RMS and peak of the slip, the largest change of the yaw moment in a
-    millisecond and the sum of all its changes.
-    """
-
-    name: str
-    scenario: str
-    contestants: tuple[str, ...]
-
-    def chunks(self, seeds: int) -> list[tuple[int, ...]]:
-        """The seeds of each case."""
-        return [(seed,) for seed in range(seeds)]
-
-    def measure(self, seeds: tuple[int, ...]) -> Measured:
-        """Drive every contestant on each seed."""
-        known = {contestant.label: contestant for contestant in control.CONTESTANTS}
-        lines, example = [], None
-        for seed in seeds:
-            numbers: Numbers = {}
-            curves: dict[str, dict[str, Array]] = {}
-            time = np.zeros(0)
-            for label in self.contestants:
-                env = control.make_env(self.scenario, known[label])
-                rate = known[label].rate
-                agent = make_agent(known[label].agent, env, **({"rate": rate} if rate else {}))
-                drive = rollout(env, agent, seed)
-                time = drive["t"]
-                curves[label] = {name: drive[name] for name in ("beta", "yaw_moment", "steer")}
-                numbers |= _effort(label, drive["beta"], drive["yaw_moment"])
-            lines.append(numbers)
-            if seed == FIRST:
-                example = Example(time, curves)
-        return Measured(_stacked(lines), example)
+    def measure(self, seeds: tuple[int, ...]) -> Measured: ...  # noqa: D102
 
 
 @dataclass(frozen=True)
@@ -148,14 +50,55 @@ class Analysis:
 
     def chunks(self, seeds: int) -> list[tuple[int, ...]]:
         """The seeds of each case."""
-        return _chunks(range(seeds if self.random else 1))
+        return chunked(seeds if self.random else 1)
 
     def measure(self, seeds: tuple[int, ...]) -> Measured:
         """What the function gives."""
         return self.function(seeds)
 
 
-Simulation = Estimation | Control | Analysis
+class ToldMotion(gym.Wrapper[Any, Any, Any, Any]):
+    """Adds the true v_x, v_y (m/s), phi (rad) and y_l (m) to `info`, beside beta, gamma and psi."""
+
+    def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
+        """Reset the env; `info` is that of tick 0."""
+        obs, info = self.env.reset(**options)
+        return obs, info | self._told()
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """One env-step; `info` is that after it."""
+        obs, reward, terminated, truncated, info = self.env.step(action)
+        return obs, reward, terminated, truncated, info | self._told()
+
+    def _told(self) -> dict[str, float]:
+        base: Any = self.env.unwrapped
+        motion = base.motion
+        return {
+            "v_x": motion.v_x,
+            "v_y": motion.v_y,
+            "phi": motion.phi,
+            "y_l": motion.y + base.vehicle.preview * (motion.psi - motion.theta),  # tie-vision (4)
+        }
+
+
+def truth_of(drive: Rollout) -> dict[str, Array]:
+    """The truth at every tick of a drive, (K,) each, interpolated between the env's steps."""
+    return {name: np.interp(drive.log.time, drive["t"], drive[name]) for name in TRUTH}
+
+
+def rms(values: npt.ArrayLike) -> float:
+    """The root of the mean square."""
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def chunked(seeds: int, size: int = CHUNK) -> list[tuple[int, ...]]:
+    """The seeds 0 .. seeds-1 in tuples of at most some."""
+    return [tuple(range(k, min(k + size, seeds))) for k in range(0, seeds, size)]
+
+
+def stacked(lines: list[Numbers]) -> Mapping[tuple[str, str], Array]:
+    """(seeds,) of each number, from the numbers of each seed."""
+    return {name: np.array([line[name] for line in lines]) for name in lines[0]}
 
 
 def joined(chunks: list[Measured]) -> Measured:
@@ -163,60 +106,3 @@ def joined(chunks: list[Measured]) -> Measured:
     names = chunks[0].numbers
     numbers = {name: np.concatenate([chunk.numbers[name] for chunk in chunks]) for name in names}
     return Measured(numbers, next((c.example for c in chunks if c.example is not None), None))
-
-
-def _chunks(seeds: range) -> list[tuple[int, ...]]:
-    return [tuple(seeds[k : k + _CHUNK]) for k in range(0, len(seeds), _CHUNK)]
-
-
-def _built(each: Filter, vehicle: Vehicle, common: Mapping[str, Any]) -> Any:
-    with warnings.catch_warnings():  # what dakf cannot see is a claim of its own
-        warnings.simplefilter("ignore", UnobservableWarning)
-        return make_estimator(each.name, vehicle=vehicle, **common, **each.options)
-
-
-def _truth(drive: Rollout, vehicle: Vehicle, speed: float | None) -> dict[str, Array]:
-    """The truth of the log and, on a straight road at a held speed, the lateral offset y_l."""
-    truth = dict(drive.log.truth)
-    if speed is not None and "y_l" not in truth:
-        drift = speed * (truth["psi"] + truth["beta"])  # tie-vision (5)
-        steps = 0.5 * (drift[1:] + drift[:-1]) * drive.log.record.dt
-        y_cg = np.concatenate([[0.0], np.cumsum(steps)])
-        truth["y_l"] = y_cg + vehicle.preview * truth["psi"]  # tie-vision (4)
-    return truth
-
-
-def _errors(
-    label: str, estimates: Mapping[str, Array], truth: Mapping[str, Array], log: Log, scenario: Any
-) -> Numbers:
-    t, beta = log.time, estimates["beta"]
-    late = t >= SETTLED - 1e-9
-    numbers = {
-        (label, name): float(np.sqrt(np.mean((estimates[name] - truth[name])[late] ** 2)))
-        for name in truth
-        if name in estimates
-    }
-    error = beta - truth["beta"]
-    numbers[label, "last"] = float(abs(np.mean(error[t >= t[-1] - 1.0])))
-    arrived = log.record.packets[:, PACKET.arrived].astype(int) - log.record.first
-    arrived = arrived[(arrived > 0) & (t[np.minimum(arrived, len(t) - 1)] >= SETTLED)]
-    numbers[label, "jump"] = float(np.sqrt(np.mean((beta[arrived] - beta[arrived - 1]) ** 2)))
-    if scenario.gps_outage is not None:
-        start, end = scenario.gps_outage
-        out = (t >= start) & (t < end)
-        numbers[label, "outage"] = float(np.sqrt(np.mean(error[out] ** 2)))
-    return numbers
-
-
-def _effort(label: str, slip: Array, moment: Array) -> Numbers:
-    change = np.abs(np.diff(moment))
-    return {
-        (label, "rms_slip"): float(np.sqrt(np.mean(slip**2))),
-        (label, "peak_slip"): float(np.max(np.abs(slip))),
-        (label, "largest_step"): float(np.max(change)),
-        (label, "total_variation"): float(np.sum(change)),
-    }
-
-
-def _stacked(lines: list[Numbers]) -> dict[tuple[str, str], Array]:
-    return {name: np.array([line[name] for line in lines]) for name in lines[0]}

@@ -1,45 +1,32 @@
-"""tie-vision: body slip angle from a camera and a gyro, and a controller that keeps it at zero."""
+"""tie-vision: body slip angle from a camera and a gyro; `tie_vision_control` has its controller."""
 
-from functools import partial
-
-import gymnasium as gym
 import numpy as np
 
-from ...agents import make_agent
-from ...agents.rollout import rollout
-from ...envs.scenario import KMH
-from .claim import Bound, Claim, Measured, Part, number, over_others, ratio
+from .claim import Bound, Claim, Measured, Part, number, over_others, ratio, smaller
 from .draw import PaperFigure, curves
-from .simulations import Analysis, Control, Estimation, Filter
+from .estimation import Estimation, Filter
+from .simulations import Analysis
 from .tie_vision_appendix import residuals
 from .tie_vision_convergence import LITERAL, SPREAD, intersample_maps, random_tunings
 
 PAPER = "tie-vision"
-FIG7, FIG8, STIFF = "tie-vision-fig7", "tie-vision-fig8", "tie-vision-fig8-stiff"
+FIG7, FIG9 = "tie-vision-fig7", "tie-vision-fig9"
 BICYCLE, SINGLE, MULTI = "bicycle-kf", "single-rate-kf", "multirate-kf"
 PROPOSED, EXACT = "multirate-residual-kf", "exact-kf, true model"
 NO_DELAY = "multirate-kf, delay ignored"
+RETUNED = "multirate-kf, delay ignored, tuned for it"
+MAPS, TUNINGS, APPENDIX = "tie-vision-maps", "tie-vision-tunings", "tie-vision-appendix"
 
-
-def static_slip(_: tuple[int, ...]) -> Measured:
-    """The slip left after 10 s of steering by 0.001 rad with the feedforward (24), by speed."""
-    left = []
-    for kmh in range(10, 46, 5):
-        scenario = {
-            "base": FIG8,
-            "name": "static",
-            "steering": "step",
-            "onset": 0.0,
-            "amplitude": 0.001,
-            "hold": 60.0,
-            "duration": 10.0,
-            "speed": kmh * KMH,
-            "noise": {"wheel": 0.0, "gyro": 0.0},
-        }
-        env = gym.make("sideslip/YawVision-v0", scenario=scenario)
-        left.append(abs(rollout(env, make_agent("feedforward", env))["beta"][-1]))
-    return Measured({("feedforward", "static_slip"): np.array(left)})
-
+_PAPERS_OWN = tuple(Filter(name, name) for name in (BICYCLE, SINGLE, MULTI, PROPOSED))
+# as estimators/tunings.py, but with psi and y_l's noise free too: seeds 1000 to 1011 of this drive
+_FOR_NO_DELAY = {
+    "q_beta": 8.8e-3,
+    "q_gamma": 0.15,
+    "q_psi": 2.9e-8,
+    "q_y_l": 1.3e-7,
+    "psi_noise": 1.5e-3,
+    "y_l_noise": 2.2,
+}
 
 SIMULATIONS = (
     Estimation(
@@ -47,70 +34,58 @@ SIMULATIONS = (
         "sideslip/YawVision-v0",
         FIG7,
         (
-            *(Filter(name, name) for name in (BICYCLE, SINGLE, MULTI, PROPOSED)),
+            *_PAPERS_OWN,
             Filter(NO_DELAY, MULTI, {"delay": "ignore"}),
+            Filter(RETUNED, MULTI, {"delay": "ignore", **_FOR_NO_DELAY}),
             Filter(EXACT, "exact-kf", told="truth"),
         ),
         bound=True,
         times=5,
     ),
-    Control(FIG8, FIG8, ("none", "feedforward", "single-rate", "multirate", "multirate-residual")),
-    Control(
-        STIFF, STIFF, ("none", "feedforward", "single-rate", "multirate", "multirate-residual")
-    ),
-    Analysis("tie-vision-static", static_slip, random=False),
-    Analysis("tie-vision-tunings", random_tunings),
-    Analysis("tie-vision-maps", intersample_maps),
-    Analysis("tie-vision-appendix", residuals),
+    Estimation(FIG9, "sideslip/YawVision-v0", FIG9, _PAPERS_OWN),
+    Analysis(TUNINGS, random_tunings),
+    Analysis(MAPS, intersample_maps),
+    Analysis(APPENDIX, residuals),
 )
 
-_fig7 = partial(ratio, FIG7)
+
+def _poorest(scenario: str, threshold: Bound | None) -> Part:
+    return Part(
+        "bicycle / poorest vision filter",
+        scenario,
+        over_others(scenario, BICYCLE, (SINGLE, MULTI, PROPOSED), np.max),
+        Bound(">", 1.0),
+        threshold,
+    )
+
+
+def _best(scenario: str, most: float | None) -> tuple[Part, ...]:
+    return (
+        smaller("proposed / bicycle", scenario, PROPOSED, BICYCLE),
+        smaller("proposed / single-rate", scenario, PROPOSED, SINGLE),
+        smaller("proposed / multirate", scenario, PROPOSED, MULTI, most),
+    )
+
+
+def _pooled(measured: Measured, one: str, other: str) -> np.ndarray:
+    """The ratio of RMS values over all seeds together, (1,)."""
+    squares = [np.mean(measured.numbers[who, "beta"] ** 2) for who in (one, other)]
+    return np.array([np.sqrt(squares[0] / squares[1])])
+
+
 _zero = Bound("<=", 1e-12)
 CLAIMS = (
     Claim(
         PAPER,
-        "(24)",
-        "the feedforward brings the static slip to zero",
-        (
-            Part(
-                "slip left, 10 to 45 km/h",
-                "tie-vision-static",
-                number("tie-vision-static", "feedforward", "static_slip"),
-                Bound("<", 1e-9),
-                Bound("<", 1e-9),
-                "static_slip",
-            ),
-        ),
-    ),
-    Claim(
-        PAPER,
         "Fig. 7",
         "the bicycle model's filter is the poorest",
-        (
-            Part(
-                "bicycle / poorest vision filter",
-                FIG7,
-                over_others(FIG7, BICYCLE, (SINGLE, MULTI, PROPOSED), np.max),
-                Bound(">", 1.0),
-                Bound(">=", 1.05),
-            ),
-        ),
+        (_poorest(FIG7, Bound(">=", 1.05)),),
     ),
     Claim(
         PAPER,
         "Fig. 7",
         "the multirate filter with pseudo-residuals is the best",
-        (
-            Part("proposed / bicycle", FIG7, _fig7(PROPOSED, BICYCLE), Bound("<", 1.0)),
-            Part("proposed / single-rate", FIG7, _fig7(PROPOSED, SINGLE), Bound("<", 1.0)),
-            Part(
-                "proposed / multirate",
-                FIG7,
-                _fig7(PROPOSED, MULTI),
-                Bound("<", 1.0),
-                Bound("<=", 1.10),
-            ),
-        ),
+        _best(FIG7, 1.10),
         "For an optimal gain the expected error given the residual is zero: the correction adds no "
         "information, it is a change of gain.",
     ),
@@ -125,9 +100,27 @@ CLAIMS = (
                 lambda results: _pooled(results[FIG7], EXACT, "bound"),
                 threshold=Bound("<=", 1.03),
             ),
-            Part("multirate / bound: the stiffness error", FIG7, _fig7(MULTI, "bound")),
-            Part("delay ignored / multirate", FIG7, _fig7(NO_DELAY, MULTI)),
+            Part("multirate / bound: the stiffness error", FIG7, ratio(FIG7, MULTI, "bound")),
+            Part("delay ignored / multirate", FIG7, ratio(FIG7, NO_DELAY, MULTI)),
+            Part("delay ignored, tuned for it / multirate", FIG7, ratio(FIG7, RETUNED, MULTI)),
         ),
+        "docs/PAPERS.md has 2.7 for the stiffness error and 1.64 for the ignored delay. The exact "
+        "filter reaches our bound, so that 2.7 belongs to another bound. What ignoring the delay "
+        "costs is a matter of tuning: more than twice the error with the gains of the filter that "
+        "knows the delay; far less than that filter's error with gains tuned for ignoring it, "
+        "since on a single sine the lag that is left cancels the lag of too soft tyres.",
+    ),
+    Claim(
+        PAPER,
+        "Fig. 9 (twin)",
+        "on the road the bicycle model's filter is the poorest",
+        (_poorest(FIG9, None),),
+    ),
+    Claim(
+        PAPER,
+        "Fig. 9 (twin)",
+        "on the road the filter with pseudo-residuals is the best",
+        _best(FIG9, None),
     ),
     Claim(
         PAPER,
@@ -136,16 +129,16 @@ CLAIMS = (
         (
             Part(
                 "error dynamics, difference from a fast camera",
-                "tie-vision-maps",
-                number("tie-vision-maps", "pseudo-residuals", "difference"),
+                MAPS,
+                number(MAPS, "pseudo-residuals", "difference"),
                 Bound("<=", 1e-9),
                 metric="difference",
             ),
             *(
                 Part(
                     f"share of random tunings that diverge, {gain}",
-                    "tie-vision-tunings",
-                    number("tie-vision-tunings", gain, "share"),
+                    TUNINGS,
+                    number(TUNINGS, gain, "share"),
                     Bound("=", 0.0),
                     metric="share",
                 )
@@ -163,8 +156,8 @@ CLAIMS = (
         tuple(
             Part(
                 f"{case}, residual",
-                "tie-vision-appendix",
-                number("tie-vision-appendix", case, "residual"),
+                APPENDIX,
+                number(APPENDIX, case, "residual"),
                 None if corrected else _zero,
                 _zero if corrected or not case.endswith("printed") else None,
                 "residual",
@@ -181,103 +174,31 @@ CLAIMS = (
         "Case 3 (a): the products run over G of k+i, not of k+1. Case 3 (b): with the residual "
         "C G e nothing multiplies w; printed is (I - K C) w.",
     ),
-    Claim(
-        PAPER,
-        "Fig. 8",
-        "the controller reduces the slip",
-        tuple(
-            Part(
-                f"{who} / none, {'tyres x 1.2' if scenario == STIFF else 'nominal'}",
-                scenario,
-                ratio(scenario, who, "none", "rms_slip"),
-                Bound("<", 1.0),
-                Bound("<=", 0.55 if scenario == STIFF else 0.40),
-            )
-            for scenario in (FIG8, STIFF)
-            for who in ("single-rate", "multirate")
-        ),
-    ),
-    Claim(
-        PAPER,
-        "Fig. 8 (a)",
-        "the multirate controller keeps the slip smaller than the single-rate one",
-        tuple(
-            Part(
-                f"{who} / single-rate, {'tyres x 1.2' if scenario == STIFF else 'nominal'}",
-                scenario,
-                ratio(scenario, who, "single-rate", "rms_slip"),
-                Bound("<", 1.0),
-                None if scenario == STIFF else Bound("<=", 0.92),
-            )
-            for scenario in (FIG8, STIFF)
-            for who in ("multirate", "multirate-residual")
-        ),
-    ),
-    Claim(
-        PAPER,
-        "Fig. 8 (b)",
-        "the multirate controller's input is smoother",
-        (
-            Part(
-                "largest 1 ms step, pseudo-residuals / single-rate",
-                FIG8,
-                ratio(FIG8, "multirate-residual", "single-rate", "largest_step"),
-                Bound("<", 1.0),
-                Bound("<=", 0.4),
-            ),
-            Part(
-                "total variation, pseudo-residuals / single-rate",
-                FIG8,
-                ratio(FIG8, "multirate-residual", "single-rate", "total_variation"),
-                Bound("<", 1.0),
-            ),
-        ),
-    ),
 )
 
-
-def _pooled(measured: Measured, one: str, other: str) -> np.ndarray:
-    """The ratio of RMS values over all seeds together, (1,)."""
-    squares = [np.mean(measured.numbers[who, "beta"] ** 2) for who in (one, other)]
-    return np.array([np.sqrt(squares[0] / squares[1])])
-
-
 _BETA = "body slip angle / rad"
-_FIG8 = ("none", "single-rate", "multirate", "multirate-residual")
+_SHOWN = ("truth", BICYCLE, SINGLE, MULTI, PROPOSED)
 FIGURES = (
     PaperFigure(
         PAPER,
         "Fig. 7: body slip angle, estimators",
         FIG7,
-        curves("beta", _BETA, ("truth", BICYCLE, SINGLE, MULTI, PROPOSED)),
+        curves("beta", _BETA, _SHOWN),
         "Sine steering at 25 km/h, tyres 1.2 times stiffer than the filters believe.",
     ),
     PaperFigure(
         PAPER,
-        "Fig. 8 (a): body slip angle, controllers",
-        FIG8,
-        curves("beta", _BETA, _FIG8),
-        "One lane change at 25 km/h, tyres as the controllers believe.",
+        "Fig. 9 (twin): body slip angle, estimators",
+        FIG9,
+        curves("beta", _BETA, _SHOWN, (8.0, 20.0)),
+        "The driver's sine while the car goes from 0 to 30 km/h; 12 of 30 s.",
     ),
     PaperFigure(
         PAPER,
-        "Fig. 8 (b): yaw moment",
-        FIG8,
-        curves("yaw_moment", "yaw moment / (N m)", _FIG8[1:]),
-        "The control input; single-rate decides every 33 ms.",
-    ),
-    PaperFigure(
-        PAPER,
-        "Fig. 8 (a) with tyres 1.2 times stiffer",
-        STIFF,
-        curves("beta", _BETA, _FIG8),
-        "The same lane change, when the controllers believe in too soft tyres.",
-    ),
-    PaperFigure(
-        PAPER,
-        "Fig. 8 (b) with tyres 1.2 times stiffer",
-        STIFF,
-        curves("yaw_moment", "yaw moment / (N m)", _FIG8[1:]),
-        "The control input on stiffer tyres.",
+        "Appendix: what is left of an error between samples",
+        MAPS,
+        curves("error", "size of the error / its size before the sample", x_label="time / ms"),
+        "A sample at 0 ms, the next after 33 ms. Ideal: a fast camera (case 1); none: no "
+        "correction in between (case 2); pseudo-residuals: case 3. Without noise.",
     ),
 )

@@ -15,7 +15,8 @@ from ...envs.sensor_sets import CAMERA_33_30
 from ...envs.vehicle import COMS
 from ...estimators import kalman, make_estimator
 from . import error_maps
-from .claim import Array, Measured
+from .claim import Array, Example, Measured
+from .simulations import FIRST
 
 SPEED = 25.0 * KMH
 PERIOD, DELAY = 33, 30  # ms, of the camera
@@ -90,14 +91,25 @@ def _shipped(Q: Array) -> float:
 def intersample_maps(seeds: tuple[int, ...]) -> Measured:
     """How far the error dynamics with pseudo-residuals are from those of a fast camera.
 
-    The vision model at 1 ms, every row slow, a Kalman gain of random process noise a seed.
+    The vision model at 1 ms, every row slow, a Kalman gain of random process noise a seed. The
+    example has the size of the maps of the appendix's three cases, of the first seed.
     """
     model = vision(COMS, SPEED)
     G, _ = model.discrete(1e-3)
-    found = []
+    found, example = [], None
     for seed in seeds:
         Q = 1e-3 * np.diag(10.0 ** np.random.default_rng(seed).uniform(-8.0, 0.0, 4))
         K = kalman.gain(solve_discrete_are(G.T, model.C.T, Q, R), model.C, R)
-        ours, _ = error_maps.pseudo(G, model.C, K, PERIOD)
-        found.append(error_maps.difference(ours, error_maps.fast(G, model.C, K, PERIOD)))
-    return Measured({("pseudo-residuals", "difference"): np.array(found)})
+        cases = {
+            "ideal": error_maps.fast(G, model.C, K, PERIOD),
+            "none": error_maps.predicted(G, model.C, K, PERIOD),
+            "pseudo-residuals": error_maps.pseudo(G, model.C, K, PERIOD),
+        }
+        found.append(error_maps.difference(cases["pseudo-residuals"], cases["ideal"]))
+        if seed == FIRST:
+            sizes = {
+                name: {"error": np.array([np.linalg.norm(each) for each in maps]) / 2.0}
+                for name, maps in cases.items()
+            }
+            example = Example(np.arange(float(PERIOD)), sizes)
+    return Measured({("pseudo-residuals", "difference"): np.array(found)}, example)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sideslip.benchmarks import papers
-from sideslip.benchmarks.claims import CLAIMS, FIGURES, SIMULATIONS, error_maps, observability
+from sideslip.benchmarks.claims import CLAIMS, FIGURES, SIMULATIONS, observability
 from sideslip.benchmarks.claims.claim import (
     Bound,
     Claim,
@@ -24,7 +24,6 @@ from sideslip.benchmarks.claims.tie_vision_appendix import residuals
 from sideslip.benchmarks.rows import METRICS, VERDICTS
 from sideslip.envs.linear import vision
 from sideslip.envs.vehicle import COMS
-from sideslip.estimators.kalman import gain
 
 
 def judged(*parts: tuple[Any, Any]) -> str:
@@ -123,57 +122,6 @@ def test_exact_matrices_are_the_packages() -> None:
     ours = observability.bicycle(COMS, observability.SPEED, 4)
     wanted = vision(COMS, float(observability.SPEED)).A
     np.testing.assert_allclose(np.array(ours, float), wanted, rtol=1e-14)
-
-
-def test_pseudo_measurements_equal_fast_ones_for_square_c_only() -> None:
-    """dual-rate (33): the maps agree where (30) can be solved."""
-    rng = np.random.default_rng(5)
-    A = 0.97 * np.linalg.qr(rng.normal(size=(3, 3)))[0]
-    for outputs, equal in ((3, True), (2, False)):
-        C = rng.normal(size=(outputs, 3))
-        L = gain(np.eye(3), C, np.eye(outputs))
-        ours, frame = error_maps.pseudo(A, C, L, 10)
-        off = error_maps.difference(ours, error_maps.fast(A, C, L, 10))
-        assert off < 1e-12 if equal else off > 0.1
-        np.testing.assert_allclose(frame, A @ ours[-1])
-
-
-def test_the_map_is_what_a_simulated_error_does() -> None:
-    """(13)-(14), (17), (19) and (31)-(32) step by step, without noise."""
-    rng = np.random.default_rng(6)
-    A, C = 0.3 * rng.normal(size=(3, 3)), rng.normal(size=(1, 3))
-    L = 0.3 * rng.normal(size=(3, 1))
-    maps, _ = error_maps.pseudo(A, C, L, 3)
-    x, start = rng.normal(size=3), rng.normal(size=3)
-    hat = x - start
-    innovation = C @ (x - hat)  # (13)
-    hat = hat + L @ innovation
-    np.testing.assert_allclose(maps[0] @ start, x - hat)
-    C_plus = C.T @ np.linalg.inv(C @ C.T)
-    G1 = C @ A @ (np.eye(3) - L @ C) @ C_plus  # (32)
-    x, hat = A @ x, A @ hat
-    pseudo = C @ hat + G1 @ innovation  # (14)
-    hat = hat + L @ (pseudo - C @ hat)  # (19)
-    np.testing.assert_allclose(maps[1] @ start, x - hat)
-    Psi = A @ A @ (np.eye(3) - L @ C) - A @ L @ G1 @ C  # (26) for i = 2
-    G2 = C @ Psi @ C_plus  # (31)
-    x, hat = A @ x, A @ hat
-    hat = hat + L @ G2 @ innovation
-    np.testing.assert_allclose(maps[2] @ start, x - hat)
-
-
-def test_gains_from_the_pseudo_noise_start_with_the_kalman_gain_and_grow() -> None:
-    """dual-rate (29) on its own application: PAPERS found a radius of 1.17 to 1.22."""
-    from sideslip.benchmarks.claims.dual_rate import COURSE_SD, RATIO, extended
-
-    A, C = extended()
-    Q = np.diag([1e-4, 1e-4, 1e-4, 20.0, 20.0, 20.0]) * 1e-3
-    R, P = np.array([[COURSE_SD**2]]), 0.01 * np.eye(6)
-    _, once = error_maps.FromNoise(A, C, Q, R, 1).frame(P)
-    np.testing.assert_allclose(once, A @ (np.eye(6) - gain(P, C, R) @ C))
-    for printed in (True, False):
-        radius = error_maps.FromNoise(A, C, Q, R, RATIO, printed).spectral_radius(P, 15)
-        assert 1.15 < radius < 1.25
 
 
 def test_the_appendix_holds_as_corrected_and_fails_as_printed() -> None:

@@ -1,0 +1,116 @@
+"""Filters over the same uncontrolled drives, and how far off they are."""
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from ...agents.rollout import rollout
+from ...envs.record import PACKET, Log
+from ...envs.vehicle import Vehicle
+from ...estimators import UnobservableWarning, make_estimator
+from ...estimators.bound import bound
+from .claim import Array, Example, Measured
+from .simulations import FIRST, Numbers, ToldMotion, chunked, rms, stacked, truth_of
+
+SETTLED = 2.0  # s: errors count from here on
+
+
+@dataclass(frozen=True)
+class Filter:
+    """label: its name in the ledger. name, options: of `make_estimator`. told: the "nominal"
+    vehicle or the "truth"."""
+
+    label: str
+    name: str
+    options: Mapping[str, Any] = field(default_factory=dict)
+    told: str = "nominal"
+
+
+@dataclass(frozen=True)
+class Estimation:
+    """Filters over the drives of a scenario, without control.
+
+    Numbers of each filter: the RMSE of every state whose truth is known, from `SETTLED` on;
+    "outage", that of beta while the GPS is out; "jump", the RMS change of beta in the milliseconds
+    in which a packet arrives; "last", the mean of beta's error over the last second, its size.
+    bound: whether "bound" is wanted, the RMS of the optimal standard deviation of beta. times: that
+    many times the seeds, where a ratio is close to its threshold. control_period: ticks between
+    rows of the truth; in between it is interpolated.
+    """
+
+    name: str
+    env_id: str
+    scenario: str | Mapping[str, Any]
+    filters: tuple[Filter, ...]
+    bound: bool = False
+    times: int = 1
+    control_period: int = 10
+
+    def chunks(self, seeds: int) -> list[tuple[int, ...]]:
+        """The seeds of each case."""
+        return chunked(self.times * seeds)
+
+    def measure(self, seeds: tuple[int, ...]) -> Measured:
+        """Drive each seed once and run every filter over its record."""
+        env: gym.Env[Any, Any] = ToldMotion(
+            gym.make(self.env_id, scenario=self.scenario, control_period=self.control_period)
+        )
+        base: Any = env.unwrapped
+        estimators: dict[str, Any] = {}
+        lines, example = [], None
+        for seed in seeds:
+            drive = rollout(env, seed=seed)
+            if drive.failed:
+                raise RuntimeError(f"{self.name}: the car of seed {seed} failed without control")
+            truth = truth_of(drive)
+            told = {"nominal": base.nominal, "truth": base.vehicle}
+            common = {"sensors": drive.log.slow, "dt": base.dt, "speed": base.held_speed}
+            numbers: Numbers = {("truth", "beta"): _settled_rms(truth["beta"], drive.log)}
+            curves = {"truth": truth}
+            for each in self.filters:
+                if each.label not in estimators:
+                    estimators[each.label] = _built(each, told[each.told], common)
+                estimates = estimators[each.label].run(drive.log)
+                curves[each.label] = {name: estimates[name] for name in estimates.names}
+                numbers |= _errors(each.label, curves[each.label], truth, drive.log, base.scenario)
+            if self.bound:
+                std = bound(base.vehicle, record=drive.log.record, **common)
+                numbers["bound", "beta"] = _settled_rms(std, drive.log)
+            lines.append(numbers)
+            if seed == FIRST:
+                record = drive.log.record
+                packets = {sensor: record.packets_of(sensor) for sensor in drive.log.slow}
+                example = Example(drive.log.time, curves, packets)
+        return Measured(dict(stacked(lines)), example)
+
+
+def _built(each: Filter, vehicle: Vehicle, common: Mapping[str, Any]) -> Any:
+    with warnings.catch_warnings():  # what dakf cannot see is a claim of its own
+        warnings.simplefilter("ignore", UnobservableWarning)
+        return make_estimator(each.name, vehicle=vehicle, **common, **each.options)
+
+
+def _settled_rms(values: Array, log: Log) -> float:
+    return rms(values[log.time >= SETTLED - 1e-9])
+
+
+def _errors(
+    label: str, estimates: Mapping[str, Array], truth: Mapping[str, Array], log: Log, scenario: Any
+) -> Numbers:
+    errors = {name: estimates[name] - truth[name] for name in truth if name in estimates}
+    numbers = {(label, name): _settled_rms(error, log) for name, error in errors.items()}
+    if "beta" not in estimates:
+        return numbers
+    t, beta = log.time, estimates["beta"]
+    numbers[label, "last"] = float(abs(np.mean(errors["beta"][t >= t[-1] - 1.0])))
+    arrived = log.record.packets[:, PACKET.arrived].astype(int) - log.record.first
+    arrived = arrived[(arrived > 0) & (t[np.minimum(arrived, len(t) - 1)] >= SETTLED)]
+    numbers[label, "jump"] = rms(beta[arrived] - beta[arrived - 1])
+    if scenario.gps_outage is not None:
+        start, end = scenario.gps_outage
+        numbers[label, "outage"] = rms(errors["beta"][(t >= start) & (t < end)])
+    return numbers
