@@ -32,6 +32,7 @@ COLOURS = {
     "vision-only-kf": "#56B4E9",
     "double-layer": "#0072B2",
     "lob": "#D55E00",
+    "lob-2": "#D55E00",
     "roll-kf": "#D55E00",
     "kinematic-velocity-kf": "#D55E00",
     "conventional": "#D55E00",

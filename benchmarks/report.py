@@ -165,7 +165,7 @@ def _row(row: Sequence[str], numeric: Sequence[bool], keyed: bool) -> str:
         value = number(cell) if is_number else None
         data = "" if value is None else f' data-value="{_plain(value)}"'
         tag, key = ('th scope="row"', _key(cell) if keyed else "") if i == 0 else ("td", "")
-        kind = ' class="long"' if i > 0 and len(cell) > _LONG else _number_class(is_number)
+        kind = ' class="long"' if len(cell) > _LONG else _number_class(is_number)
         cells.append(f"<{tag}{kind}{data}>{key}{escape(cell)}</{tag[:2]}>")
     return "".join(cells)
 

@@ -7,6 +7,7 @@ from . import (
     dual_rate_gains,
     tie_vision,
     tie_vision_control,
+    tie_vision_convergence,
     uneven_delay,
 )
 from .claim import Claim
@@ -16,6 +17,7 @@ from .simulations import Simulation
 _MODULES = (
     tie_vision,
     tie_vision_control,
+    tie_vision_convergence,
     uneven_delay,
     double_layer,
     dual_rate,

@@ -2,12 +2,9 @@
 
 import numpy as np
 
-from .claim import Bound, Claim, Measured, Part, number, over_others, ratio, smaller
+from .claim import Bound, Claim, Measured, Part, over_others, ratio, smaller
 from .draw import PaperFigure, curves
 from .estimation import Estimation, Filter
-from .simulations import Analysis
-from .tie_vision_appendix import residuals
-from .tie_vision_convergence import LITERAL, SPREAD, intersample_maps, random_tunings
 
 PAPER = "tie-vision"
 FIG7, FIG9 = "tie-vision-fig7", "tie-vision-fig9"
@@ -15,7 +12,6 @@ BICYCLE, SINGLE, MULTI = "bicycle-kf", "single-rate-kf", "multirate-kf"
 PROPOSED, EXACT = "multirate-residual-kf", "exact-kf, true model"
 NO_DELAY = "multirate-kf, delay ignored"
 RETUNED = "multirate-kf, delay ignored, tuned for it"
-MAPS, TUNINGS, APPENDIX = "tie-vision-maps", "tie-vision-tunings", "tie-vision-appendix"
 
 _PAPERS_OWN = tuple(Filter(name, name) for name in (BICYCLE, SINGLE, MULTI, PROPOSED))
 # as estimators/tunings.py, but with psi and y_l's noise free too: seeds 1000 to 1011 of this drive
@@ -43,9 +39,6 @@ SIMULATIONS = (
         times=5,
     ),
     Estimation(FIG9, "sideslip/YawVision-v0", FIG9, _PAPERS_OWN),
-    Analysis(TUNINGS, random_tunings),
-    Analysis(MAPS, intersample_maps),
-    Analysis(APPENDIX, residuals),
 )
 
 
@@ -73,7 +66,6 @@ def _pooled(measured: Measured, one: str, other: str) -> np.ndarray:
     return np.array([np.sqrt(squares[0] / squares[1])])
 
 
-_zero = Bound("<=", 1e-12)
 CLAIMS = (
     Claim(
         PAPER,
@@ -122,58 +114,6 @@ CLAIMS = (
         "on the road the filter with pseudo-residuals is the best",
         _best(FIG9, None),
     ),
-    Claim(
-        PAPER,
-        "Appendix",
-        "pseudo-residuals let the estimate converge, as measurements at every step would",
-        (
-            Part(
-                "error dynamics, difference from a fast camera",
-                MAPS,
-                number(MAPS, "pseudo-residuals", "difference"),
-                Bound("<=", 1e-9),
-                metric="difference",
-            ),
-            *(
-                Part(
-                    f"share of random tunings that diverge, {gain}",
-                    TUNINGS,
-                    number(TUNINGS, gain, "share"),
-                    Bound("=", 0.0),
-                    metric="share",
-                )
-                for gain in (LITERAL, SPREAD)
-            ),
-        ),
-        "C has full row rank only: (20) cannot know the error that the sample does not see. How "
-        "often the filter diverges depends on the gain between samples, which the paper leaves "
-        "open.",
-    ),
-    Claim(
-        PAPER,
-        "Appendix",
-        "the error recursions of the three cases",
-        tuple(
-            Part(
-                f"{case}, residual",
-                APPENDIX,
-                number(APPENDIX, case, "residual"),
-                None if corrected else _zero,
-                _zero if corrected or not case.endswith("printed") else None,
-                "residual",
-            )
-            for case, corrected in (
-                ("case 1", False),
-                ("case 2", False),
-                ("case 3 (a)", True),
-                ("case 3 (a), printed", False),
-                ("case 3 (b)", True),
-                ("case 3 (b), printed", False),
-            )
-        ),
-        "Case 3 (a): the products run over G of k+i, not of k+1. Case 3 (b): with the residual "
-        "C G e nothing multiplies w; printed is (I - K C) w.",
-    ),
 )
 
 _BETA = "body slip angle / rad"
@@ -192,13 +132,5 @@ FIGURES = (
         FIG9,
         curves("beta", _BETA, _SHOWN, (8.0, 20.0)),
         "The driver's sine while the car goes from 0 to 30 km/h; 12 of 30 s.",
-    ),
-    PaperFigure(
-        PAPER,
-        "Appendix: what is left of an error between samples",
-        MAPS,
-        curves("error", "size of the error / its size before the sample", x_label="time / ms"),
-        "A sample at 0 ms, the next after 33 ms. Ideal: a fast camera (case 1); none: no "
-        "correction in between (case 2); pseudo-residuals: case 3. Without noise.",
     ),
 )

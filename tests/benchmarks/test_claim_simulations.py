@@ -1,0 +1,86 @@
+"""The ledger's simulations: what they take from a drive, on drives cut short."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from sideslip.agents.rollout import rollout
+from sideslip.benchmarks.claims.controlled import Following, Slip
+from sideslip.benchmarks.claims.estimation import SETTLED, Estimation, Filter
+from sideslip.benchmarks.claims.simulations import ToldMotion, chunked, truth_of
+from sideslip.estimators import make_estimator
+
+VISION = "sideslip/YawVision-v0"
+SHORT: dict[str, Any] = {"base": "tie-vision-fig7", "name": "short", "duration": 2.5}
+
+
+def test_the_told_motion_is_the_cars() -> None:
+    """tie-vision (4)-(5): y_l integrates v (psi + beta) and looks ahead; beta = v_y / v_x."""
+    env = ToldMotion(gym.make(VISION, scenario=SHORT, control_period=1))
+    drive = rollout(env, seed=4)
+    truth = truth_of(drive)
+    v = 25.0 / 3.6
+    np.testing.assert_allclose(truth["v_y"], truth["beta"] * truth["v_x"], rtol=1e-12, atol=1e-15)
+    drift = v * (truth["psi"] + truth["beta"])
+    y_cg = np.concatenate([[0.0], np.cumsum(0.5 * (drift[1:] + drift[:-1]) * 1e-3)])
+    base: Any = env.unwrapped
+    np.testing.assert_allclose(truth["y_l"], y_cg + base.vehicle.preview * truth["psi"], atol=1e-6)
+    assert np.abs(truth["y_l"]).max() > 0.1
+
+
+def test_numbers_of_an_estimation_are_those_of_its_drives() -> None:
+    filters = (Filter("a", "multirate-kf"), Filter("b", "bicycle-kf", told="truth"))
+    found = Estimation("short", VISION, SHORT, filters, bound=True).measure((3, 5))
+    env = ToldMotion(gym.make(VISION, scenario=SHORT, control_period=10))
+    base: Any = env.unwrapped
+    for i, seed in enumerate((3, 5)):
+        drive = rollout(env, seed=seed)
+        truth, late = truth_of(drive), drive.log.time >= SETTLED - 1e-9
+        for label, name, car in (
+            ("a", "multirate-kf", base.nominal),
+            ("b", "bicycle-kf", base.vehicle),
+        ):
+            run = make_estimator(
+                name, vehicle=car, sensors=drive.log.slow, speed=base.held_speed
+            ).run(drive.log)
+            error = (run["gamma"] - truth["gamma"])[late]
+            assert found.numbers[label, "gamma"][i] == pytest.approx(np.sqrt(np.mean(error**2)))
+    assert ("a", "y_l") in found.numbers
+    assert ("b", "y_l") not in found.numbers
+    assert found.example is None  # the first seed's, which is in another chunk
+    assert (found.numbers["bound", "beta"] > 0.0).all()
+
+
+def test_a_car_that_fails_is_no_estimation() -> None:
+    scenario = SHORT | {"half_width": 0.3}
+    with pytest.raises(RuntimeError, match="narrow: the car of seed 0 failed"):
+        Estimation("narrow", VISION, scenario, (Filter("a", "bicycle-kf"),)).measure((0,))
+
+
+def test_options_of_a_contestant_reach_its_agent() -> None:
+    label = "multirate, stronger"
+    slip = Slip("s", "tie-vision-fig8", ("none", "multirate", label), {label: {"gain": 5.0}})
+    numbers = slip.measure((0,)).numbers
+    assert numbers["none", "saturation"] == 0.0
+    assert numbers[label, "rms_slip"] < 0.9 * numbers["multirate", "rms_slip"]
+    assert numbers[label, "total_variation"] > 2.0 * numbers["multirate", "total_variation"]
+
+
+@pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning")
+def test_following_has_the_reference_beside_the_car() -> None:
+    scenario = {"base": "dakf-fig7", "name": "short", "duration": 1.5}
+    found = Following("f", scenario, {"without": {"agent": "none"}}).measure((0,))
+    assert found.example is not None
+    curves = found.example.curves
+    error = curves["without"]["gamma"] - curves["reference"]["gamma"]
+    expected = np.sqrt(np.mean(error**2))
+    assert found.numbers["without", "rms_gamma"] == pytest.approx(expected)
+    assert found.numbers["without", "steered"] == 0.0
+
+
+def test_seeds_are_split_and_shared() -> None:
+    assert chunked(7, 3) == [(0, 1, 2), (3, 4, 5), (6,)]
+    assert Following("f", "dakf-fig7", {}, share=0.25).chunks(8) == [(0, 1)]
+    assert Following("f", "dakf-fig7", {}, share=0.25).chunks(1) == [(0,)]
