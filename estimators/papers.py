@@ -8,6 +8,9 @@ double-layer-gps (38), (42) take A T + I; disturbances and process noise are per
 double-layer-gps (34) and dual-rate (5) count them per step; the misprints of docs/PAPERS.md are
 corrected; and with pseudo-residuals every tick takes an even share of the gain that the filter
 without them applies at a sample (the papers do not say which gain they use in between).
+
+The poles of `lob-2` and `lob` have the least error of beta of a grid from 1 to 200 rad/s, on the
+training seeds of double-layer-fig9 and dakf-fig6.
 """
 
 from dataclasses import dataclass
@@ -79,7 +82,9 @@ FILTERS: dict[str, Filter] = {
         hdop=((1.0, 1.0), (20.0, 20.0)),
         source="double-layer-gps (28)-(29), (34)-(42)",
     ),
-    "lob-2": Filter(gains="placed", poles=(-6.0, -8.0), source="double-layer-gps 6.1, Aoki 2005"),
+    "lob-2": Filter(
+        gains="placed", poles=(-60.0, -120.0), source="double-layer-gps 6.1, Aoki 2005"
+    ),
     "roll-kf": Filter(
         model="roll", fast=("roll_rate",), source="double-layer-gps 6.2 and (3), Tseng 2003"
     ),
@@ -100,7 +105,7 @@ FILTERS: dict[str, Filter] = {
     "lob": Filter(
         fast=("gyro", "accel_y"),
         gains="placed",
-        poles=(-10.0, -10.0),
+        poles=(-2.0, -2.0),
         source="dakf-stability VI.A, [5]: gamma and a_y of (1)",
     ),
     "yaw-moment-observer": Filter(
