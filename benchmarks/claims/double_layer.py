@@ -131,8 +131,8 @@ CLAIMS = (
             ),
         ),
         "The kinematic KF with the process noise of its accelerometers, and with one tuned to the "
-        "drive, which takes roll for noise: against that 0.3 is not reached. v_x: it has the "
-        "wheels at 1 kHz, the double layer the GPS's speed at 5 Hz.",
+        "drive, which takes roll for noise. v_x: it has the wheels at 1 kHz, the double layer the "
+        "GPS's speed at 5 Hz.",
     ),
     Claim(
         PAPER,
