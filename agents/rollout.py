@@ -24,16 +24,22 @@ INFO_UNITS = {
     "yaw_moment": "N m",
     "cost": "-",
     "failure": "-",
+    "v_x": "m/s",
+    "v_y": "m/s",
+    "phi": "rad",
+    "y_l": "m",
 }
+TRUTH = ("beta", "gamma", "psi", "v_x", "v_y", "phi", "y_l")
+"""What a log knows of the states, named as estimators name them."""
 
 
 @dataclass(frozen=True, repr=False)
 class Rollout:
     """An episode. Row 0 is the reset, row k the state after the k-th step.
 
-    columns: arrays of one value a row: the numbers of `info`, then every entry of the observation
-    (`obs_...`), the action that led to the row and its reward. units: by column. log: the record
-    of every tick, with the truth at the ticks of the rows.
+    columns: arrays of one value a row: the numbers of `info` and the true motion, then every entry
+    of the observation (`obs_...`), the action that led to the row and its reward. units: by column.
+    log: the record of every tick, with the truth at the ticks of the rows.
     """
 
     columns: dict[str, npt.NDArray[np.float64]]
@@ -122,6 +128,7 @@ def rollout(
     layout = env.get_wrapper_attr("layout")
     obs, info = env.reset(seed=seed, options=options)
     actions = np.zeros(env.action_space.shape or (1,), np.float32)
+    info = info | motion_of(base)
     rows, records, state = [_row(info, obs, actions, 0.0)], [base.record], None
     start = np.ones(1, bool)
     over = False
@@ -129,7 +136,7 @@ def rollout(
         if agent is not None:
             actions, state = agent.predict(obs, state, start, deterministic=True)
         obs, reward, terminated, truncated, info = env.step(actions)
-        start = np.zeros(1, bool)
+        start, info = np.zeros(1, bool), info | motion_of(base)
         rows.append(_row(info, obs, actions, float(reward)))
         records.append(base.record)
         over = terminated or truncated
@@ -143,6 +150,17 @@ def rollout(
     columns = dict(zip(names, table, strict=True))
     record = concatenate(records)
     return Rollout(columns, units, _log(base, record, columns))
+
+
+def motion_of(base: Any) -> dict[str, float]:
+    """The true v_x, v_y (m/s), phi (rad) and y_l (m) of an env, which its `info` leaves out."""
+    motion = base.motion
+    return {
+        "v_x": motion.v_x,
+        "v_y": motion.v_y,
+        "phi": motion.phi,
+        "y_l": motion.y + base.vehicle.preview * (motion.psi - motion.theta),  # tie-vision (4)
+    }
 
 
 def _unit(name: str) -> str:
@@ -161,5 +179,5 @@ def _row(info: dict[str, Any], obs: Any, action: Any, reward: float) -> list[flo
 def _log(base: Any, record: Record, columns: dict[str, npt.NDArray[np.float64]]) -> Log:
     """The record with the truth; ticks between rows are interpolated."""
     t = record.ticks * record.dt
-    truth = {name: np.interp(t, columns["t"], columns[name]) for name in ("beta", "gamma", "psi")}
+    truth = {name: np.interp(t, columns["t"], columns[name]) for name in TRUTH}
     return Log(record, base.slow_sensors, truth, base.scenario.name)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ...estimators.options import HDOP_TABLE
+from ...estimators import FILTERS
 from .claim import Bound, Claim, Part, over_others, smaller
 from .draw import PaperFigure, curves
 from .estimation import Estimation, Filter
@@ -15,7 +15,7 @@ ROLL, KINEMATIC = "roll-kf", "kinematic-velocity-kf"
 DESIGNED = "kinematic-velocity-kf, Q of its sensors"
 FIXED = ", R of HDOP 1"
 _ENV = "sideslip/YawGps-v0"
-_HDOP = {"hdop_table": HDOP_TABLE}
+_HDOP = {"hdop_table": FILTERS["double-layer"].hdop}
 # a tuning of its own, found as estimators/tunings.py says on seeds 1000 to 1011 of FIG9
 _PREDICTED = {
     "intersample": "predict",

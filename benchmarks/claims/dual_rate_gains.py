@@ -81,7 +81,7 @@ def gains(seeds: tuple[int, ...]) -> Measured:
             ANY: 10.0 ** rng.uniform([-6.0] * 3 + [-3.0] * 3, [0.0] * 3 + [2.0] * 3),
         }
         for name, q in tunings.items():
-            shares = spread.from_29(A, np.diag(q) * 1e-3, C, R, RATIO)
+            shares = spread.from_29(A, np.diag(np.asarray(q, np.float64)) * 1e-3, C, R, RATIO)
             growth = np.linalg.eigvals(spread.frame_map(A, C, shares))
             radii[name].append(float(np.abs(growth).max()))
     return Measured({(name, "spectral_radius"): np.array(r) for name, r in radii.items()})

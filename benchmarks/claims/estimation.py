@@ -14,7 +14,7 @@ from ...envs.vehicle import Vehicle
 from ...estimators import UnobservableWarning, make_estimator
 from ...estimators.bound import bound
 from .claim import Array, Example, Measured
-from .simulations import FIRST, Numbers, ToldMotion, chunked, rms, stacked, truth_of
+from .simulations import FIRST, Numbers, chunked, rms, stacked
 
 SETTLED = 2.0  # s: errors count from here on
 
@@ -56,8 +56,8 @@ class Estimation:
 
     def measure(self, seeds: tuple[int, ...]) -> Measured:
         """Drive each seed once and run every filter over its record."""
-        env: gym.Env[Any, Any] = ToldMotion(
-            gym.make(self.env_id, scenario=self.scenario, control_period=self.control_period)
+        env: gym.Env[Any, Any] = gym.make(
+            self.env_id, scenario=self.scenario, control_period=self.control_period
         )
         base: Any = env.unwrapped
         estimators: dict[str, Any] = {}
@@ -66,7 +66,7 @@ class Estimation:
             drive = rollout(env, seed=seed)
             if drive.failed:
                 raise RuntimeError(f"{self.name}: the car of seed {seed} failed without control")
-            truth = truth_of(drive)
+            truth = drive.log.truth
             told = {"nominal": base.nominal, "truth": base.vehicle}
             common = {"sensors": drive.log.slow, "dt": base.dt, "speed": base.held_speed}
             numbers: Numbers = {("truth", "beta"): _settled_rms(truth["beta"], drive.log)}

@@ -7,13 +7,11 @@ A simulation is data and gives the same `Measured` whatever it is: filters over 
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
-import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 
-from ...agents.rollout import Rollout
 from .claim import Array, Measured
 
 FIRST = 0  # the seed of the figures
@@ -21,9 +19,6 @@ CHUNK = 5  # seeds of a case that is over in seconds
 
 Numbers = dict[tuple[str, str], float]
 """One seed's numbers, by who and metric."""
-
-TRUTH = ("beta", "gamma", "psi", "v_x", "v_y", "phi", "y_l")
-"""The states whose truth is known, named as the filters name them."""
 
 
 class Simulation(Protocol):
@@ -55,35 +50,6 @@ class Analysis:
     def measure(self, seeds: tuple[int, ...]) -> Measured:
         """What the function gives."""
         return self.function(seeds)
-
-
-class ToldMotion(gym.Wrapper[Any, Any, Any, Any]):
-    """Adds the true v_x, v_y (m/s), phi (rad) and y_l (m) to `info`, beside beta, gamma and psi."""
-
-    def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
-        """Reset the env; `info` is that of tick 0."""
-        obs, info = self.env.reset(**options)
-        return obs, info | self._told()
-
-    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """One env-step; `info` is that after it."""
-        obs, reward, terminated, truncated, info = self.env.step(action)
-        return obs, reward, terminated, truncated, info | self._told()
-
-    def _told(self) -> dict[str, float]:
-        base: Any = self.env.unwrapped
-        motion = base.motion
-        return {
-            "v_x": motion.v_x,
-            "v_y": motion.v_y,
-            "phi": motion.phi,
-            "y_l": motion.y + base.vehicle.preview * (motion.psi - motion.theta),  # tie-vision (4)
-        }
-
-
-def truth_of(drive: Rollout) -> dict[str, Array]:
-    """The truth at every tick of a drive, (K,) each, interpolated between the env's steps."""
-    return {name: np.interp(drive.log.time, drive["t"], drive[name]) for name in TRUTH}
 
 
 def rms(values: npt.ArrayLike) -> float:

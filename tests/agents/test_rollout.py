@@ -1,6 +1,7 @@
 """The table of an episode: nothing lost, units on everything."""
 
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -37,3 +38,21 @@ def test_parquet_carries_units_and_pictures_are_drawn(tmp_path: Path) -> None:
     assert table.schema.field("yaw_moment").metadata[b"unit"] == b"N m"
     assert drive.plot().axes[0].get_ylabel() == "sideslip angle / deg"
     assert [path.name for path in tmp_path.iterdir()] == ["drive.parquet"]
+
+
+def test_the_motion_told_is_the_cars() -> None:
+    """tie-vision (4)-(5): y_l integrates v (psi + beta) and looks ahead; beta = v_y / v_x."""
+    env = gym.make(
+        "sideslip/YawVision-v0",
+        scenario={"base": "tie-vision-fig7", "duration": 2.5},
+        control_period=1,
+    )
+    drive = sideslip.rollout(env, seed=4)
+    truth = drive.log.truth
+    v = 25.0 / 3.6
+    np.testing.assert_allclose(truth["v_y"], truth["beta"] * truth["v_x"], rtol=1e-12, atol=1e-15)
+    drift = v * (truth["psi"] + truth["beta"])
+    y_cg = np.concatenate([[0.0], np.cumsum(0.5 * (drift[1:] + drift[:-1]) * 1e-3)])
+    base: Any = env.unwrapped
+    np.testing.assert_allclose(truth["y_l"], y_cg + base.vehicle.preview * truth["psi"], atol=1e-6)
+    assert np.abs(truth["y_l"]).max() > 0.1

@@ -9,35 +9,21 @@ import pytest
 from sideslip.agents.rollout import rollout
 from sideslip.benchmarks.claims.controlled import Following, Slip
 from sideslip.benchmarks.claims.estimation import SETTLED, Estimation, Filter
-from sideslip.benchmarks.claims.simulations import ToldMotion, chunked, truth_of
+from sideslip.benchmarks.claims.simulations import chunked
 from sideslip.estimators import make_estimator
 
 VISION = "sideslip/YawVision-v0"
 SHORT: dict[str, Any] = {"base": "tie-vision-fig7", "name": "short", "duration": 2.5}
 
 
-def test_the_told_motion_is_the_cars() -> None:
-    """tie-vision (4)-(5): y_l integrates v (psi + beta) and looks ahead; beta = v_y / v_x."""
-    env = ToldMotion(gym.make(VISION, scenario=SHORT, control_period=1))
-    drive = rollout(env, seed=4)
-    truth = truth_of(drive)
-    v = 25.0 / 3.6
-    np.testing.assert_allclose(truth["v_y"], truth["beta"] * truth["v_x"], rtol=1e-12, atol=1e-15)
-    drift = v * (truth["psi"] + truth["beta"])
-    y_cg = np.concatenate([[0.0], np.cumsum(0.5 * (drift[1:] + drift[:-1]) * 1e-3)])
-    base: Any = env.unwrapped
-    np.testing.assert_allclose(truth["y_l"], y_cg + base.vehicle.preview * truth["psi"], atol=1e-6)
-    assert np.abs(truth["y_l"]).max() > 0.1
-
-
 def test_numbers_of_an_estimation_are_those_of_its_drives() -> None:
     filters = (Filter("a", "multirate-kf"), Filter("b", "bicycle-kf", told="truth"))
     found = Estimation("short", VISION, SHORT, filters, bound=True).measure((3, 5))
-    env = ToldMotion(gym.make(VISION, scenario=SHORT, control_period=10))
+    env = gym.make(VISION, scenario=SHORT, control_period=10)
     base: Any = env.unwrapped
     for i, seed in enumerate((3, 5)):
         drive = rollout(env, seed=seed)
-        truth, late = truth_of(drive), drive.log.time >= SETTLED - 1e-9
+        truth, late = drive.log.truth, drive.log.time >= SETTLED - 1e-9
         for label, name, car in (
             ("a", "multirate-kf", base.nominal),
             ("b", "bicycle-kf", base.vehicle),
