@@ -120,9 +120,8 @@ class Posterior:
                 M.append(self.T[k, at].sum(0)[None] / sd)
                 b.append(np.array([(packet[PACKET.value + i] - self.mean[k, at].sum()) / sd]))
         A = np.column_stack([np.concatenate(M), np.concatenate(b)])
-        R: Any = np.linalg.qr(A, "r")
-        self.R: Any = R
-        self.z: Any = solve_triangular(R[:-1, :-1], R[:-1, -1])
+        self.R = np.linalg.qr(A, mode="r")
+        self.z = solve_triangular(self.R[:-1, :-1], self.R[:-1, -1])
 
     def at(self, k: int) -> Any:
         """Mean and covariance of the states at row k."""

@@ -137,8 +137,7 @@ def test_clone_and_buffer_equal_dense_gaussian_conditioning(case: Any) -> None:
     assert twice > SCHEDULES // 4 and late > SCHEDULES // 4  # that the schedules were hard
 
 
-@pytest.mark.plain
-@pytest.mark.parametrize("delay", ["clone", "buffer"])
+@pytest.mark.parametrize("delay", ["clone", pytest.param("buffer", marks=pytest.mark.plain)])
 def test_so_they_do_at_every_tick_on_the_way(delay: Any) -> None:
     told = CASES["forces, camera and gps"]
     filter_ = told.build(delay)

@@ -90,7 +90,6 @@ def test_an_estimator_of_any_rule_is_smoothed_alike_and_left_alone() -> None:
     assert np.isfinite(found["clone"].nis[used]).all()
 
 
-@pytest.mark.plain
 def test_a_state_that_is_known_exactly_stays_known() -> None:
     log = simulate(SHORT, {"camera": CAMERA}, 3)
     prior = dict.fromkeys(("beta", "gamma", "psi", "y_l"), 0.0)
