@@ -120,12 +120,13 @@ class Posterior:
                 M.append(self.T[k, at].sum(0)[None] / sd)
                 b.append(np.array([(packet[PACKET.value + i] - self.mean[k, at].sum()) / sd]))
         A = np.column_stack([np.concatenate(M), np.concatenate(b)])
-        self.R = np.linalg.qr(A, mode="r")
-        self.z = solve_triangular(self.R[:-1, :-1], self.R[:-1, -1])
+        R: Any = np.linalg.qr(A, mode="r")
+        self.R = R[:-1, :-1]
+        self.z = solve_triangular(self.R, R[:-1, -1])
 
     def at(self, k: int) -> Any:
         """Mean and covariance of the states at row k."""
-        root = solve_triangular(self.R[:-1, :-1], self.T[k].T, trans="T")
+        root = solve_triangular(self.R, self.T[k].T, trans="T")
         return self.mean[k] + self.T[k] @ self.z, root.T @ root
 
 
