@@ -20,7 +20,8 @@ def use(f: Any, gains: Any, s: int, packet: Any) -> bool:
     if f.late == BUFFER:
         return take_late(f, gains, s, packet)
     first = find(f, s, int(packet[PACKET.captured]))
-    return first != DROPPED and measure(f, gains, s, first, packet, True)
+    found = first != DROPPED
+    return found and measure(f, gains, s, first, packet, found)
 
 
 @jit
@@ -91,13 +92,31 @@ def _wait(f: Any, s: int, packet: Any) -> bool:
 
 
 @jit
+def receive_sample(f: Any, gains: Any) -> bool:
+    """`receive` the packet that lies in f.sample."""
+    f.nis = np.nan
+    if not sound(f, f.sample):
+        return False
+    s = int(f.sample[PACKET.sensor])
+    if f.pace > 1 and not (f.begun == 1 and (f.tick - f.origin) % f.pace == 0):
+        return _wait(f, s, f.sample)
+    return use(f, gains, s, f.sample)
+
+
+@jit
 def receive(f: Any, gains: Any, packet: Any) -> bool:
     """Use a packet that is here now, keep it for the next step, or drop and count it; whether it
     was used or kept."""
-    f.nis = np.nan
-    if not sound(f, packet):
-        return False
-    s = int(packet[PACKET.sensor])
-    if f.pace > 1 and not (f.begun == 1 and (f.tick - f.origin) % f.pace == 0):
-        return _wait(f, s, packet)
-    return use(f, gains, s, packet)
+    for i in range(PACKET_WIDTH):
+        f.sample[i] = packet[i]
+    return receive_sample(f, gains)
+
+
+@jit
+def use_waiting(f: Any, gains: Any) -> None:
+    """Use the packets that came since the last step that listened."""
+    for i in range(f.waits):
+        for j in range(PACKET_WIDTH):
+            f.sample[j] = f.waiting[i, j]
+        use(f, gains, int(f.sample[PACKET.sensor]), f.sample)
+    f.waits = 0

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..envs.backend import jit, maximum, sqrt
 from ..envs.record import FAST, PACKET
-from .arrivals import receive, use
+from .arrivals import receive, use_waiting
 from .delay import BUFFER, latch_due
 from .layers import pass_on
 from .memory import COUNTERS, FRAMES, INPUTS, ROWS, SEEN, SLOW, WIDTH, WINDOW
@@ -70,14 +70,6 @@ def _start(f: Any) -> None:
 
 
 @jit
-def _waited(f: Any, gains: Any) -> None:
-    """Use the packets that came since the last step that listened."""
-    for i in range(f.waits):
-        use(f, gains, int(f.waiting[i, PACKET.sensor]), f.waiting[i])
-    f.waits = 0
-
-
-@jit
 def tick(f: Any, gains: Any) -> None:
     """From the last tick to this one, whose fast row was read."""
     f.tick += 1
@@ -110,7 +102,7 @@ def tick(f: Any, gains: Any) -> None:
         f.u_sum[i] = 0.0
     f.u_count = 0
     if f.pace > 1 and listens:
-        _waited(f, gains)
+        use_waiting(f, gains)
 
 
 @jit
@@ -190,7 +182,7 @@ def step_all(layers: Any, gains: Any, fast: Any, packets: Any, count: int) -> in
     """`advance` over all rows with nothing to be filled: fewer arguments to hand over."""
     nothing = fast[:0]
     return advance(
-        layers, gains, fast, len(fast), packets, count, 0, nothing, nothing, nothing[:, 0]
+        layers, gains, fast, len(fast), packets, count, len(nothing), nothing, nothing, nothing.reshape(0)
     )
 
 

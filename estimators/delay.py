@@ -32,6 +32,12 @@ DROPPED = -2
 HELD = -3
 
 
+@jit
+def direct() -> int:
+    """DIRECT, as a number: a literal argument would have every callee compiled once more."""
+    return DIRECT
+
+
 def rule_code(rule: str) -> int:
     """The number of a rule; "literal" and "lag" are models whose samples count as fresh."""
     return IGNORE if rule in ("literal", "lag") else RULES.index(rule)

@@ -5,7 +5,7 @@ from typing import Any
 from ..envs.backend import jit, maximum
 from ..envs.elementary import sincos
 from ..envs.record import GPS, PACKET
-from .arrivals import receive
+from .arrivals import receive_sample
 from .innovation import HDOP, dilution
 from .memory import COUNTERS, WINDOW
 from .speed import finite
@@ -31,7 +31,7 @@ def pass_on(first: Any, second: Any, gains: Any, packet: Any) -> None:
     if not finite(V):
         first.counts[COUNTERS.invalid] += 1
         return
-    told = second.waiting[0]  # its place for packets that wait, which it never uses
+    told = second.sample
     for i in range(len(packet)):
         told[i] = packet[i]
     told[PACKET.value] = V * c
@@ -40,4 +40,4 @@ def pass_on(first: Any, second: Any, gains: Any, packet: Any) -> None:
     speed = second.r_speed * factor * factor
     second.r[GPS, 0] = speed
     second.r[GPS, 1] = V * V * first.P[0, 0] + speed * s * s
-    receive(second, gains, told)
+    receive_sample(second, gains)

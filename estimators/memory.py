@@ -139,6 +139,7 @@ FILTER = np.dtype(
         ("r_held", _FLOAT, (FRAMES,)),  # variance of the course in each frame held of the GPS
         ("seen", _INT, (SLOW, SEEN)),
         ("first_fix", _INT),  # captured tick of the first course used; -1: none yet
+        ("sample", _FLOAT, (PACKET_WIDTH,)),  # the packet at hand
         ("waiting", _FLOAT, (WAITING, PACKET_WIDTH)),
         ("waits", _INT),
         ("cursor", _INT),  # packets of the present call that are done

@@ -12,7 +12,7 @@ from typing import Any
 
 from ..envs.backend import jit, maximum
 from ..envs.record import PACKET, PACKET_WIDTH
-from .delay import DIRECT
+from .delay import direct
 from .measure import measure
 from .memory import COUNTERS, EVERY, RECENT, ROWS, SLOW, SNAPSHOTS, WINDOW
 from .step import advance_state, correct_fast
@@ -112,7 +112,9 @@ def _measure(f: Any, gains: Any, s: int, place: int, new: bool) -> bool:
     if f.kind == VELOCITY_ROLL:  # told its noise with each packet
         for i in range(ROWS):
             f.r[s, i] = f.recent_r[place, i]
-    passed = measure(f, gains, s, DIRECT, f.recent[place], new)
+    for i in range(PACKET_WIDTH):
+        f.sample[i] = f.recent[place, i]
+    passed = measure(f, gains, s, direct(), f.sample, new)
     if not passed:
         f.recent[place, PACKET.quality] = 0.0
     return passed
@@ -169,7 +171,7 @@ def take_late(f: Any, gains: Any, s: int, packet: Any) -> bool:
         return False
     _keep(f, s, packet, place)
     if captured == f.tick:
-        return _measure(f, gains, s, place, True)
+        return _measure(f, gains, s, place, captured == f.tick)
     return _tell_again(f, gains, first, place)
 
 
