@@ -255,11 +255,11 @@ def test_the_roll_filter() -> None:
 
 
 def test_the_two_state_observer() -> None:
-    """6.1 (Aoki): beta and gamma from the gyro, poles at -6 and -8 rad/s."""
+    """6.1 (Aoki): beta and gamma from the gyro, poles at -60 and -120 rad/s."""
     log = log_of(4)
     A, B = (M[:2, :2] for M in car(V))
     G, H = zoh(A, B)
-    C, poles = np.array([[0.0, 1.0]]), np.exp(np.array([-6.0, -8.0]) * T)
+    C, poles = np.array([[0.0, 1.0]]), np.exp(np.array([-60.0, -120.0]) * T)
     wanted_poly = (G - poles[0] * np.eye(2)) @ (G - poles[1] * np.eye(2))
     K = wanted_poly @ np.linalg.inv(np.vstack([C @ G, C @ G @ G]))[:, -1:]  # Ackermann
     reached = np.linalg.eigvals((np.eye(2) - K @ C) @ G)
