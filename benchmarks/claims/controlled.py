@@ -46,7 +46,7 @@ class Slip:
             lines.append(numbers)
             if seed == FIRST:
                 example = Example(time, curves)
-        return Measured(dict(stacked(lines)), example)
+        return Measured(stacked(lines), example)
 
     def _drive(self, label: str, seed: int) -> tuple[Array, dict[str, Array], float]:
         """Times, signals, and the yaw moment's limit in N m."""
@@ -106,4 +106,4 @@ class Following:
             lines.append(numbers)
             if seed == FIRST:
                 example = Example(time, curves)
-        return Measured(dict(stacked(lines)), example)
+        return Measured(stacked(lines), example)

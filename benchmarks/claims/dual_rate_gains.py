@@ -77,7 +77,7 @@ def gains(seeds: tuple[int, ...]) -> Measured:
         rng = np.random.default_rng(seed)
         strong = 10.0 ** rng.uniform(math.log10(5.0), math.log10(50.0))
         tunings = {
-            STRONG: [1e-4] * 3 + [strong] * 3,
+            STRONG: np.array([1e-4] * 3 + [strong] * 3),
             ANY: 10.0 ** rng.uniform([-6.0] * 3 + [-3.0] * 3, [0.0] * 3 + [2.0] * 3),
         }
         for name, q in tunings.items():

@@ -85,7 +85,7 @@ class Estimation:
                 record = drive.log.record
                 packets = {sensor: record.packets_of(sensor) for sensor in drive.log.slow}
                 example = Example(drive.log.time, curves, packets)
-        return Measured(dict(stacked(lines)), example)
+        return Measured(stacked(lines), example)
 
 
 def _built(each: Filter, vehicle: Vehicle, common: Mapping[str, Any]) -> Any:

@@ -5,7 +5,7 @@ A simulation is data and gives the same `Measured` whatever it is: filters over 
 (`Analysis`).
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -62,7 +62,7 @@ def chunked(seeds: int, size: int = CHUNK) -> list[tuple[int, ...]]:
     return [tuple(range(k, min(k + size, seeds))) for k in range(0, seeds, size)]
 
 
-def stacked(lines: list[Numbers]) -> Mapping[tuple[str, str], Array]:
+def stacked(lines: list[Numbers]) -> dict[tuple[str, str], Array]:
     """(seeds,) of each number, from the numbers of each seed."""
     return {name: np.array([line[name] for line in lines]) for name in lines[0]}
 
