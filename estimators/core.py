@@ -182,7 +182,16 @@ def step_all(layers: Any, gains: Any, fast: Any, packets: Any, count: int) -> in
     """`advance` over all rows with nothing to be filled: fewer arguments to hand over."""
     nothing = fast[:0]
     return advance(
-        layers, gains, fast, len(fast), packets, count, len(nothing), nothing, nothing, nothing.reshape(0)
+        layers,
+        gains,
+        fast,
+        len(fast),
+        packets,
+        count,
+        len(nothing),
+        nothing,
+        nothing,
+        nothing.reshape(0),
     )
 
 
