@@ -52,8 +52,8 @@ SIMULATIONS = (
             {"base": FIG9, "name": name, "hdop": hdop, "hdop_spread": spread, "hdop_law": law},
             (
                 *_FILTERS[:2],
-                Filter(WALKS + FIXED, PROPOSED, _PREDICTED),
-                Filter(PROPOSED + FIXED, PROPOSED),
+                Filter(WALKS + FIXED, PROPOSED, {**_PREDICTED, "hdop_table": None}),
+                Filter(PROPOSED + FIXED, PROPOSED, {"hdop_table": None}),
             ),
         )
         for name, (hdop, spread), law, _ in _SKIES

@@ -10,8 +10,8 @@ CONVENTIONAL, HOLDING, PSEUDO = "conventional", "innovation holding", "pseudo me
 PLAIN = "conventional, no disturbance states"
 _ENV = "sideslip/YawGps-v0"
 
-# every rule has a tuning of its own, found by Nelder-Mead on the logarithms on seeds 1000 to 1011 of
-# FIG4; they hold there, at other speeds and rates of the GPS they may diverge
+# every rule has a tuning of its own, found by Nelder-Mead on the logarithms on seeds 1000 to 1011
+# of FIG4; they hold there, at other speeds and rates of the GPS they may diverge
 _TUNED = {
     PSEUDO: {
         "q_beta": 1.9e-5,
