@@ -3,6 +3,7 @@
 import itertools
 import warnings
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -136,7 +137,7 @@ class Estimator:
         """
         for name, sensor in self.sensors.items():
             told = sensor if sensors is None else sensors.get(name)
-            if told is None or _clockless(told) != _clockless(sensor):
+            if told is None or replace(told, phase=0.0) != replace(sensor, phase=0.0):
                 raise ValueError(
                     f"{self.name} was built for the {name} {sensor}, the reset tells {told}"
                 )
@@ -294,9 +295,3 @@ class Estimator:
 
     def __repr__(self) -> str:
         return f"<{self.name}: {', '.join(self.names)} at tick {self.tick}>"
-
-
-def _clockless(sensor: SlowSensor) -> SlowSensor:
-    return SlowSensor(
-        sensor.period, sensor.delays, 0.0, sensor.jitter, sensor.loss, sensor.duplicate
-    )
