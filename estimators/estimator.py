@@ -28,7 +28,6 @@ CHECKED_SPEEDS = (3.0, 7.0, 14.0)  # m/s, where a filter without a fixed speed i
 
 _NOTHING = np.zeros((0, 0))
 _NO_NIS = np.zeros(0)
-_ROW, _PACKET = (FAST_WIDTH,), (PACKET_WIDTH,)
 _NO_PACKETS = np.zeros((0, PACKET_WIDTH))
 
 
@@ -154,14 +153,17 @@ class Estimator:
         """
         fast = np.ascontiguousarray(fast, np.float64)
         packets = np.ascontiguousarray(packets, np.float64)
-        if fast.shape[1:] != _ROW:
-            raise ValueError(f"fast rows have shape (k, {FAST_WIDTH}), got {fast.shape}")
-        if packets.shape[1:] != _PACKET:
-            raise ValueError(f"packets have shape (k, {PACKET_WIDTH}), got {packets.shape}")
-        arrived = len(packets) if count is None else count
+        try:
+            (rows, wide), (arrived, long) = fast.shape, packets.shape
+        except ValueError:
+            rows, wide, arrived, long = 0, 0, 0, 0
+        if wide != FAST_WIDTH or long != PACKET_WIDTH:
+            raise ValueError(_misshapen(fast, packets))
+        arrived = arrived if count is None else count
         done = entries()[2](self.filters, self.gains, fast, packets, arrived)
-        if done < len(fast):  # gains are missing
-            self._go_on(done, fast, len(fast), packets, arrived, _NOTHING, _NOTHING, _NO_NIS)
+        if done < rows:  # gains are missing
+            nothing = _NOTHING, _NOTHING, _NO_NIS
+            self._go_on(done, rows, (fast, rows, packets, arrived), nothing)
 
     def take(
         self,
@@ -181,24 +183,16 @@ class Estimator:
         given = fast, rows, packets, count
         done = entries()[0](self.filters, self.gains, *given, 0, X, S, nis)
         if done < rows:
-            self._go_on(done, *given, X, S, nis)
+            self._go_on(done, rows, given, (X, S, nis))
 
-    def _go_on(
-        self,
-        done: int,
-        fast: Array,
-        rows: int,
-        packets: Array,
-        count: int,
-        X: Array,
-        S: Array,
-        nis: Array,
-    ) -> None:
-        """The rest of the rows, designing the gains that are asked for on the way."""
+    def _go_on(self, done: int, rows: int, given: Any, filled: Any) -> None:
+        """The rest of the rows, designing the gains that are asked for on the way.
+
+        given, filled: the arguments of `advance` before and behind the rows done.
+        """
         while done < rows:
             self.design_missing()
-            given = fast, rows, packets, count, done
-            done = entries()[0](self.filters, self.gains, *given, X, S, nis)
+            done = entries()[0](self.filters, self.gains, *given, done, *filled)
 
     def predict(self, fast_row: npt.ArrayLike) -> None:
         """Take one fast row: from the last tick to this one, with the gyro."""
@@ -295,3 +289,9 @@ class Estimator:
 
     def __repr__(self) -> str:
         return f"<{self.name}: {', '.join(self.names)} at tick {self.tick}>"
+
+
+def _misshapen(fast: Array, packets: Array) -> str:
+    if fast.shape[1:] != (FAST_WIDTH,):
+        return f"fast rows have shape (k, {FAST_WIDTH}), got {fast.shape}"
+    return f"packets have shape (k, {PACKET_WIDTH}), got {packets.shape}"
