@@ -1,7 +1,7 @@
 """dakf-stability Fig. 7: do steering and yaw moment make the car follow its reference model?"""
 
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -74,26 +74,3 @@ def tracking(episode: Rollout) -> Tracking:
         steered=float(steering.max()),
         failed=episode.failed,
     )
-
-
-def compared(
-    seeds: Iterable[int], scenario: Manoeuvre = "dakf-fig7", **options: Any
-) -> dict[str, Array]:
-    """With control over without it, (seeds,) each: RMS errors of beta and gamma, peak of beta.
-
-    `saturated` and `failed` are those with control. options: of `drive`.
-    """
-    rows = []
-    for seed in seeds:
-        none = tracking(drive(seed, scenario, "none"))
-        ours = tracking(drive(seed, scenario, **options))
-        rows.append(
-            {
-                "rms_beta": ours.rms_beta / none.rms_beta,
-                "rms_gamma": ours.rms_gamma / none.rms_gamma,
-                "peak_beta": ours.peak_beta / none.peak_beta,
-                "saturated": ours.saturated,
-                "failed": float(ours.failed),
-            }
-        )
-    return {name: np.array([row[name] for row in rows]) for name in rows[0]}

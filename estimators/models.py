@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..envs.linear import roll
 from ..envs.record import CAMERA, FAST, GPS, SLOW_NAMES
 from ..envs.vehicle import Vehicle
 from .transition import FORCES, KINEMATIC, LATERAL, ROLL, VELOCITY_ROLL, YAW
@@ -159,11 +160,8 @@ def write_model(
         vehicle.front_stiffness,
         vehicle.rear_stiffness,
     ]
-    f.roll[:] = [
-        vehicle.roll_stiffness / vehicle.roll_inertia,
-        vehicle.roll_damping / vehicle.roll_inertia,
-        vehicle.sprung_mass * vehicle.roll_arm / vehicle.roll_inertia,
-    ]
+    body = roll(vehicle)
+    f.roll[:] = [-body.A[1, 0], -body.A[1, 1], body.B[1, 0]]
     f.preview = vehicle.preview
     f.step = step
     f.Q[:n, :n] = Q * step

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from sideslip.envs.linear import course, vision
+from sideslip.envs.linear import course, velocity_and_roll, vision
 from sideslip.envs.record import SlowSensor
 from sideslip.envs.vehicle import COMS, PASSENGER_CAR
 from sideslip.estimators import make_estimator
-from sideslip.estimators.transition import discretise
+from sideslip.estimators.transition import build, discretise
 from tests.estimators.simulation import CAMERA, GPS
 
 STEPS = (0.001, 0.01, 0.033, 0.1, 0.2)
@@ -121,3 +121,16 @@ def test_process_noise_means_the_same_at_every_tick() -> None:
     assert fine.filters[0].Q[0, 0] == pytest.approx(1e-6)
     assert coarse.filters[0].Q[0, 0] == pytest.approx(1e-5)
     assert single.filters[0].Q[0, 0] == pytest.approx(33e-6)
+
+
+@pytest.mark.parametrize("turning", [0.0, 0.3, -1.2])
+def test_the_second_layer_is_the_linear_model_at_every_yaw_rate(turning: float) -> None:
+    """`transition` writes double-layer-gps (42) for compiled code; `linear` has it for design."""
+    with pytest.warns(UserWarning, match="cannot see"):
+        filter_ = make_estimator("double-layer", sensors={"gps": GPS}, speed=7.0)
+    f = filter_.filters[1]
+    build(f, 7.0, turning)
+    model = velocity_and_roll(COMS, turning)
+    G, H = model.discrete(float(f.step))
+    np.testing.assert_allclose(f.G[:4, :4], G, rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(f.H[:4, :2], H, rtol=1e-12, atol=1e-15)
