@@ -79,7 +79,6 @@ VARIANTS = [
     case("exact-kf", PAPERS, gains="periodic"),
     case("dakf", GPS, leak=2.0),
     case("double-layer", GPS, intersample="predict"),
-    case("double-layer", GPS, disturbances="none", intersample="predict"),
     *(
         case("dual-rate", GPS, disturbances="none", intersample=rule)
         for rule in ("pseudo", "predict", "hold", "oh")
@@ -177,10 +176,16 @@ def test_so_it_does_where_a_prediction_is_stored_for_a_period_or_longer(case: Ca
     shrinks(case)
 
 
+@quietly
 @pytest.mark.long
-@pytest.mark.xfail(strict=True, reason="the map knows one gain, the filter has each tick's: 1 %")
-def test_so_it_does_with_pseudo_residuals_and_a_covariance() -> None:
-    shrinks(Case("double-layer", GPS, {"disturbances": "none"}))
+@pytest.mark.xfail(
+    strict=True, reason="the maps take a constant R and gain, layers tell each tick's"
+)
+@pytest.mark.parametrize("rule", ["pseudo-residual", "predict"])
+def test_so_it_does_in_the_layers_of_double_layer(rule: str) -> None:
+    """The rates differ by 1 % with the first rule and by 20 % (0.950 told, 0.940 true) with the
+    second, where the second layer is the slowest: its map has the noise of no packet."""
+    shrinks(Case("double-layer", GPS, {"disturbances": "none", "intersample": rule}))
 
 
 @quietly
