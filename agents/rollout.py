@@ -28,6 +28,8 @@ INFO_UNITS = {
     "v_y": "m/s",
     "phi": "rad",
     "y_l": "m",
+    "X": "m",
+    "Y": "m",
 }
 TRUTH = ("beta", "gamma", "psi", "v_x", "v_y", "phi", "y_l")
 """What a log knows of the states, named as estimators name them."""
@@ -153,13 +155,15 @@ def rollout(
 
 
 def motion_of(base: Any) -> dict[str, float]:
-    """The true v_x, v_y (m/s), phi (rad) and y_l (m) of an env, which its `info` leaves out."""
+    """What an env's `info` leaves out: v_x, v_y (m/s), phi (rad), y_l and the place X, Y (m)."""
     motion = base.motion
     return {
         "v_x": motion.v_x,
         "v_y": motion.v_y,
         "phi": motion.phi,
         "y_l": motion.y + base.vehicle.preview * (motion.psi - motion.theta),  # tie-vision (4)
+        "X": motion.X,
+        "Y": motion.Y,
     }
 
 

@@ -81,8 +81,8 @@ function broken(text) {
 }
 
 function draw(figure) {
-  const { data, layout } = JSON.parse(figure.querySelector("script").textContent);
-  for (const trace of data) {
+  const { data, layout = {}, frames = [] } = JSON.parse(figure.querySelector("script").textContent);
+  for (const trace of [...data, ...frames.flatMap((frame) => frame.data)]) {
     for (const pen of [trace.line, trace.marker, trace.error_x]) {
       if (pen?.color) pen.color = inked(pen.color);
     }
@@ -97,11 +97,12 @@ function draw(figure) {
   // A finger shall scroll the page, not zoom the figure it lands on.
   const dragmode = TOUCH.matches ? false : "zoom";
   const themed = { dragmode, ...layout, template: template() };
-  Plotly.react(figure.querySelector(".plot"), data, themed, CONFIG);
+  // Frames belong to the plot: they are replaced with it, never added a second time.
+  Plotly.react(figure.querySelector(".plot"), { data, layout: themed, frames, config: CONFIG });
 }
 
 function drawAll() {
-  for (const figure of document.querySelectorAll("figure")) draw(figure);
+  for (const figure of document.querySelectorAll("figure:not(.explorer)")) draw(figure);
 }
 
 // One figure a turn, so that the page can be read and scrolled from the start.
@@ -116,7 +117,7 @@ function setPrinting(printing) {
   if (DARK.matches) drawAll();
 }
 
-drawInTurn([...document.querySelectorAll("figure")]);
+drawInTurn([...document.querySelectorAll("figure:not(.explorer)")]);
 DARK.addEventListener("change", drawAll);
 NARROW.addEventListener("change", drawAll);
 window.addEventListener("beforeprint", () => setPrinting(true));

@@ -1,9 +1,10 @@
 """The report: what the suites found as one HTML file that needs nothing from the network.
 
-The page's looks are in `report.css`, what it does in `report.js`, both beside this module and
-copied into the page. The page's own policy forbids it to load anything.
+The page's looks are in `report.css`, what it does in `report.js` and `explorer.js`, all beside this
+module and copied into the page. The page's own policy forbids it to load anything.
 """
 
+import base64
 import json
 import math
 import re
@@ -79,12 +80,12 @@ def write_report(
     if not suites:
         raise ValueError("a report needs at least one suite")
     made = {"made": datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z"), **environment}
-    figures = [figure for suite in suites for _, figure, _ in suite.figures]
+    drawn = any(suite.figures or suite.explorers for suite in suites)
     page = _PAGE.substitute(
         suites=", ".join(escape(suite.name) for suite in suites),
         css=_beside("report.css"),
-        js=_beside("report.js"),
-        plotly=f"<script>{_plotly()}</script>\n" if figures else "",
+        js=_beside("report.js") + "\n\n" + _beside("explorer.js"),
+        plotly=f"<script>{_plotly()}</script>\n" if drawn else "",
         command=escape(command),
         made=" · ".join(f"{escape(name)} <b>{escape(value)}</b>" for name, value in made.items()),
         contents="\n".join(
@@ -191,6 +192,7 @@ def _section(link: str, suite: Suite) -> str:
     blocks = [f"<h2>{escape(suite.title)}</h2>"]
     blocks += [f"<p>{_inline(part)}</p>" for part in suite.text.split("\n\n") if part.strip()]
     blocks += [_table(table) for table in suite.tables]
+    blocks += [explorer.html() for explorer in suite.explorers]
     blocks += [
         f"<figure>\n<h3>{escape(title)}</h3>\n"
         f'<div class="plot" role="img" aria-label="{escape(title)}"></div>\n'
@@ -198,7 +200,16 @@ def _section(link: str, suite: Suite) -> str:
         f"<figcaption>{_inline(caption)}</figcaption>\n</figure>"
         for title, figure, caption in suite.figures
     ]
+    blocks += [_download(*file) for file in suite.files]
     return f'<section id="{link}">\n' + "\n".join(blocks) + "\n</section>"
+
+
+def _download(name: str, media: str, text: str) -> str:
+    data = base64.b64encode(text.encode()).decode()
+    return (
+        f'<p class="file"><a download="{escape(name)}" href="data:{media};base64,{data}">'
+        f"{escape(name)}</a></p>"
+    )
 
 
 def _links(suites: Sequence[Suite]) -> list[tuple[str, str]]:
@@ -217,7 +228,7 @@ def _json(figure: Any) -> str:
     content = figure.to_plotly_json()
     for name in ("template", "title"):
         content["layout"].pop(name, None)
-    plain = {"data": content["data"], "layout": content["layout"]}
+    plain = {name: content[name] for name in ("data", "layout", "frames") if content.get(name)}
     text = json.dumps(plain, cls=PlotlyJSONEncoder, separators=(",", ":"))
     return text.replace("<", "\\u003c")
 

@@ -8,6 +8,8 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
+from .explorer import Explorer
+
 METRICS = {
     "rmse": "rad",
     "rmse_over_bound": "-",
@@ -19,6 +21,16 @@ METRICS = {
     "saturation": "-",
     "effort": "-",
     "cost": "-",
+    "score": "-",
+    "iqm": "-",
+    "cost_over_informed": "-",
+    "rms_slip_error": "rad",
+    "rms_yaw_error": "rad/s",
+    "spin_rate": "-",
+    "departure_rate": "-",
+    "not_finite_rate": "-",
+    "bad_action_rate": "-",
+    "us_per_decision": "us",
     "ratio": "-",
     "static_slip": "rad",
     "drift": "rad",
@@ -89,7 +101,8 @@ class Suite:
     """What a benchmark module gives: rows for machines, tables and figures for people.
 
     figures: (title, plotly figure, a sentence on what to see). Empty where the extra `report` is
-    not installed or pictures were not asked for.
+    not installed or pictures were not asked for. explorers: figures with menus. files: what the
+    report offers to save, (file name, media type, text).
     """
 
     name: str
@@ -98,6 +111,8 @@ class Suite:
     rows: list[Row] = field(default_factory=list)
     tables: list[Table] = field(default_factory=list)
     figures: list[tuple[str, Any, str]] = field(default_factory=list)
+    explorers: list[Explorer] = field(default_factory=list)
+    files: list[tuple[str, str, str]] = field(default_factory=list)
 
 
 def check_writable(*paths: Path | None) -> None:
