@@ -32,7 +32,7 @@ class Car(NamedTuple):
     d_r: Any
     r: Any
     T_max: Any
-    mu: Any
+    mu: Any  # under the left wheels
     l_pre: Any
     S: Any  # kg m, M_s h_s
     I_x: Any
@@ -41,6 +41,7 @@ class Car(NamedTuple):
     h: Any
     ahead: Any  # m, the GPS antenna from the centre of gravity
     left: Any  # m
+    mu_r: Any  # under the right wheels
 
 
 class Motion(NamedTuple):

@@ -10,20 +10,31 @@ from typing import Any
 from .actuators import Lag, distribute, lagged, slewed, within_stop, yaw_moment
 from .backend import absolute, fixed_tuple, inlined, jit, select
 from .delivery import sense, store
+from .driver import Driver, steered
 from .dynamics import Car, Motion, Push, Road, gravity_at, rk4, sideslip_angle
-from .layout import Disturbance, Drive, P, Task, Z
+from .layout import Change, Disturbance, Drive, P, Task, Z
 from .noise import CHANNELS, normals
-from .programme import STEERING_WIDTH, Pace, Wind, acceleration_command, steering_at, wind_at
+from .pace import Pace, acceleration_command
+from .programme import DRIVER, STEERING_WIDTH, Wind, steering_at, wind_at
 from .record import FAST, TICK
 from .reference import COST_CAP, Target, cost_rate, reference
 from .summary import clip, observe, write_report
 from .switches import BAD_ACTION, NOT_FINITE, OFF_ROAD, REFUSED, REPORT, RUNNING, SPIN
+from .tracks import Path, path_offset
 from .tyres import Inputs, load_of
 from .vehicle import GRAVITY
 
 _CAR, _MOTION, _ROAD, _LAG = (len(each._fields) for each in (Car, Motion, Road, Lag))
 _WIND, _PACE, _TARGET = (len(each._fields) for each in (Wind, Pace, Target))
 _OU, _TASK, _DRIVE = (len(each._fields) for each in (Disturbance, Task, Drive))
+_DRIVER, _PATH, _CHANGE = (len(each._fields) for each in (Driver, Path, Change))
+
+
+@inlined
+def changed(car: Any, change: Any) -> Any:
+    """The car once its tyres have changed."""
+    tyres = (car.C_f * change.front, car.C_r * change.rear)
+    return Car(*(car[:4] + tyres + car[6:]))
 
 
 @jit
@@ -107,6 +118,9 @@ def step_vehicle(
     ou = Disturbance(*fixed_tuple(p[P.disturbance :], _OU))
     task = Task(*fixed_tuple(p[P.task :], _TASK))
     programme = fixed_tuple(p[P.steering :], STEERING_WIDTH)
+    person = Driver(*fixed_tuple(p[P.driver :], _DRIVER))
+    path = Path(*fixed_tuple(p[P.path :], _PATH))
+    change = Change(*fixed_tuple(p[P.change :], _CHANGE))
     motion = Motion(*fixed_tuple(z[Z.motion :], _MOTION))
     T_l, T_r, delta, integral, F_d, N_d, slewing, added = fixed_tuple(z[Z.drive :], _DRIVE)
     key_low, key_high, tick = int(z[Z.clock]), int(z[Z.clock + 1]), z[Z.clock + 2]
@@ -119,9 +133,15 @@ def step_vehicle(
     done = 0
     lagging = motor.start + steering.start > 0.0
     both_lag = motor.start * steering.start > 0.0
+    if tick > change.tick:
+        car = changed(car, change)
     start = load_of(Inputs(delta, T_l, T_r), car, small_angle)
-    driver = steering_at(tick, programme)
+    follows = switches[3] == DRIVER
+    driver = z[Z.driver] if follows else steering_at(tick, programme)
     for j in range(n):
+        if tick == change.tick:
+            car = changed(car, change)
+            start = load_of(Inputs(delta, T_l, T_r), car, small_angle)
         slewing = slewed(slewing, wanted, task.slew)
         extra = within_stop(slewing, driver, task.stop)
         command = driver + extra
@@ -183,7 +203,10 @@ def step_vehicle(
             p, z, motion, small_angle, accel, acted, rows, j, packets, count, fast, wheels
         )
         v = 0.5 * (rows[j, FAST.wheel_left] + rows[j, FAST.wheel_right])
-        driver = steering_at(tick, programme)
+        if follows:
+            driver = steered(driver, motion, path, road, target, person, task.stop)
+        else:
+            driver = steering_at(tick, programme)
         refs = reference(driver, v, target, kind)
         delivered = yaw_moment(left, right, car)
         effort = delivered / task.yaw_scale
@@ -197,12 +220,15 @@ def step_vehicle(
             motion, beta, refs = before, 0.0, (0.0, 0.0)  # the last that is fit for `info`
         elif absolute(beta) > task.spin and v_x > 0.0:  # backing up is no spin
             failure = SPIN
-        elif absolute(motion.y) > task.half_width:
+        elif absolute(motion.y - (path_offset(path, motion.s) if follows else 0.0)) > (
+            task.half_width
+        ):
             failure = OFF_ROAD
         if failure != RUNNING or tick >= task.duration:
             break
     store(z, Z.motion, motion)
     store(z, Z.drive, (T_l, T_r, delta, integral, F_d, N_d, slewing, added))
+    z[Z.driver] = driver
     z[Z.clock + 3] = failure
     if failure != RUNNING:  # the rest of the episode is charged: failing never pays
         cost = cost + COST_CAP * (task.duration - tick) * TICK

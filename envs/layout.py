@@ -10,11 +10,14 @@ import numpy as np
 import numpy.typing as npt
 
 from .actuators import Lag
+from .driver import Driver
 from .dynamics import Car, Motion, Road
-from .programme import STEERING_WIDTH, Pace, Wind
+from .pace import Pace
+from .programme import STEERING_WIDTH, Wind
 from .record import FAST, FAST_UNITS, PACKET_WIDTH, SLOW_NAMES, SLOW_VALUES
 from .reference import Target
 from .sensors import IN_FLIGHT, Link, Noise, Sky
+from .tracks import Path
 
 Array = npt.NDArray[np.float64]
 
@@ -39,6 +42,14 @@ class Task(NamedTuple):
     authority: Any  # rad of added steering, of action 1
     slew: Any  # rad a tick, of added steering
     stop: Any  # rad, of the whole steering angle
+
+
+class Change(NamedTuple):
+    """Tyres that change in mid-run."""
+
+    tick: Any  # from which on
+    front: Any  # factors on the cornering stiffness
+    rear: Any
 
 
 class Drive(NamedTuple):
@@ -101,6 +112,9 @@ _PARAMS = _offsets(
         "task": len(Task._fields),
         "steering": STEERING_WIDTH,
         "sky": len(Sky._fields),
+        "driver": len(Driver._fields),
+        "path": len(Path._fields),
+        "change": len(Change._fields),
     }
 )
 _STATE = _offsets(
@@ -112,6 +126,7 @@ _STATE = _offsets(
         "gps": len(Slow._fields),
         "queue": 2 * IN_FLIGHT * PACKET_WIDTH,
         "sky": 1,  # deviation of log HDOP from its median
+        "driver": 1,  # rad, the driver's steering command
     }
 )
 
@@ -133,6 +148,9 @@ class ParamsAt(NamedTuple):
     task: int
     steering: int
     sky: int
+    driver: int
+    path: int
+    change: int
     end: int
 
 
@@ -146,6 +164,7 @@ class StateAt(NamedTuple):
     gps: int
     queue: int
     sky: int
+    driver: int
     end: int
 
 

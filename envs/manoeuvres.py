@@ -14,6 +14,27 @@ _DRAWN: dict[str, Any] = {
     "rear_stiffness": (0.6, 1.4),
     "friction": (0.7, 1.0),
 }
+# Above 28 km/h so many of the drawn cars are close to their critical speed that those which spin
+# would decide the mean cost of a harsh manoeuvre.
+_HARSH = _DRAWN | {"speed": (18.0 * KMH, 28.0 * KMH)}
+_RANDOM: dict[str, Any] = {
+    "steering": "random",
+    "onset": (0.0, 1.0),
+    "amplitude": (0.01, 0.04),
+    "amplitude_2": (0.01, 0.04),
+    "frequency": (0.3, 0.4),
+    "frequency_2": (0.4, 0.8),
+    "frequency_3": (0.2, 0.3),
+    "frequency_4": (0.4, 0.6),
+}
+_SLALOM: dict[str, Any] = {
+    "steering": "slalom",
+    "onset": (0.5, 1.5),
+    "amplitude": (0.04, 0.1),
+    "frequency": (0.2, 0.6),
+}
+_LANE: dict[str, Any] = {"steering": "driver", "half_width": 1.75}
+_BEND: dict[str, Any] = {"curvature": (0.01, 0.03), "curve_start": 15.0, "curve_ramp": 10.0}
 
 _MANOEUVRES = (
     Scenario(name="straight", **_DRAWN),
@@ -27,10 +48,7 @@ _MANOEUVRES = (
     ),
     Scenario(
         name="slalom",
-        steering="slalom",
-        onset=(0.5, 1.5),
-        amplitude=(0.04, 0.1),
-        frequency=(0.2, 0.6),
+        **_SLALOM,
         **_DRAWN,
     ),
     Scenario(
@@ -49,32 +67,104 @@ _MANOEUVRES = (
         onset=(0.5, 1.5),
         amplitude=(0.03, 0.1),
         hold=(1.0, 2.0),
-        **_DRAWN,
+        **_HARSH,
     ),
     Scenario(
         name="random-steering",
-        steering="random",
-        onset=(0.0, 1.0),
-        amplitude=(0.01, 0.04),
-        amplitude_2=(0.01, 0.04),
-        frequency=(0.3, 0.4),
-        frequency_2=(0.4, 0.8),
-        frequency_3=(0.2, 0.3),
-        frequency_4=(0.4, 0.6),
+        **_RANDOM,
         **_DRAWN,
     ),
     Scenario(
         name="gust",
-        wind_force=(150.0, 300.0),
+        wind_force=(300.0, 500.0),
         wind_arm=(-0.1, 0.3),
         wind_start=(1.0, 3.0),
         wind_length=(1.0, 4.0),
-        **_DRAWN,
+        **_HARSH,
+    ),
+    Scenario(  # FMVSS 126: 0.7 Hz, and half a second at the second peak
+        name="sine-with-dwell",
+        duration=6.0,
+        steering="sine-with-dwell",
+        onset=(0.5, 1.0),
+        amplitude=(0.05, 0.12),
+        frequency=(0.6, 0.8),
+        hold=0.5,
+        **_HARSH,
+    ),
+    Scenario(  # at half the speed of a passenger car, on a track half as long
+        name="double-lane-change",
+        duration=6.0,
+        path="iso-3888-2",
+        path_speed=(8.0, 10.0),
+        onset=(0.5, 1.0),
+        **(_LANE | {"half_width": 2.0}),
+        **_HARSH,
+    ),
+    Scenario(
+        name="low-friction",
+        duration=6.0,
+        steering="lane-change",
+        onset=(0.5, 1.5),
+        amplitude=(0.03, 0.07),
+        frequency=(0.3, 0.6),
+        **(_HARSH | {"friction": (0.27, 0.35)}),
+    ),
+    Scenario(  # the motors brake; they share their torque with the yaw moment
+        name="brake-in-turn",
+        duration=6.0,
+        steering="held-step",
+        onset=(0.5, 1.0),
+        amplitude=(0.04, 0.1),
+        speed_change=-12.0 * KMH,
+        change_start=2.0,
+        change_length=2.0,
+        **_HARSH,
+    ),
+    Scenario(
+        name="stiffness-step",
+        tyre_change_time=(3.0, 6.0),
+        front_change=(0.7, 1.3),
+        rear_change=(0.7, 1.3),
+        **_RANDOM,
+        **_HARSH,
+    ),
+    Scenario(
+        name="sensor-outage",
+        camera_outage=(3.0, 6.0),
+        gps_outage=(3.0, 6.0),
+        **_SLALOM,
+        **_HARSH,
+    ),
+    Scenario(
+        name="uneven-delay",
+        camera_delays=(0.020, 0.015, 0.010, 0.025),  # uneven-delay, Fig. 5
+        **_RANDOM,
+        **_HARSH,
     ),
 )
 
+# Not scored: what they ask for is a place on the road, which the cost does not judge.
+_ROADS = (
+    Scenario(  # braking as hard as the motors can: the right wheel slips
+        name="split-friction",
+        duration=6.0,
+        speed_change=-18.0 * KMH,
+        change_start=2.0,
+        change_length=2.0,
+        friction_right=(0.2, 0.3),
+        scored=False,
+        **_LANE,
+        **(_HARSH | {"speed": (22.0 * KMH, 30.0 * KMH)}),
+    ),
+    Scenario(  # nobody steers but the controller
+        name="curved-road", half_width=1.75, scored=False, **_BEND, **_HARSH
+    ),
+    Scenario(name="curved-road-driver", scored=False, **_LANE, **_BEND, **_HARSH),
+)
+
 SCENARIOS: dict[str, Scenario] = {
-    scenario.name: scenario for scenario in (*_MANOEUVRES, *SIMULATIONS, *ROAD_TESTS)
+    scenario.name: scenario for scenario in (*_MANOEUVRES, *_ROADS, *SIMULATIONS, *ROAD_TESTS)
 }
 
 

@@ -1,4 +1,4 @@
-"""What a scenario does over time: steering, wind, speed; and its draws, realised from a key.
+"""What a scenario does over time: steering and wind; and its draws, realised from a key.
 
 A scenario names a range for each quantity of `Draws`. `realise` turns a 64-bit key into numbers
 within the ranges and writes them into the packed parameters, in compiled code, so that a batch
@@ -7,17 +7,24 @@ can reset its rows without Python.
 
 from typing import Any, NamedTuple
 
-from .backend import fixed_tuple, floor, inlined, jit, maximum, minimum, select
+from .backend import fixed_tuple, floor, jit, maximum, minimum, select
 from .elementary import PI, sincos, smoothstep
 from .noise import CHANNELS, uniforms
 from .record import TICK
 
-STRAIGHT, SINE, SLALOM, LANE_CHANGE, STEP, RANDOM, DOUBLE_LANE_CHANGE = range(7)
+(
+    STRAIGHT, SINE, SLALOM, LANE_CHANGE, STEP, RANDOM, DOUBLE_LANE_CHANGE, SINE_WITH_DWELL, RAMP,
+    SWEEP, HELD_STEP, DRIVER,
+) = range(12)  # fmt: skip
 STEERING_KINDS = (
     "straight", "sine", "slalom", "lane-change", "step", "random", "double-lane-change",
+    "sine-with-dwell", "ramp", "sweep", "held-step", "driver",
 )  # fmt: skip
 SINES, STEPS = 4, 3
-STEERING_WIDTH = 5 * SINES + 3 * STEPS
+_RAMP_AT = 5 * SINES + 3 * STEPS
+_SWEEP_AT = _RAMP_AT + 3
+STEERING_WIDTH = _SWEEP_AT + 5
+RISE = 0.2  # s, of a step
 FOREVER = 1e15  # ticks
 _ATTEMPTS = 64
 
@@ -36,13 +43,19 @@ class Draws(NamedTuple):
     frequency_2: Any
     frequency_3: Any
     frequency_4: Any
-    hold: Any  # s, of each step; from one lane change to the next
+    hold: Any  # s, of a step, a dwell, a ramp, a sweep; from one lane change to the next
     wind_force: Any  # N
     wind_arm: Any  # m, ahead of the centre of gravity
     wind_start: Any  # s
     wind_length: Any  # s
     side: Any  # uniform in (0, 1): below a half the steering is mirrored
     wind_side: Any
+    curvature: Any  # 1/m, of the road
+    path_speed: Any  # m/s at which a track has its standard's lengths; 0 always
+    friction_right: Any  # 0 as on the left
+    tyre_change_time: Any  # s; 0 never
+    front_change: Any  # factors on the stiffness from then on
+    rear_change: Any
 
 
 DRAWS_WIDTH = len(Draws._fields)
@@ -58,20 +71,6 @@ class Wind(NamedTuple):
     height: Any = 0.0  # m, above the roll axis
 
 
-class Pace(NamedTuple):
-    """The driver's longitudinal work: a speed held or followed by PI, or an acceleration."""
-
-    speed: Any  # m/s, at the start and to hold
-    hold: Any  # 1 hold the speed that `acceleration` and `surge` make of it; 0 apply them alone
-    acceleration: Any  # m/s2, from start to end
-    start: Any  # tick
-    end: Any
-    k_p: Any  # 1/s
-    k_i: Any  # 1/s2
-    surge: Any = 0.0  # m/s2, amplitude of a sine
-    surge_rate: Any = 1.0  # rad/s
-
-
 @jit
 def steering_at(tick: Any, programme: Any) -> Any:
     """The driver's steering command in rad at a tick; `programme` is STEERING_WIDTH numbers."""
@@ -84,6 +83,18 @@ def steering_at(tick: Any, programme: Any) -> Any:
     for i in range(STEPS):
         k = 5 * SINES + 3 * i
         angle = angle + programme[k] * smoothstep((tick - programme[k + 1]) / programme[k + 2])
+    k = _RAMP_AT
+    if programme[k] != 0.0:
+        share = (tick - programme[k + 1]) / programme[k + 2]
+        angle = angle + programme[k] * minimum(maximum(share, 0.0), 1.0)
+    k = _SWEEP_AT
+    if programme[k] != 0.0:
+        t = maximum(tick - programme[k + 3], 0.0) * TICK
+        grown = minimum(t, programme[k + 4])
+        phase = programme[k + 1] * t + programme[k + 2] * (
+            0.5 * grown * grown / programme[k + 4] + (t - grown)
+        )
+        angle = angle + programme[k] * sincos(phase)[0]
     return angle
 
 
@@ -92,28 +103,6 @@ def wind_at(tick: Any, wind: Any) -> Any:
     """(force in N, yaw moment, roll moment in N m) of the wind from this tick to the next."""
     force = select((tick >= wind.start) & (tick < wind.end), wind.force, 0.0)
     return force, force * wind.arm, 0.0 - force * wind.height
-
-
-@inlined
-def acceleration_command(tick: Any, v_x: Any, integral: Any, pace: Any, limit: Any) -> Any:
-    """(a_x command in m/s2, next integral): PI on the speed with the integral held at the limit.
-
-    The wanted speed starts at `pace.speed` and is the integral of the wanted acceleration, which
-    is fed forward.
-    """
-    ahead = select((tick >= pace.start) & (tick < pace.end), pace.acceleration, 0.0)
-    since = (minimum(maximum(tick, pace.start), pace.end) - pace.start) * TICK
-    speed = pace.speed + pace.acceleration * since
-    if pace.surge != 0.0:
-        s, c = sincos(pace.surge_rate * (tick * TICK))
-        ahead = ahead + pace.surge * s
-        speed = speed + pace.surge / pace.surge_rate * (1.0 - c)
-    error = speed - v_x
-    wanted = pace.k_p * error + integral + pace.hold * ahead
-    held = minimum(maximum(wanted, 0.0 - limit), limit)
-    grown = integral + pace.k_i * error * TICK
-    integral = select(wanted == held, grown, integral)
-    return pace.hold * held + (1.0 - pace.hold) * ahead, integral
 
 
 @jit
@@ -128,15 +117,25 @@ def draw(low: Any, high: Any, key_low: int, key_high: int, attempt: int, drawn: 
 
 @jit
 def stable(d: Any, car: Any) -> Any:
-    """Whether the drawn linear vehicle is stable at the drawn speed (with 5 % to spare)."""
+    """Whether the drawn linear vehicle is stable at the drawn speed (with 5 % to spare), before
+    its tyres change and after."""
     C_f, C_r = car.C_f * d.front_stiffness, car.C_r * d.rear_stiffness
+    changes = d.tyre_change_time > 0.0
+    later_f = C_f * select(changes, d.front_change, 1.0)
+    later_r = C_r * select(changes, d.rear_change, 1.0)
+    return _holds(C_f, C_r, d.speed, car) & _holds(later_f, later_r, d.speed, car)
+
+
+@jit
+def _holds(C_f: Any, C_r: Any, speed: Any, car: Any) -> Any:
     excess = C_f * car.l_f - C_r * car.l_r
-    l, v = car.l_f + car.l_r, 1.05 * d.speed  # noqa: E741
+    l, v = car.l_f + car.l_r, 1.05 * speed  # noqa: E741
     return car.m * v * v * excess < 2.0 * C_f * C_r * l * l
 
 
 @jit
-def _ticks(seconds: Any) -> Any:
+def whole_ticks(seconds: Any) -> Any:
+    """Whole ticks of a time in seconds."""
     return floor(seconds / TICK + 0.5)
 
 
@@ -156,33 +155,49 @@ def _step(programme: Any, i: int, amplitude: Any, start: Any, rise: Any) -> None
 
 
 @jit
-def write_steering(kind: int, d: Any, programme: Any) -> None:
-    """Fill the steering programme of a kind from drawn numbers.
+def _dwell(programme: Any, a: Any, hertz: Any, start: Any, dwell: Any) -> None:
+    """Three quarters of a sine, its peak held, and the last quarter."""
+    peak, last = start + whole_ticks(0.75 / hertz), start + whole_ticks(1.0 / hertz)
+    _sine(programme, 0, a, hertz, start, peak)
+    _sine(programme, 1, -a, 0.0, peak, peak + dwell)
+    programme[5 + 2] = 0.5 * PI
+    _sine(programme, 2, a, hertz, peak + dwell, last + dwell)
+    programme[10 + 2] = 2.0 * PI * hertz * ((peak - start) * TICK)
 
-    All but the plain sine leave the car on its old heading: the slalom starts with a half wave of
-    half the amplitude, the step is followed by its mirror image and by straight on, and the sines
-    of a random steering come in pairs whose heading angles cancel.
+
+@jit
+def write_steering(kind: int, d: Any, programme: Any) -> None:
+    """Fill the steering programme of a kind from drawn numbers; a driver's is empty.
+
+    The slalom, the lane changes, the step and the random steering leave the car on its old
+    heading: the slalom starts with a half wave of half the amplitude, the step is followed by its
+    mirror image and by straight on, and the sines of a random steering come in pairs whose heading
+    angles cancel. The sine with dwell stays at its second peak for `hold` (FMVSS 126). The ramp
+    reaches its amplitude after `hold`, the held step after 0.2 s, and both stay there. The sweep
+    goes from `frequency` to `frequency_2` within `hold`, evenly in Hz, and stays at that.
     """
     for i in range(SINES):
         _sine(programme, i, 0.0, 0.0, 0.0, 0.0)
     for i in range(STEPS):
         _step(programme, i, 0.0, 0.0, 1.0)
+    for i in range(_RAMP_AT, STEERING_WIDTH):
+        programme[i] = 0.0
     a = select(d.side < 0.5, -d.amplitude, d.amplitude)
-    start = _ticks(d.onset)
+    start = whole_ticks(d.onset)
     if kind == SINE:
         _sine(programme, 0, a, d.frequency, start, FOREVER)
     elif kind == LANE_CHANGE:
-        _sine(programme, 0, a, d.frequency, start, start + _ticks(1.0 / d.frequency))
+        _sine(programme, 0, a, d.frequency, start, start + whole_ticks(1.0 / d.frequency))
     elif kind == DOUBLE_LANE_CHANGE:
-        back, period = start + _ticks(d.hold), _ticks(1.0 / d.frequency)
+        back, period = start + whole_ticks(d.hold), whole_ticks(1.0 / d.frequency)
         _sine(programme, 0, a, d.frequency, start, start + period)
         _sine(programme, 1, -a, d.frequency, back, back + period)
     elif kind == SLALOM:
-        half = start + _ticks(0.5 / d.frequency)
+        half = start + whole_ticks(0.5 / d.frequency)
         _sine(programme, 0, 0.5 * a, d.frequency, start, half)
         _sine(programme, 1, -a, d.frequency, half, FOREVER)
     elif kind == STEP:
-        length, rise = _ticks(d.hold), _ticks(0.2)
+        length, rise = whole_ticks(d.hold), whole_ticks(RISE)
         _step(programme, 0, a, start, rise)
         _step(programme, 1, -2.0 * a, start + length, rise)
         _step(programme, 2, a, start + 2.0 * length, rise)
@@ -194,6 +209,18 @@ def write_steering(kind: int, d: Any, programme: Any) -> None:
         _sine(
             programme, 3, -second * (d.frequency_4 / d.frequency_3), d.frequency_4, start, FOREVER
         )
+    elif kind == SINE_WITH_DWELL:
+        _dwell(programme, a, d.frequency, start, whole_ticks(d.hold))
+    elif kind == RAMP:
+        k = _RAMP_AT
+        programme[k], programme[k + 1], programme[k + 2] = a, start, whole_ticks(d.hold)
+    elif kind == SWEEP:
+        k = _SWEEP_AT
+        programme[k], programme[k + 1] = a, 2.0 * PI * d.frequency
+        programme[k + 2] = 2.0 * PI * (d.frequency_2 - d.frequency)
+        programme[k + 3], programme[k + 4] = start, d.hold
+    elif kind == HELD_STEP:
+        _step(programme, 0, a, start, whole_ticks(RISE))
 
 
 @jit

@@ -2,21 +2,49 @@
 
 from typing import Any
 
-from .backend import fixed_tuple, floor, jit, select
+from .backend import fixed_tuple, jit, select
 from .delivery import FAR, sense, store
+from .driver import Driver, wanted_angle
 from .dynamics import Car, Motion, Road, gravity_at, sideslip_angle
 from .layout import P, Z
 from .noise import CHANNELS, normals
-from .programme import STEERING_WIDTH, realise, steering_at, write_steering
-from .record import CAMERA, FAST, PACKET, PACKET_WIDTH, TICK
+from .programme import (
+    DRIVER,
+    FOREVER,
+    STEERING_WIDTH,
+    realise,
+    steering_at,
+    whole_ticks,
+    write_steering,
+)
+from .record import CAMERA, FAST, PACKET, PACKET_WIDTH
 from .reference import Target, reference
 from .sensors import IN_FLIGHT, NEVER, Link, clock_phase
 from .summary import observe, write_report
 from .switches import REPORT
+from .tracks import Path, laid
 from .vehicle import GRAVITY
 
 _CAR, _MOTION, _LINK, _TARGET = (len(each._fields) for each in (Car, Motion, Link, Target))
-_ROAD = len(Road._fields)
+_ROAD, _DRIVER, _PATH = (len(each._fields) for each in (Road, Driver, Path))
+
+
+@jit
+def _write_surroundings(p: Any, d: Any) -> None:
+    """Friction, wind, the road's curvature and the path from what was drawn."""
+    mirrored = d.side < 0.5
+    right = select(d.friction_right > 0.0, d.friction_right, d.friction)
+    p[P.car + 10] = select(mirrored, right, d.friction)
+    p[P.car + 19] = select(mirrored, d.friction, right)
+    p[P.wind] = select(d.wind_side < 0.5, -d.wind_force, d.wind_force)
+    p[P.wind + 1] = d.wind_arm
+    p[P.wind + 2] = whole_ticks(d.wind_start)
+    p[P.wind + 3] = p[P.wind + 2] + whole_ticks(d.wind_length)
+    p[P.road] = select(mirrored, 0.0 - d.curvature, d.curvature)
+    scaled = d.path_speed > 0.0
+    scale = select(scaled, d.speed, 1.0) / select(scaled, d.path_speed, 1.0)
+    path = Path(*fixed_tuple(p[P.path :], _PATH))
+    store(p, P.path, laid(path, d.onset * d.speed, scale, select(mirrored, -1.0, 1.0)))
 
 
 @jit
@@ -47,12 +75,10 @@ def reset_vehicle(
     d, redraws = realise(low, high, key_low, key_high, Car(*fixed_tuple(p, _CAR)), drawn)
     p[P.car + 4] = p[P.car + 4] * d.front_stiffness
     p[P.car + 5] = p[P.car + 5] * d.rear_stiffness
-    p[P.car + 10] = d.friction
+    change = select(d.tyre_change_time > 0.0, whole_ticks(d.tyre_change_time), FOREVER)
+    store(p, P.change, (change, d.front_change, d.rear_change))
     write_steering(switches[3], d, p[P.steering :])
-    p[P.wind] = select(d.wind_side < 0.5, -d.wind_force, d.wind_force)
-    p[P.wind + 1] = d.wind_arm
-    p[P.wind + 2] = floor(d.wind_start / TICK + 0.5)
-    p[P.wind + 3] = p[P.wind + 2] + floor(d.wind_length / TICK + 0.5)
+    _write_surroundings(p, d)
     p[P.pace] = d.speed
     for i in range(Z.end):
         z[i] = 0.0
@@ -64,7 +90,16 @@ def reset_vehicle(
             z[Z.motion + i] = start[i]
     z[Z.sky] = p[P.sky + 1] * normals(key_low, key_high, 0, CHANNELS.sky)[1]
     n = normals(key_low, key_high, 0, CHANNELS.initial)
-    z[Z.drive + 2] = steering_at(0.0, fixed_tuple(p[P.steering :], STEERING_WIDTH))
+    road = Road(*fixed_tuple(p[P.road :], _ROAD))
+    motion = Motion(*fixed_tuple(z[Z.motion :], _MOTION))
+    target = Target(*fixed_tuple(p[P.target :], _TARGET))
+    steer = steering_at(0.0, fixed_tuple(p[P.steering :], STEERING_WIDTH))
+    if switches[3] == DRIVER:
+        person = Driver(*fixed_tuple(p[P.driver :], _DRIVER))
+        path = Path(*fixed_tuple(p[P.path :], _PATH))
+        steer = wanted_angle(motion, path, road, target, person, p[P.task + 7])
+    z[Z.drive + 2] = steer
+    z[Z.driver] = steer
     z[Z.drive + 4] = p[P.disturbance] * n[0]
     z[Z.drive + 5] = p[P.disturbance + 1] * n[1]
     store(z, Z.clock, (key_low * 1.0, key_high * 1.0, 0.0, 0.0, redraws * 1.0, FAR))
@@ -73,18 +108,14 @@ def reset_vehicle(
         link = Link(*fixed_tuple(p[P.camera if sensor == CAMERA else P.gps :], _LINK))
         z[at + 1] = select(link.period > 0.0, clock_phase(link, key_low, key_high, sensor), NEVER)
         z[at + 2] = NEVER
-    motion = Motion(*fixed_tuple(z[Z.motion :], _MOTION))
     beta = sideslip_angle(motion.v_x, motion.v_y, switches[0])
-    steer = z[Z.drive + 2]
     fast = normals(key_low, key_high, 0, CHANNELS.inertial)
     wheels = normals(key_low, key_high, 0, CHANNELS.wheels)
     inputs = (steer, 0.0, 0.0, steer, 0.0)
-    road = Road(*fixed_tuple(p[P.road :], _ROAD))
     g_x, g_y = gravity_at(motion, road, switches[0])
     accel = (g_x, g_y + GRAVITY * motion.phi)
     count = sense(p, z, motion, switches[0], accel, inputs, rows, 0, packets, 0, fast, wheels)
     v = 0.5 * (rows[0, FAST.wheel_left] + rows[0, FAST.wheel_right])
-    target = Target(*fixed_tuple(p[P.target :], _TARGET))
     refs = reference(steer, v, target, switches[2])
     if switches[4]:  # every sample of the step is asked for: tick 0 stands for all of them
         for j in range(1, len(rows)):

@@ -1,7 +1,6 @@
 """A manoeuvre is data: named, frozen, JSON-able."""
 
 import dataclasses
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -9,35 +8,45 @@ from typing import Any
 import numpy as np
 
 from .layout import Array
-from .programme import DRAWS_WIDTH, STEERING_KINDS, Draws
-from .sensors import HDOP_LAWS, Noise
+from .programme import DRAWS_WIDTH, Draws
+from .scenario_checks import SIDES, check
 
 Range = float | tuple[float, float]
 """A number, or the (low, high) that the seed draws from uniformly."""
 
 KMH = 1.0 / 3.6
-SHORTEST_GPS_PERIOD = 0.05  # s; an env keeps room for its packets
 
 
 @dataclass(frozen=True, kw_only=True)
 class Scenario:
     """What happens in an episode. Ranges are drawn by the seed; SI units.
 
-    Driver: steering is a kind of `STEERING_KINDS`, built from onset, amplitude, frequency (random:
-    two pairs of sines) and hold (of a step, or from one lane change to the next). mirror: the seed
-    draws the side of steering and wind. acceleration: None holds the speed. speed_change: m/s by
-    which the held speed changes at an even rate, from change_start over change_length. surge,
-    surge_frequency: a sine of the driver's acceleration, which the held speed follows.
+    Steering is a kind of `STEERING_KINDS`, built from onset, amplitude, frequency (random: two
+    pairs of sines; sweep: to frequency_2) and hold (of a step, a dwell, a ramp or a sweep, or from
+    one lane change to the next). mirror: the seed draws the side of steering, track, bend and
+    friction_right, and that of the wind.
+
+    The steering "driver" keeps to a path of `PATHS` (`driver.py`): the road's centre line, or a
+    track that begins where the car is at the onset, for the vehicle's width; path_speed: m/s at
+    which it has its standard's lengths, which grow with the speed driven (None: at every speed).
+    driver_preview (s), driver_gain, driver_lag (s) and driver_rate (rad/s at the wheels). An
+    episode ends where the car is half_width off the path (without a driver, off the road's centre
+    line).
+
+    acceleration: None holds the speed. speed_change: m/s by which the held speed changes at an
+    even rate, from change_start over change_length. surge, surge_frequency: a sine of the driver's
+    acceleration, which the held speed follows.
 
     Car: front_stiffness and rear_stiffness are factors on the vehicle's; draws that make the car
-    unstable at the drawn speed are drawn again and counted. vehicle and nominal: parameters that
+    unstable at the drawn speed are drawn again and counted. From tyre_change_time (s, None: never)
+    on front_change and rear_change are further factors. vehicle and nominal: parameters that
     replace those of the env. small_angle, linear_tyres, lags, roll: the plant.
 
-    Surroundings: friction is the road's and replaces the vehicle's. curvature, bank (rad, left side
-    up) and grade (rad, uphill) come in from curve_start over curve_ramp metres; a negative
-    curve_start has them from the beginning. wind_*: a side wind, wind_arm ahead of the centre of
-    gravity and wind_height above the roll axis. disturbance_*: an Ornstein-Uhlenbeck force and
-    moment.
+    Surroundings: friction is the road's and replaces the vehicle's; friction_right, if given, is
+    that under the right wheels. curvature, bank (rad, left side up) and grade (rad, uphill) come
+    in from curve_start over curve_ramp metres; a negative curve_start has them from the beginning.
+    wind_*: a side wind, wind_arm ahead of the centre of gravity and wind_height above the roll
+    axis. disturbance_*: an Ornstein-Uhlenbeck force and moment.
 
     Sensors: noise replaces the default. camera_delays: a repeating pattern that replaces the id's,
     and camera_jitter with it; gps_period and gps_delays likewise. hdop, hdop_spread, hdop_time:
@@ -61,6 +70,12 @@ class Scenario:
     frequency_4: Range = 0.5
     hold: Range = 1.5
     mirror: bool = False
+    path: str = "road"
+    path_speed: Range | None = None
+    driver_preview: float = 1.0
+    driver_gain: float = 1.0
+    driver_lag: float = 0.15
+    driver_rate: float = 0.8
     speed: Range = 25.0 * KMH
     acceleration: float | None = None
     speed_change: float = 0.0
@@ -69,8 +84,12 @@ class Scenario:
     surge: float = 0.0
     surge_frequency: float = 0.1
     friction: Range = 0.9
+    friction_right: Range | None = None
     front_stiffness: Range = 1.0
     rear_stiffness: Range = 1.0
+    tyre_change_time: Range | None = None
+    front_change: Range = 1.0
+    rear_change: Range = 1.0
     wind_force: Range = 0.0
     wind_arm: Range = 0.0
     wind_start: Range = 0.0
@@ -79,7 +98,7 @@ class Scenario:
     disturbance_force: float = 50.0
     disturbance_moment: float = 20.0
     disturbance_time: float = 0.3
-    curvature: float = 0.0
+    curvature: Range = 0.0
     curve_start: float = 20.0
     curve_ramp: float = 20.0
     bank: float = 0.0
@@ -109,52 +128,13 @@ class Scenario:
             value = getattr(self, entry.name)
             if isinstance(value, list):
                 object.__setattr__(self, entry.name, tuple(value))
-        for value, known, what in (
-            (self.steering, STEERING_KINDS, "steering"),
-            (self.hdop_law, HDOP_LAWS, "hdop_law"),
-        ):
-            if value not in known:
-                self._refuse(f"unknown {what} {value!r}; known: {', '.join(known)}")
-        if not (self.duration > 0.0 and math.isfinite(self.duration)):
-            self._refuse(f"duration {self.duration!r} s")
-        unknown = sorted(set(self.noise) - set(Noise._fields))
-        if unknown:
-            self._refuse(f"unknown noise {', '.join(unknown)}")
-        for name in Draws._fields:
-            if name in _SIDES:
-                continue
-            low, high = self.range(name)
-            if not (math.isfinite(low) and math.isfinite(high) and low <= high):
-                self._refuse(f"{name} {getattr(self, name)!r}")
-        numbers = {name: getattr(self, name) for name in _NUMBERS} | dict(self.noise)
-        for name, value in (numbers | {"acceleration": self.acceleration or 0.0}).items():
-            if not math.isfinite(value):
-                self._refuse(f"{name} {value!r} is not finite")
-        for name in ("frequency", "frequency_3", "front_stiffness", "rear_stiffness", "friction"):
-            if self.range(name)[0] <= 0.0:
-                self._refuse(f"{name} must be positive")
-        for name in _POSITIVE:
-            if not getattr(self, name) > 0.0:
-                self._refuse(f"{name} must be positive, got {getattr(self, name)!r}")
-        if self.range("speed")[0] < 0.0 or self.range("speed")[0] + self.speed_change < 0.0:
-            self._refuse("speed must not be negative, with speed_change or without")
-        if self.acceleration is not None and (self.speed_change or self.surge):
-            self._refuse("speed_change and surge need the held speed (acceleration None)")
-        if not 0.0 <= self.hdop_spread <= 1.0:
-            self._refuse(f"hdop_spread is 0 to 1, got {self.hdop_spread!r}")
-        if self.gps_period is not None and not self.gps_period >= SHORTEST_GPS_PERIOD:
-            self._refuse(f"gps_period is {SHORTEST_GPS_PERIOD} s or more, got {self.gps_period!r}")
-        if self.camera_jitter and self.camera_delays is None:
-            self._refuse("camera_jitter needs camera_delays")
-        if max(abs(self.bank), abs(self.grade)) > 0.5:
-            self._refuse(f"bank and grade are up to 0.5 rad, got {self.bank!r}, {self.grade!r}")
-
-    def _refuse(self, message: str) -> None:
-        raise ValueError(f"scenario {self.name!r}: {message}")
+        check(self)
 
     def range(self, name: str) -> tuple[float, float]:
-        """(low, high) of a drawn quantity."""
+        """(low, high) of a drawn quantity; zeros where it is None."""
         value = getattr(self, name)
+        if value is None:
+            return 0.0, 0.0
         if isinstance(value, tuple):
             low, high = value
             return float(low), float(high)
@@ -164,7 +144,7 @@ class Scenario:
         """(low, high) of every quantity of `Draws`, each (len(Draws),)."""
         low, high = np.empty(DRAWS_WIDTH), np.empty(DRAWS_WIDTH)
         for i, name in enumerate(Draws._fields):
-            if name in _SIDES:
+            if name in SIDES:
                 low[i], high[i] = (0.0, 1.0) if self.mirror else (1.0, 1.0)
             else:
                 low[i], high[i] = self.range(name)
@@ -194,34 +174,3 @@ class Scenario:
                     dict(value) if mapping else list(value) if isinstance(value, tuple) else value
                 )
         return kept
-
-
-_SIDES = ("side", "wind_side")
-_NUMBERS = (
-    "disturbance_force",
-    "disturbance_moment",
-    "disturbance_time",
-    "curvature",
-    "curve_start",
-    "curve_ramp",
-    "speed_change",
-    "change_start",
-    "change_length",
-    "surge",
-    "surge_frequency",
-    "wind_height",
-    "bank",
-    "grade",
-    "half_width",
-    "hdop",
-    "hdop_time",
-)
-_POSITIVE = (
-    "disturbance_time",
-    "curve_ramp",
-    "half_width",
-    "change_length",
-    "surge_frequency",
-    "hdop",
-    "hdop_time",
-)

@@ -5,7 +5,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from .record import SlowSensor
-from .scenario import SHORTEST_GPS_PERIOD, Scenario
+from .scenario import Scenario
+from .scenario_checks import SHORTEST_GPS_PERIOD
 from .sensors import IN_FLIGHT, ticks
 
 CAMERA_33_30 = SlowSensor(period=0.033, delays=(0.030,))

@@ -260,16 +260,15 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
 
     @property
     def vehicle(self) -> Vehicle:
-        """The true vehicle of this episode, with what the seed drew."""
+        """The true vehicle now, with what the seed drew; friction is the mean of both sides'."""
         car = self._params
-        return (
-            self._now.vehicle.replace(
-                front_stiffness=float(car[P.car + 4]),
-                rear_stiffness=float(car[P.car + 5]),
-                friction=float(car[P.car + 10]),
-            )
-            if car[P.car] > 0.0
-            else self._now.vehicle
+        if car[P.car] == 0.0:
+            return self._now.vehicle
+        changed = self._state[Z.clock + 2] >= car[P.change]
+        return self._now.vehicle.replace(
+            front_stiffness=float(car[P.car + 4] * (car[P.change + 1] if changed else 1.0)),
+            rear_stiffness=float(car[P.car + 5] * (car[P.change + 2] if changed else 1.0)),
+            friction=float(0.5 * (car[P.car + 10] + car[P.car + 19])),
         )
 
     @property

@@ -7,14 +7,17 @@ import numpy as np
 import numpy.typing as npt
 
 from .actuators import lag_of
+from .driver import Driver
 from .dynamics import Car, Road
-from .layout import Array, Disturbance, P, Task
-from .programme import FOREVER, STEERING_KINDS, STEERING_WIDTH, Pace, Wind
+from .layout import Array, Change, Disturbance, P, Task
+from .pace import Pace
+from .programme import FOREVER, STEERING_KINDS, STEERING_WIDTH, Wind
 from .record import TICK, SlowSensor
 from .reference import REFERENCES, target_of
 from .scenario import Scenario
 from .sensors import HDOP_LAWS, Link, Noise, Sky, link_of, ticks
 from .switches import Switches
+from .tracks import path_of
 from .tyres import FIALA, LINEAR
 from .vehicle import GRAVITY, Vehicle
 
@@ -69,6 +72,7 @@ def car_of(vehicle: Vehicle) -> Car:
         vehicle.gravity_height,
         vehicle.antenna_ahead,
         vehicle.antenna_left,
+        vehicle.friction,
     )
 
 
@@ -90,7 +94,7 @@ def _pace_of(scenario: Scenario) -> Pace:
 def _road_of(scenario: Scenario) -> Road:
     """Curvature, bank and grade of the road."""
     return Road(
-        scenario.curvature,
+        0.0,  # drawn
         scenario.curve_start,
         scenario.curve_ramp,
         GRAVITY * math.sin(scenario.bank),
@@ -158,6 +162,14 @@ def template_of(
         ),
         (0.0,) * STEERING_WIDTH,
         _sky_of(scenario, gps),
+        Driver(
+            scenario.driver_preview,
+            scenario.driver_gain,
+            lag_of(scenario.driver_lag, TICK).end,
+            scenario.driver_rate * TICK,
+        ),
+        path_of(scenario.path, vehicle.width),
+        Change(FOREVER, 1.0, 1.0),  # drawn
     )
     params = np.array([value for part in parts for value in part], dtype=np.float64)
     assert len(params) == P.end

@@ -35,7 +35,8 @@ class Load(NamedTuple):
     slope_f: Any  # C / 3 F_max of the same tyres, 1/tan
     slope_l: Any
     slope_r: Any
-    rear: Any  # N, capacity of a rear tyre in all directions, standing
+    rear_l: Any  # N, capacity of the left and the right rear tyre in all directions, standing
+    rear_r: Any
     F_l: Any  # N, what the left and the right motor ask for
     F_r: Any
 
@@ -48,17 +49,22 @@ def _capacity(limit: Any, drive: Any) -> Any:
 
 @jit
 def load_of(inputs: Any, car: Any, small_angle: int) -> Any:
-    """The Load of the Inputs of one instant."""
+    """The Load of the Inputs of one instant.
+
+    The road may grip less on one side: each rear tyre has its own, which its motor feels; the
+    front tyres share the mean.
+    """
     weight = car.m * GRAVITY / (2.0 * (car.l_f + car.l_r))
-    front, rear = car.mu * weight * car.l_r, car.mu * weight * car.l_f
+    front = 0.5 * (car.mu + car.mu_r) * weight * car.l_r
+    rear_l, rear_r = car.mu * weight * car.l_f, car.mu_r * weight * car.l_f
     asked_l, asked_r = inputs.T_l * (1.0 / car.r), inputs.T_r * (1.0 / car.r)
     F_l, F_r = asked_l, asked_r
     s, c = sincos(inputs.delta_f)
-    left, right = rear, rear
+    left, right = rear_l, rear_r
     if not small_angle:
-        F_l = minimum(maximum(F_l, 0.0 - rear), rear)
-        F_r = minimum(maximum(F_r, 0.0 - rear), rear)
-        left, right = _capacity(rear, F_l), _capacity(rear, F_r)
+        F_l = minimum(maximum(F_l, 0.0 - rear_l), rear_l)
+        F_r = minimum(maximum(F_r, 0.0 - rear_r), rear_r)
+        left, right = _capacity(rear_l, F_l), _capacity(rear_r, F_r)
     return Load(
         s,
         c,
@@ -71,7 +77,8 @@ def load_of(inputs: Any, car: Any, small_angle: int) -> Any:
         car.C_f / (3.0 * front),
         car.C_r / (3.0 * left),
         car.C_r / (3.0 * right),
-        rear,
+        rear_l,
+        rear_r,
         asked_l,
         asked_r,
     )
@@ -142,7 +149,7 @@ def tyre_forces(
         F_yf = lateral_force(t_f, load.limit_f * narrow, per * wide, law) + lateral_force(
             t_f, load.limit_f * wide, per * narrow, law
         )
-        rear_l, rear_r = load.rear * (1.0 - e_r), load.rear * (1.0 + e_r)
+        rear_l, rear_r = load.rear_l * (1.0 - e_r), load.rear_r * (1.0 + e_r)
         F_l = minimum(maximum(load.F_l, 0.0 - rear_l), rear_l)
         F_r = minimum(maximum(load.F_r, 0.0 - rear_r), rear_r)
         left, right = _capacity(rear_l, F_l), _capacity(rear_r, F_r)

@@ -50,6 +50,7 @@ class Vehicle:
     steering_rate: float = _unit("rad/s", "how fast the added angle may change", 0.8)
     preview: float = _unit("m", "l_pre, the camera's preview distance", 5.135)
     friction: float = _unit("-", "mu, tyre to road (a scenario has its own)", 0.9)
+    width: float = _unit("m", "over all; the lanes of test tracks go by it", 1.8)
     sprung_mass: float = _unit("kg", "M_s, the part of the mass that rolls")
     roll_arm: float = _unit("m", "h_s, centre of gravity above the roll axis")
     roll_inertia: float = _unit("kg m2", "I_x, about the roll axis")
@@ -143,6 +144,7 @@ COMS = Vehicle(  # Table I of tie-vision; front track, height of the centre and 
     wheel_radius=0.22,
     gravity_height=0.45,
     motor_torque=100.0,
+    width=1.095,  # the maker's
     sprung_mass=300.0,
     roll_arm=0.35,
     roll_inertia=60.0,

@@ -9,7 +9,7 @@ from scipy import stats
 
 from sideslip.envs import SlowSensor, StabilityEnv
 from sideslip.envs.record import CAMERA, GPS, PACKET
-from sideslip.envs.scenario import SHORTEST_GPS_PERIOD
+from sideslip.envs.scenario_checks import SHORTEST_GPS_PERIOD
 from sideslip.envs.sensor_sets import SENSOR_SETS
 from sideslip.envs.sensors import IN_FLIGHT, link_of
 

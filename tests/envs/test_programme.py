@@ -8,15 +8,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sideslip.envs import COMS, FAILURES, StabilityEnv, critical_speed
+from sideslip.envs.pace import Pace, acceleration_command
 from sideslip.envs.programme import (
     DRAWS_WIDTH,
     FOREVER,
     STEERING_KINDS,
     STEERING_WIDTH,
     Draws,
-    Pace,
     Wind,
-    acceleration_command,
     stable,
     steering_at,
     wind_at,

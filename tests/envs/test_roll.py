@@ -202,7 +202,7 @@ def test_rear_tyres_stay_within_the_friction_circle_of_their_own_load(
     load = load_of(Inputs(0.0, T_l, T_r), CAR, 0)
     _, F_yr, F_x, N_z = tyre_forces(state, load, CAR, 0.0, 0, FIALA, 1)
     share = load_transfer(state, CAR, 0.0)[1]
-    left, right = load.rear * (1.0 - share), load.rear * (1.0 + share)
+    left, right = load.rear_l * (1.0 - share), load.rear_r * (1.0 + share)
     F_l, F_r = 0.5 * F_x - N_z / CAR.d_r, 0.5 * F_x + N_z / CAR.d_r
     assert abs(F_l) <= left * (1.0 + 1e-12)
     assert abs(F_r) <= right * (1.0 + 1e-12)
@@ -211,7 +211,7 @@ def test_rear_tyres_stay_within_the_friction_circle_of_their_own_load(
         max(math.sqrt(max(limit**2 - F**2, 0.0)), 0.05 * limit)
         for limit, F in ((left, F_l), (right, F_r))
     )
-    assert abs(F_yr) <= most + 1e-6 * load.rear
+    assert abs(F_yr) <= most + 1e-6 * load.rear_l
 
 
 def test_wind_at_a_height_pushes_the_body_over() -> None:

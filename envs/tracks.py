@@ -1,0 +1,117 @@
+"""Test tracks between cones, as lanes along a road and as the path a driver takes through them.
+
+ISO 3888-1 (double lane change) and ISO 3888-2 (obstacle avoidance) give fixed lengths and lane
+widths that grow with the vehicle's width, so a narrow car has narrow lanes and less far to go
+sideways. For the passenger car the lengths are the standards'. A car built for lower speeds drives
+them shortened in proportion to its speed (`scale`): the time in each section stays the same, and
+with it the lateral acceleration that the track asks for.
+
+ISO 3888-1's lane offset of 3.5 m is read as that between the right edges of the lanes; the last
+lane's right edge lies in line with the first one's in both.
+"""
+
+from collections.abc import Callable
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+from .backend import jit
+from .elementary import smoothstep
+
+LEAD = 0.2  # of a gap's length: how far the path's transition reaches into the lanes beside it
+
+
+class Section(NamedTuple):
+    """A lane between cones."""
+
+    start: float  # m, along the road
+    length: float  # m
+    width: float  # m, between the cones
+    offset: float  # m, its centre line to the left of the road's
+
+
+class Path(NamedTuple):
+    """A lateral offset from the road's centre line: two smooth transitions."""
+
+    shift_1: Any  # m, to the left
+    start_1: Any  # m, along the road
+    length_1: Any  # m
+    shift_2: Any
+    start_2: Any
+    length_2: Any
+
+
+def _iso_3888_1(width: float) -> tuple[Section, ...]:
+    first, side, last = 1.1 * width + 0.25, 1.2 * width + 0.25, 1.3 * width + 0.25
+    return (
+        Section(0.0, 15.0, first, 0.0),
+        Section(45.0, 25.0, side, 3.5 + 0.5 * (side - first)),
+        Section(95.0, 30.0, last, 0.5 * (last - first)),  # sections 5 and 6
+    )
+
+
+def _iso_3888_2(width: float) -> tuple[Section, ...]:
+    first, side, last = 1.1 * width + 0.25, width + 1.0, max(1.3 * width + 0.25, 3.0)
+    return (
+        Section(0.0, 12.0, first, 0.0),
+        Section(25.5, 11.0, side, 1.0 + 0.5 * (first + side)),  # 1 m from edge to edge
+        Section(49.0, 12.0, last, 0.5 * (last - first)),
+    )
+
+
+_TRACKS: dict[str, Callable[[float], tuple[Section, ...]]] = {
+    "iso-3888-1": _iso_3888_1,
+    "iso-3888-2": _iso_3888_2,
+}
+PATHS = ("road", *_TRACKS)
+
+
+def sections(
+    track: str, width: float, start: float = 0.0, scale: float = 1.0, side: float = 1.0
+) -> tuple[Section, ...]:
+    """The lanes of a track for a vehicle's width in m, in the order of driving.
+
+    start: m, where the first begins. scale: of the lengths. side: -1 mirrors the track. The road
+    itself has none. Raises ValueError for an unknown track.
+    """
+    if track not in PATHS:
+        raise ValueError(f"unknown track {track!r}; known: {', '.join(PATHS)}")
+    lanes = _TRACKS[track](width) if track in _TRACKS else ()
+    return tuple(
+        Section(start + scale * each.start, scale * each.length, each.width, side * each.offset)
+        for each in lanes
+    )
+
+
+def path_of(track: str, width: float) -> Path:
+    """The path through a track that begins at 0, in the standard's lengths.
+
+    It keeps to the centre of a lane but for the last fifth of the next gap's length, where it
+    begins to turn, and the first fifth of that before: there the car's side still is in the lane.
+    """
+    shifts = []
+    lanes = sections(track, width)
+    for before, after in pairwise(lanes):
+        left = before.start + before.length
+        gap = after.start - left
+        shifts += [after.offset - before.offset, left - LEAD * gap, (1.0 + 2.0 * LEAD) * gap]
+    return Path(*(shifts or (0.0, 0.0, 1.0, 0.0, 0.0, 1.0)))
+
+
+@jit
+def laid(path: Any, start: Any, scale: Any, side: Any) -> Any:
+    """The path of a track that begins at `start` m, its lengths scaled, mirrored by side -1."""
+    return Path(
+        side * path.shift_1,
+        start + scale * path.start_1,
+        scale * path.length_1,
+        side * path.shift_2,
+        start + scale * path.start_2,
+        scale * path.length_2,
+    )
+
+
+@jit
+def path_offset(path: Any, s: Any) -> Any:
+    """The path's lateral offset in m at the distance s; its slope is continuous."""
+    first = path.shift_1 * smoothstep((s - path.start_1) / path.length_1)
+    return first + path.shift_2 * smoothstep((s - path.start_2) / path.length_2)
