@@ -3,31 +3,34 @@
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from .dynamics import Motion
+from .layout import Array, Entry, observation_layout
 from .manoeuvres import scenario_from
 from .record import SlowSensor
 from .scenario import Scenario
-from .sensor_sets import SENSOR_SETS, in_scenario, with_changes
+from .sensor_sets import SENSOR_SETS, in_scenario, most_packets, with_changes
 from .template import Template, template_of
 from .vehicle import Vehicle, vehicle_from
 
-_OPTIONS = ("scenario", "vehicle", "friction", "state", "duration")
+OPTIONS = ("scenario", "vehicle", "friction", "state", "duration")
 
 
 @dataclass(frozen=True)
 class Setting:
-    """The arguments of an environment that hold for all its episodes; `StabilityEnv` says what
-    they mean. `nominal` None: the vehicle.
+    """The arguments of an environment, which hold for all its episodes but for options of reset;
+    `StabilityEnv` says what they mean.
 
     Raises TypeError or ValueError for an argument out of place.
     """
 
     sensors: str
+    scenario: Scenario
     vehicle: Vehicle
     nominal: Vehicle
     control_period: int
@@ -60,6 +63,32 @@ class Setting:
         changes = {"camera": self.camera, "gps": self.gps}
         return with_changes(SENSOR_SETS[self.sensors], changes)
 
+    @cached_property
+    def layout(self) -> tuple[Entry, ...]:
+        """The entries of an observation."""
+        return observation_layout(tuple(self.slow), int(self.control_period), self.fast)
+
+    @cached_property
+    def bounds(self) -> Array:
+        """Their bounds, (2, len(layout))."""
+        return np.array([[entry.low, entry.high] for entry in self.layout]).T.copy()
+
+    @property
+    def room(self) -> int:
+        """The most packets of a step."""
+        n = int(self.control_period)
+        return sum(most_packets(sensor, n) for sensor in self.slow.values())
+
+    @property
+    def action_width(self) -> int:
+        """The numbers of an action."""
+        return 2 if self.steering else 1
+
+    @cached_property
+    def base(self) -> Template:
+        """What an episode without options starts from."""
+        return self.template(self.scenario, self.vehicle)
+
     def template(self, scenario: Scenario, vehicle: Vehicle) -> Template:
         """What an episode of a scenario with a true vehicle starts from."""
         return template_of(
@@ -73,20 +102,20 @@ class Setting:
             self.on_bad_action == "fail",
         )
 
-    def optioned(
-        self, scenario: Scenario, options: Mapping[str, Any]
-    ) -> tuple[Template, npt.NDArray[np.float64]]:
+    def optioned(self, options: Mapping[str, Any]) -> tuple[Template, npt.NDArray[np.float64]]:
         """The template of one episode with options of reset, and its start.
 
-        scenario: what is driven without the option. Returns a template and a Motion's numbers, NaN
-        where the option `state` says nothing. Raises ValueError for an unknown option or state.
+        Returns a template and a Motion's numbers, NaN where the option `state` says nothing.
+        Raises ValueError for an unknown option or state.
         """
-        unknown = sorted(set(options) - set(_OPTIONS))
+        if not options:
+            return self.base, np.full(len(Motion._fields), np.nan)
+        unknown = sorted(set(options) - set(OPTIONS))
         if unknown:
             raise ValueError(
-                f"unknown reset option {', '.join(unknown)}; known: {', '.join(_OPTIONS)}"
+                f"unknown reset option {', '.join(unknown)}; known: {', '.join(OPTIONS)}"
             )
-        scenario = scenario_from(options.get("scenario", scenario))
+        scenario = scenario_from(options.get("scenario", self.scenario))
         vehicle = vehicle_from(options.get("vehicle", self.vehicle))
         if "friction" in options:
             scenario = scenario.replace(friction=float(options["friction"]))

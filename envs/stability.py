@@ -1,7 +1,6 @@
 """StabilityEnv: the Gymnasium environment of a car that its yaw moment and steering stabilise."""
 
 import copy
-import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
@@ -11,15 +10,14 @@ import numpy.typing as npt
 from gymnasium.error import ResetNeeded
 
 from .dynamics import Motion
+from .episode import info_of, motion_in, record_in, slow_in, vehicle_in
 from .kernel import step_vehicle
-from .layout import Entry, P, Z, observation_layout
+from .layout import Entry, P, Z
 from .manoeuvres import scenario_from
 from .programme import DRAWS_WIDTH
-from .record import FAST_WIDTH, PACKET_WIDTH, SLOW_NAMES, TICK, Record, SlowSensor
+from .record import FAST_WIDTH, PACKET_WIDTH, TICK, Record, SlowSensor
 from .restart import reset_vehicle
 from .scenario import Scenario
-from .sensor_sets import most_packets
-from .sensors import ticks
 from .setting import Setting
 from .switches import REFUSED, REPORT, RUNNING
 from .vehicle import Vehicle, vehicle_from
@@ -35,7 +33,7 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
     as a share of its full scale (0.1 rad, positive to the left; at most 0.8 rad/s, and within the
     stop of the front wheels). Zero is the uncontrolled car. Values outside are clipped. A
     non-finite action or a wrong shape raises ValueError and steps nothing; with
-    `on_bad_action="fail"` a non-finite action ends the episode as a failure.
+    `on_bad_action="fail"` it ends the episode as a failure.
 
     ## Observation
     A float32 summary whose length does not depend on the control period. `layout` gives name,
@@ -112,6 +110,7 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
         car = vehicle_from(vehicle)
         self.setting = Setting(
             sensors,
+            scenario_from(scenario),
             car,
             car if nominal is None else vehicle_from(nominal),
             control_period,
@@ -123,22 +122,19 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
             steering,
             on_bad_action,
         )
-        slow, n = self.setting.slow, int(control_period)
-        self.control_period, self.reference = n, reference
-        self._base = self.setting.template(scenario_from(scenario), car)
-        self._now = self._base
+        self.control_period, self.reference = int(control_period), reference
+        self._now = self.setting.base
         self.annotations: dict[str, float] = {}
 
-        self.layout: tuple[Entry, ...] = observation_layout(tuple(slow), n, fast)
-        self._bounds = np.array([[entry[2], entry[3]] for entry in self.layout]).T.copy()
+        self.layout: tuple[Entry, ...] = self.setting.layout
+        self._bounds = self.setting.bounds
         low, high = self._bounds.astype(np.float32)
         self.observation_space = gym.spaces.Box(low, high, dtype=np.float32)
-        self._action_shape = (2,) if steering else (1,)
+        self._action_shape = (self.setting.action_width,)
         self.action_space = gym.spaces.Box(-1.0, 1.0, self._action_shape, np.float32)
         self._params, self._state = np.zeros(P.end), np.zeros(Z.end)
-        self.rows = np.zeros((n, FAST_WIDTH))
-        room = sum(most_packets(sensor, n) for sensor in slow.values())
-        self.packets = np.zeros((room, PACKET_WIDTH))
+        self.rows = np.zeros((self.control_period, FAST_WIDTH))
+        self.packets = np.zeros((self.setting.room, PACKET_WIDTH))
         self._report = np.zeros(len(REPORT))
         self._drawn = np.zeros(DRAWS_WIDTH)
         self.ticks_done = 0  # rows of the newest record
@@ -152,9 +148,7 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[npt.NDArray[np.float32], dict[str, Any]]:
         """Start an episode; see the class docstring for the options."""
-        now, start = self._base, np.full(len(Motion._fields), np.nan)
-        if options:
-            now, start = self.setting.optioned(now.scenario, options)
+        now, start = self.setting.optioned(options or {})
         super().reset(seed=seed)  # refused options leave everything as it was
         self._now = now
         key = int(self.np_random.integers(0, 2**64, dtype=np.uint64))
@@ -181,7 +175,7 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
         )
         self._over = False
         self.annotations = {}
-        return obs, self._info(1, False)
+        return obs, self._info(1)
 
     def step(
         self, action: npt.ArrayLike
@@ -192,7 +186,9 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
         force = np.array(action, np.float32)  # a copy: contiguous whatever came
         if force.shape != self._action_shape:
             expected = self._action_shape
-            raise ValueError(f"an action has shape {expected}, got shape {force.shape}")
+            if self.setting.on_bad_action == "raise":
+                raise ValueError(f"an action has shape {expected}, got shape {force.shape}")
+            force = np.full(expected, np.nan, np.float32)
         obs = np.empty(len(self.layout), np.float32)
         done = step_vehicle(
             self._params,
@@ -210,43 +206,21 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
             if done == REFUSED:
                 raise ValueError(f"action {force.tolist()} is not finite; nothing was stepped")
             obs = np.zeros_like(obs)
-        info = self._info(done, True)
+        info = self._info(done)
         terminated = info["failure"] != RUNNING
         truncated = info["is_success"]
         self._over = terminated or truncated
         return obs, -info["cost"], terminated, truncated, info
 
-    def _info(self, done: int, stepped: bool) -> dict[str, Any]:
-        (
-            t, beta, gamma, psi, beta_ref, gamma_ref, steer, yaw_moment, cost,
-            code, delivered, _, ended,
-        ) = self._report.tolist()  # fmt: skip
-        self.ticks_done = done
-        self.delivered = int(delivered)
-        failure = int(code)
-        return {
-            "t": t,
-            "beta": beta,
-            "gamma": gamma,
-            "psi": psi,
-            "beta_ref": beta_ref,
-            "gamma_ref": gamma_ref,
-            "steer": steer,
-            "yaw_moment": yaw_moment,
-            "cost": cost,
-            "failure": failure,
-            "is_success": stepped and ended == 1.0 and failure == RUNNING,
-        }
+    def _info(self, done: int) -> dict[str, Any]:
+        self.ticks_done, self.delivered = done, int(self._report[REPORT.packets])
+        return info_of(self._report)
 
     @property
     def record(self) -> Record:
         """What the wires carried in the newest step, or at tick 0 after a reset (a copy)."""
-        last = int(self._state[Z.clock + 2])
-        return Record(
-            self.rows[: self.ticks_done].copy(),
-            self.packets[: self.delivered].copy(),
-            last - self.ticks_done + 1,
-        )
+        rows, packets = self.rows[: self.ticks_done], self.packets[: self.delivered]
+        return record_in(self._state, rows, packets)
 
     @property
     def dt(self) -> float:
@@ -261,20 +235,12 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
     @property
     def vehicle(self) -> Vehicle:
         """The true vehicle now, with what the seed drew; friction is the mean of both sides'."""
-        car = self._params
-        if car[P.car] == 0.0:
-            return self._now.vehicle
-        changed = self._state[Z.clock + 2] >= car[P.change]
-        return self._now.vehicle.replace(
-            front_stiffness=float(car[P.car + 4] * (car[P.change + 1] if changed else 1.0)),
-            rear_stiffness=float(car[P.car + 5] * (car[P.change + 2] if changed else 1.0)),
-            friction=float(0.5 * (car[P.car + 10] + car[P.car + 19])),
-        )
+        return vehicle_in(self._now, self._params, self._state)
 
     @property
     def motion(self) -> Motion:
         """The true velocities, heading, place and roll now, in SI units; no sensor tells these."""
-        return Motion(*self._state[Z.motion : Z.motion + len(Motion._fields)].tolist())
+        return motion_in(self._state)
 
     @property
     def nominal(self) -> Vehicle:
@@ -289,15 +255,7 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
     @property
     def slow_sensors(self) -> dict[str, SlowSensor]:
         """The slow sensors by name, with the clock phase that this episode drew."""
-        told = {}
-        for name, sensor in self._now.slow.items():
-            if sensor.phase is None:
-                at = Z.camera if name == SLOW_NAMES[0] else Z.gps
-                frames, upcoming = self._state[at], self._state[at + 1]
-                first = upcoming - frames * ticks(sensor.period)
-                sensor = dataclasses.replace(sensor, phase=first * TICK)
-            told[name] = sensor
-        return told
+        return slow_in(self._now, self._state)
 
     @property
     def redraws(self) -> int:
