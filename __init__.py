@@ -46,7 +46,12 @@ _ENVIRONMENTS: dict[str, dict[str, Any]] = {
 # entry point is a string and an id that stands in the registry is left alone.
 for _id, _kwargs in _ENVIRONMENTS.items():
     if _id not in registry:
-        register(_id, entry_point="sideslip.envs.stability:StabilityEnv", kwargs=_kwargs)
+        register(
+            _id,
+            entry_point="sideslip.envs.stability:StabilityEnv",
+            vector_entry_point="sideslip.envs.vector:StabilityVectorEnv",
+            kwargs=_kwargs,
+        )
 
 
 def __getattr__(name: str) -> Any:

@@ -10,6 +10,7 @@ from .record import Log, Record, SlowSensor
 from .scenario import Scenario
 from .stability import StabilityEnv
 from .switches import FAILURES
+from .vector import StabilityVectorEnv
 from .vehicle import COMS, PASSENGER_CAR, VEHICLES, Vehicle, critical_speed, vehicle_from
 
 __all__ = [
@@ -24,6 +25,7 @@ __all__ = [
     "Scenario",
     "SlowSensor",
     "StabilityEnv",
+    "StabilityVectorEnv",
     "Vehicle",
     "critical_speed",
     "scenario_from",

@@ -1,0 +1,118 @@
+"""What a vector environment is given, as one array or list of its rows; refused where it is not."""
+
+import operator
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from gymnasium.vector import AutoresetMode
+
+Mask = npt.NDArray[np.bool_]
+Actions = npt.NDArray[np.float32]
+NAMED = 8  # rows that a message lists
+
+
+def count_of(num_envs: Any) -> int:
+    """How many environments; TypeError for what is no whole number, ValueError below one."""
+    if isinstance(num_envs, bool) or not isinstance(num_envs, int | np.integer):
+        raise TypeError(f"num_envs is a number of environments, got {num_envs!r}")
+    if num_envs < 1:
+        raise ValueError(f"num_envs is at least 1, got {num_envs}")
+    return int(num_envs)
+
+
+def mode_of(autoreset_mode: Any) -> AutoresetMode:
+    """The mode of its name or itself; ValueError for another."""
+    try:
+        return AutoresetMode(autoreset_mode)
+    except ValueError:
+        known = ", ".join(repr(mode.value) for mode in AutoresetMode)
+        raise ValueError(f"unknown autoreset_mode {autoreset_mode!r}; known: {known}") from None
+
+
+def named(rows: npt.ArrayLike) -> str:
+    """ "row 3" or "rows 1, 5, ..." in a message."""
+    told = np.asarray(rows).tolist()
+    if len(told) == 1:
+        return f"row {told[0]}"
+    dots = ", ..." if len(told) > NAMED else ""
+    return f"rows {', '.join(map(str, told[:NAMED]))}{dots} ({len(told)} of them)"
+
+
+def seeds_of(seed: Any, count: int) -> list[int | None]:
+    """A seed for each row: `seed + i` of a number, a list as it is.
+
+    Raises ValueError for a list of another length or a negative seed, TypeError for a seed that is
+    no whole number.
+    """
+    if seed is None:
+        return [None] * count
+    if isinstance(seed, int | np.integer):
+        seeds: list[int | None] = [int(seed) + i for i in range(count)]
+    else:
+        if not isinstance(seed, Sequence | np.ndarray):
+            raise TypeError(f"seed: an int or a list of {count}, got {seed!r}")
+        if len(seed) != count:
+            raise ValueError(f"seed: an int or a list of {count}, got {len(seed)}")
+        seeds = [None if each is None else operator.index(each) for each in seed]
+    bad = [i for i, each in enumerate(seeds) if each is not None and each < 0]
+    if bad:
+        raise ValueError(f"seed: {named(bad)} would get a negative seed, {seeds[bad[0]]}")
+    return seeds
+
+
+def mask_of(mask: Any, count: int) -> Mask:
+    """The rows of options["reset_mask"], all without it; TypeError or ValueError for no mask."""
+    if mask is None:
+        return np.ones(count, np.bool_)
+    if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_:
+        what = mask.dtype if isinstance(mask, np.ndarray) else type(mask).__name__
+        raise TypeError(f"options['reset_mask'] is an array of bool, got {what}")
+    if mask.shape != (count,):
+        raise ValueError(f"options['reset_mask'] has shape ({count},), got {mask.shape}")
+    if not mask.any():
+        raise ValueError("options['reset_mask'] resets no row")
+    return mask.copy()
+
+
+def options_of(options: Mapping[str, Any], count: int) -> list[dict[str, Any]]:
+    """The options of each row's reset: a list, tuple or array has one for each row."""
+    columns = {}
+    for name, value in options.items():
+        if isinstance(value, np.ndarray) and value.ndim > 0:
+            value = value.tolist()
+        if not isinstance(value, list | tuple):
+            value = [value] * count
+        elif len(value) != count:
+            raise ValueError(f"reset option {name}: one or a list of {count}, got {len(value)}")
+        columns[name] = value
+    return [{name: value[i] for name, value in columns.items()} for i in range(count)]
+
+
+def actions_of(actions: Any, count: int, width: int, fail: bool) -> Actions:
+    """Actions (count, width) as float32.
+
+    What has another shape raises ValueError and names the rows; with `fail` these rows are NaN.
+    """
+    try:
+        force = np.array(actions, np.float32)  # a copy: contiguous whatever came
+        if force.shape == (count, width):
+            return force
+    except ValueError:  # rows of different lengths, or no numbers
+        pass
+    try:
+        rows = [np.array(row, np.float32) for row in actions]
+    except TypeError:  # no rows at all
+        rows = []
+    if len(rows) != count:
+        bad, got = list(range(count)), f"{len(rows)} rows"
+    else:
+        bad = [i for i, row in enumerate(rows) if row.shape != (width,)]
+        got = f"in {named(bad)} shape {rows[bad[0]].shape}"
+    if not fail:
+        raise ValueError(f"actions have shape ({count}, {width}), got {got}; nothing was stepped")
+    force = np.full((count, width), np.nan, np.float32)
+    for i in set(range(count)).difference(bad):
+        force[i] = rows[i]
+    return force

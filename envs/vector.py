@@ -1,0 +1,229 @@
+"""StabilityVectorEnv: many cars in one compiled call a step, each with the bits of one alone."""
+
+import copy
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.error import ResetNeeded
+from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+
+from .batch import step_rows
+from .border import actions_of, count_of, mask_of, mode_of, named, seeds_of
+from .episode import infos_of
+from .fleet import Fleet
+from .layout import Array
+from .stability import StabilityEnv
+from .switches import REFUSED
+
+Observations = npt.NDArray[np.float32]
+Flags = npt.NDArray[np.bool_]
+Infos = dict[str, Any]
+
+_INFO = ("all", "ends")
+_HELD = (  # arrays of a snapshot
+    "params", "states", "switches", "over", "obs", "rows", "packets", "reports", "ticks_done",
+    "delivered",
+)  # fmt: skip
+
+
+class StabilityVectorEnv(Fleet, VectorEnv[Observations, Any, npt.NDArray[Any]]):
+    """`num_envs` environments, each of which is a `StabilityEnv(**arguments)` bit for bit.
+
+    Observations, rewards, ends, infos and records are those of `SyncVectorEnv`: row i of
+    `reset(seed=s)` is the single environment of `reset(seed=s + i)`, and its episodes go on from
+    its own generator. `gym.make_vec(id, num_envs=N, **arguments)` builds it.
+
+    ## Arguments
+    arguments: those of `StabilityEnv`. autoreset_mode: "NextStep", "SameStep" or "Disabled" (rows
+    that ended wait for `reset` with a `reset_mask`), or the enum. info: "all" tells the infos of
+    every row in every step, as `SyncVectorEnv` does; "ends" only those of the last step of an
+    episode, and none at resets.
+
+    ## Reset
+    `seed`: an int, or a list (N,) of int or None. `options`: those of `StabilityEnv`, each one for
+    all rows or a list (N,); and `reset_mask`, (N,) of bool: the rows to reset. Rows that the
+    environment resets itself start without options.
+
+    ## Actions
+    (N, 1), or (N, 2) with `steering`. With `on_bad_action="raise"` a wrong number of actions or a
+    non-finite one raises ValueError, names the rows and steps nothing; with "fail" it ends these
+    rows' episodes as failures. Actions of rows that this step resets are not read.
+
+    ## Records
+    `rows` (N, n, FAST_WIDTH) of which `ticks_done` (N,) are there, `packets` (N, room,
+    PACKET_WIDTH) of which `delivered` (N,) are; `final_...` are those before a row's newest reset.
+    `record[i]` is a row's `Record`.
+
+    `vehicle`, `nominal`, `held_speed`, `slow_sensors`, `scenario` and `record` are sequences of N
+    whose items are made when asked for; `motion` is (N, len(Motion)).
+
+    Raises TypeError or ValueError for an argument out of place.
+    """
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+        info: str = "all",
+        **arguments: Any,
+    ) -> None:
+        self.num_envs = N = count_of(num_envs)
+        self._mode = mode_of(autoreset_mode)
+        if info not in _INFO:
+            raise ValueError(f"info is 'all' or 'ends', got {info!r}")
+        self._tells_all = info == "all"
+        one = StabilityEnv(**arguments)
+        Fleet.__init__(self, one.setting, N)
+        self.reference = one.reference
+        self.metadata = {**one.metadata, "autoreset_mode": self._mode}
+        self.single_observation_space = one.observation_space
+        self.single_action_space = one.action_space
+        self.observation_space = batch_space(one.observation_space, N)
+        self.action_space = batch_space(one.action_space, N)
+
+        self._started = False
+        self._waiting = 0  # rows that are over
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """What `gym.make_vec` builds this env from; JSON types where the arguments are."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        if spec is not None and "autoreset_mode" in spec.kwargs:
+            spec.kwargs["autoreset_mode"] = self._mode.value
+        self._spec = spec
+
+    _spec: EnvSpec | None = None
+
+    def reset(
+        self, *, seed: Any = None, options: Mapping[str, Any] | None = None
+    ) -> tuple[Observations, Infos]:
+        """Start episodes; see the class docstring for seeds and options.
+
+        Raises TypeError or ValueError for what is out of place, ResetNeeded where a mask leaves
+        out rows that were never started; then everything is as it was.
+        """
+        N, told = self.num_envs, dict(options or {})
+        seeds, mask = seeds_of(seed, N), mask_of(told.pop("reset_mask", None), N)
+        if not (self._started or mask.all()):
+            raise ResetNeeded("reset all rows first: a reset_mask leaves out some of them")
+        chosen = np.flatnonzero(mask)
+        made, of = self.optioned(told, chosen.tolist())
+        new = {i: seeding.np_random(s) for i in chosen.tolist() if (s := seeds[i]) is not None}
+        for i, (generator, own) in new.items():
+            self.generators[i], self.seeds[i] = generator, own
+        self.restart(chosen, made, of)
+        self.over[mask] = False
+        self._waiting, self._started = int(self.over.sum()), True
+        return self.obs.copy(), infos_of(self.reports, mask) if self._tells_all else {}
+
+    def step(self, actions: npt.ArrayLike) -> tuple[Observations, Array, Flags, Flags, Infos]:
+        """Hold each row's action for one control period."""
+        N = self.num_envs
+        if not self._started:
+            raise ResetNeeded("no episode was started: call reset() first")
+        if self._waiting and self._mode == AutoresetMode.DISABLED:
+            raise ResetNeeded(
+                f"the episode is over in {named(np.flatnonzero(self.over))}: "
+                "call reset() with a reset_mask"
+            )
+        setting = self.setting
+        told = actions_of(actions, N, setting.action_width, setting.on_bad_action == "fail")
+        resting = np.flatnonzero(self.over) if self._waiting else None
+        rewards, terminated, truncated = np.empty(N), np.empty(N, np.bool_), np.empty(N, np.bool_)
+        ended = step_rows(
+            self.params,
+            self.states,
+            self.switches,
+            told,
+            self.control_period,
+            setting.bounds,
+            self.over,
+            self.obs,
+            self.rows,
+            self.packets,
+            self.reports,
+            self.ticks_done,
+            self.delivered,
+            rewards,
+            terminated,
+            truncated,
+        )
+        if ended == REFUSED:
+            bad = np.flatnonzero(~np.isfinite(told).all(1) & ~self.over)
+            raise ValueError(
+                f"the action of {named(bad)} is not finite, {told[bad[0]].tolist()}; "
+                "nothing was stepped"
+            )
+        if resting is not None:
+            self.restart(resting)
+        infos: Infos = {}
+        if ended and self._mode == AutoresetMode.SAME_STEP:
+            infos, ended = self._finished(), 0
+        self._waiting = ended
+        if self._tells_all:
+            infos |= infos_of(self.reports, np.ones(N, np.bool_))
+        elif ended:
+            infos |= infos_of(self.reports, self.over)
+        return self.obs.copy(), rewards, terminated, truncated, infos
+
+    def _finished(self) -> Infos:
+        """Reset the rows that are over; what they told last."""
+        final_obs, rows = np.full(self.num_envs, None), np.flatnonzero(self.over)
+        for i in rows:
+            final_obs[i] = self.obs[i].copy()
+        infos: Infos = {"final_info": infos_of(self.reports, self.over), "final_obs": final_obs}
+        for key in tuple(infos):
+            infos[f"_{key}"] = self.over.copy()
+        self.restart(rows)
+        self.over[:] = False
+        return infos
+
+    @property  # type: ignore[misc]  # without a setter, as in sync
+    def np_random(self) -> tuple[np.random.Generator, ...]:  # type: ignore[override]
+        """Each row's generator, which draws one 64-bit key a reset."""
+        return tuple(map(self.generator, range(self.num_envs)))
+
+    @property
+    def np_random_seed(self) -> tuple[int | None, ...]:  # type: ignore[override]
+        """What each row's generator was seeded with."""
+        for i in range(self.num_envs):
+            self.generator(i)  # a row without one gets one now
+        return tuple(self.seeds)
+
+    def get_state(self) -> dict[str, Any]:
+        """A snapshot of all rows that `set_state` continues from, bit for bit."""
+        held: dict[str, Any] = {name: getattr(self, name).copy() for name in _HELD}
+        return held | {
+            "layout": self.layout,
+            "templates": list(self.templates),
+            "rng": copy.deepcopy(self.generators),
+            "seeds": list(self.seeds),
+            "started": self._started,
+        }
+
+    def set_state(self, snapshot: Mapping[str, Any]) -> None:
+        """Go back to a snapshot of this env or of one built with the same arguments.
+
+        Raises ValueError for one of another number of rows, control period or observation.
+        """
+        rows, ours = np.shape(snapshot["rows"]), self.rows.shape
+        if rows != ours:
+            raise ValueError(
+                f"the snapshot has {rows[0]} rows of {rows[1]} ticks a step, this env {ours[0]} "
+                f"of {ours[1]}"
+            )
+        if snapshot["layout"] != self.layout:
+            raise ValueError("the snapshot is of an env with other sensors or another observation")
+        for name in _HELD:
+            getattr(self, name)[:] = snapshot[name]
+        self.templates, self.seeds = list(snapshot["templates"]), list(snapshot["seeds"])
+        self.generators = copy.deepcopy(snapshot["rng"])
+        self._started, self._waiting = snapshot["started"], int(self.over.sum())
