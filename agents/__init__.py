@@ -3,9 +3,9 @@
 from collections.abc import Callable
 from typing import Any
 
-import gymnasium as gym
-
 from .controller import Controller, NoControl
+from .given import AnyEnv
+from .lqr import Lqr
 from .model_following import ModelFollowing
 from .two_dof import Feedforward, TwoDof
 
@@ -14,12 +14,14 @@ AGENTS: dict[str, Callable[..., Controller]] = {
     "feedforward": Feedforward,
     "two-dof": TwoDof,
     "model-following": ModelFollowing,
+    "lqr": Lqr,
 }
 
 __all__ = [
     "AGENTS",
     "Controller",
     "Feedforward",
+    "Lqr",
     "ModelFollowing",
     "NoControl",
     "TwoDof",
@@ -27,8 +29,8 @@ __all__ = [
 ]
 
 
-def make_agent(name: str, env: gym.Env[Any, Any], **options: Any) -> Controller:
-    """A controller designed for an env, from the env's nominal vehicle.
+def make_agent(name: str, env: AnyEnv, **options: Any) -> Controller:
+    """A controller designed for an env, single or vector, from the env's nominal vehicle.
 
     name: a key of `AGENTS`. options: arguments of that controller.
     Raises ValueError for an unknown name or an observation without what the controller needs,

@@ -3,11 +3,10 @@
 from abc import ABC, abstractmethod
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 
-from ..envs.vehicle import Vehicle
+from .given import AnyEnv, given
 
 Array = npt.NDArray[np.float64]
 
@@ -19,37 +18,38 @@ class Controller(ABC):
     remembers (`memory`), and fills `_law`. `predict` is pure: all memory is in `state`, an array
     (N, memory).
 
-    Raises ValueError when the env's observation lacks a needed entry.
+    A controller serves a single env or all rows of a vector env, which then share its design.
+    Where a needed entry is not finite the action is NaN and the memory stays as it was, so that an
+    estimator that fails is seen: an env with `on_bad_action="fail"` ends the episode, others raise.
+
+    Raises ValueError when the env's observation lacks a needed entry, or where the rows of a vector
+    env were told different cars.
     """
 
     needs: tuple[str, ...] = ()
     memory = 0
 
-    def __init__(self, env: gym.Env[Any, Any]) -> None:
-        layout = env.get_wrapper_attr("layout")
-        names = [entry.name for entry in layout]
+    def __init__(self, env: AnyEnv) -> None:
+        told = given(env)
+        names = [entry.name for entry in told.layout]
         missing = [name for name in self.needs if name not in names]
         if missing:
-            hint = (
-                "; wrap the env in sideslip.estimators.EstimateObservation"
-                if any(name.endswith("_hat") for name in missing)
-                else ""
-            )
             raise ValueError(
-                f"{type(self).__name__} needs {', '.join(missing)} in the observation{hint}"
+                f"{type(self).__name__} needs {', '.join(missing)} in the observation"
+                f"{_hint(missing)}"
             )
         self._columns = np.array([names.index(name) for name in self.needs], dtype=np.int64)
         self._width = len(names)
-        base: Any = env.unwrapped
-        self.nominal: Vehicle = base.nominal
-        self.full_scale = base.vehicle.yaw_moment_limit
-        self.control_period: int = base.control_period
-        self.width: int = base.action_space.shape[0]
+        self.nominal = told.nominal
+        self.full_scale, self.authority = told.full_scale, told.authority
+        self.control_period, self.reference = told.control_period, told.reference
+        self.width = told.width
 
     @abstractmethod
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
         """Fill action (N, width), which is zero, and update state (N, memory) in place.
 
+        inputs: (N, len(needs)), finite. A NaN that the law leaves in an action says that it failed.
         Its first column is the yaw moment as a share of full scale, its second, where the env has
         one, the added steering as a share of the vehicle's authority.
         """
@@ -74,9 +74,26 @@ class Controller(ABC):
         if episode_start is not None:
             memory[np.asarray(episode_start, bool)] = 0.0
         action = np.zeros((len(batch), self.width))
-        self._law(batch[:, self._columns].astype(np.float64), memory, action)
+        inputs = batch[:, self._columns].astype(np.float64)
+        bad = ~np.isfinite(inputs).all(axis=1)
+        if bad.any():
+            before = memory[bad]
+            inputs[bad] = 0.0
+            self._law(inputs, memory, action)
+            memory[bad], action[bad] = before, np.nan
+        else:
+            self._law(inputs, memory, action)
         shares = np.clip(action, -1.0, 1.0).astype(np.float32)
         return (shares[0] if obs.ndim == 1 else shares), memory
+
+
+def _hint(missing: list[str]) -> str:
+    """What to wrap the env in, so that its observation has these entries."""
+    if any(name.startswith("true_") for name in missing):
+        return "; build env and agent with sideslip.agents.informed.make_informed"
+    if any(name.endswith("_hat") for name in missing):
+        return "; wrap the env in sideslip.estimators.EstimateObservation"
+    return ""
 
 
 class NoControl(Controller):

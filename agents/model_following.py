@@ -9,7 +9,6 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 
 from ..envs.backend import jit, maximum
@@ -18,6 +17,7 @@ from ..envs.record import TICK
 from ..envs.reference import REFERENCES, reference, target_of
 from ..envs.vehicle import Vehicle
 from .controller import Array, Controller
+from .given import AnyEnv, given
 
 SLOWEST = 2.0  # m/s: below it the vehicle is taken as at this speed
 BANDWIDTH = (5.0, 5.0)  # rad/s, K_beta and K_gamma of dakf-stability V.D
@@ -156,11 +156,11 @@ class ModelFollowing(Controller):
 
     def __init__(
         self,
-        env: gym.Env[Any, Any],
+        env: AnyEnv,
         bandwidth: Sequence[float] = BANDWIDTH,
         rejection: bool = True,
     ) -> None:
-        names = {entry.name for entry in env.get_wrapper_attr("layout")}
+        names = {entry.name for entry in given(env).layout}
         instead = {} if "gamma_hat" in names else {"gamma_hat": "gyro"}
         if not rejection:  # whatever stands there is multiplied by zero
             instead |= {"d1_hat": "beta_ref", "d2_hat": "gamma_ref"}
@@ -171,14 +171,12 @@ class ModelFollowing(Controller):
         K = [float(each) for each in bandwidth]
         if len(K) != 2 or not all(0.0 < each < math.inf for each in K):
             raise ValueError(f"bandwidth is two positive numbers in rad/s, got {bandwidth!r}")
-        base: Any = env.unwrapped
         self.bandwidth = np.array(K)
         self.rejection = bool(rejection)
-        self.authority: float = base.vehicle.steering_authority
         self.dt = self.control_period * TICK
         self._car = np.array(_car(self.nominal))
         self._target = target_of(self.nominal)
-        self._kind = REFERENCES.index(base.reference)
+        self._kind = REFERENCES.index(self.reference)
 
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
         _model_following_law(

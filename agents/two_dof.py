@@ -7,13 +7,13 @@ front wheel speeds: the feedforward by its formula, the PI on a grid of speeds.
 import math
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 
 from ..envs.backend import absolute, jit, maximum, select
 from ..envs.record import TICK
 from ..envs.vehicle import COMS, Vehicle
 from .controller import Array, Controller
+from .given import AnyEnv
 from .pi import COMS_PI, PLACEMENTS, POLE, design_pi, sample_pi
 
 SLOWEST = 2.0  # m/s: gains below it are those of this speed
@@ -126,7 +126,7 @@ class Feedforward(Controller):
 
     needs = ("wheel_left", "wheel_right", "steer_command")
 
-    def __init__(self, env: gym.Env[Any, Any]) -> None:
+    def __init__(self, env: AnyEnv) -> None:
         super().__init__(env)
         self.car = _car(self.nominal)
 
@@ -151,7 +151,7 @@ class TwoDof(Controller):
 
     def __init__(
         self,
-        env: gym.Env[Any, Any],
+        env: AnyEnv,
         rate: str = "control",
         gain: float = 1.0,
         pole: float = POLE,

@@ -1,0 +1,193 @@
+"""The car as its controllers predict it: sampled at the control period, with the env's own cost.
+
+Every tick of a period counts in the cost, so both the motion and the cost are summed tick by tick:
+what is minimised is the episode's cost J itself, but for its cap, of the linear car at a held
+speed, with the driver's command and the references held as they are now.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..envs.actuators import lag_of
+from ..envs.linear import LinearModel, bicycle
+from ..envs.record import TICK
+from ..envs.reference import BETA_SCALE, EFFORT_WEIGHT, GAMMA_SCALE, STEER_SCALE, ZERO_SLIP
+from ..envs.vehicle import Vehicle
+
+Array = npt.NDArray[np.float64]
+
+DYNAMIC = ("beta", "gamma", "N_z", "delta_f")
+"""States that the inputs move: rad, rad/s, delivered yaw moment as a share of full scale, applied
+steering in rad."""
+
+HELD = ("driver", "beta_ref", "gamma_ref")
+"""What is taken to stay as it is: the driver's steering in rad and the references."""
+
+DISTURBANCES: dict[str, tuple[str, ...]] = {
+    "none": (),
+    "forces": ("F_d", "N_d"),
+    "rates": ("d1", "d2"),
+}
+"""Disturbances by kind: an Ornstein-Uhlenbeck force and moment in N and N m, as `exact-kf` knows
+them, or d_1 and d_2 in rad/s and rad/s2, which stay: dakf-stability (8)-(9), (14)."""
+
+
+@dataclass(frozen=True)
+class Purpose:
+    """What a design is for: everything but the car and its speed.
+
+    period: ticks. full_scale: N m of the first input. steers: whether steering is the second.
+    kind: of `envs.reference.REFERENCES` by number. disturbances: of `DISTURBANCES`.
+    disturbance_time: s, in which forces decay.
+    """
+
+    period: int
+    full_scale: float
+    steers: bool
+    kind: int
+    disturbances: str = "none"
+    disturbance_time: float = 0.3
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """Names of all states."""
+        return DYNAMIC + HELD + DISTURBANCES[self.disturbances]
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Names of the inputs: share of the yaw moment, and rad added to the driver's steering."""
+        return ("N_z", "delta_f") if self.steers else ("N_z",)
+
+
+@dataclass(frozen=True)
+class DesignModel:
+    """x+ = G x + H u over a period, costing x'Qx + u'Ru + 2 x'Nu in units of J.
+
+    G (n, n), H (n, m), Q (n, n), R (m, m), N (n, m), states and inputs as the purpose names them.
+    The first len(DYNAMIC) states are moved by the inputs, the others by themselves alone.
+    """
+
+    G: Array
+    H: Array
+    Q: Array
+    R: Array
+    N: Array
+    purpose: Purpose
+
+
+def design_model(vehicle: Vehicle, speed: float, purpose: Purpose) -> DesignModel:
+    """The model of a vehicle at a speed in m/s; ValueError unless that is positive."""
+    G1, H1, C, D = one_tick(vehicle, speed, purpose)
+    n, m = H1.shape
+    W = TICK * np.diag(_weights(purpose))
+    step, G, H = np.hstack([G1, H1]), np.eye(n), np.zeros((n, m))
+    whole = np.zeros((n + m, n + m))
+    for _ in range(purpose.period):
+        now = np.vstack([np.hstack([G, H]), np.hstack([np.zeros((m, n)), np.eye(m)])])
+        judged = np.hstack([C, D]) @ now
+        whole += judged.T @ W @ judged
+        G, H = np.split(step @ now, [n], axis=1)
+    return DesignModel(G, H, whole[:n, :n], whole[n:, n:], whole[:n, n:], purpose)
+
+
+def one_tick(vehicle: Vehicle, speed: float, purpose: Purpose) -> tuple[Array, Array, Array, Array]:
+    """(G, H) of a tick, and (C, D) from state and input at its start to what the cost judges.
+
+    Judged at the tick's end: e_beta, e_gamma, and the means over the tick of the delivered share
+    of the yaw moment and of the added steering, which is the applied less the driver's.
+    """
+    lags = [lag_of(tau, TICK) for tau in (vehicle.motor_lag, vehicle.steering_lag)]
+    plane, push = _tick_of_the_plane(vehicle, speed, purpose)
+    n, m = len(purpose.states), len(purpose.inputs)
+    G, H = np.eye(n), np.zeros((n, m))
+    G[:2] = 0.0
+    G[:2, :4], H[:2, :1], G[:2, 4:5] = plane[:, :4], plane[:, 4:5], plane[:, 5:6]
+    if purpose.steers:
+        H[:2, 1:] = plane[:, 5:6]
+    C, D = np.zeros((4, n)), np.zeros((4, m))
+    C[2, 2], C[3, 3], C[3, 4] = lags[0].mean, lags[1].mean, -lags[1].mean
+    for i, lag in enumerate(lags):
+        G[2 + i, 2 + i] = lag.end
+    G[3, 4] = 1.0 - lags[1].end
+    for i in range(m):
+        H[2 + i, i], D[2 + i, i] = 1.0 - lags[i].end, 1.0 - lags[i].mean
+    if purpose.disturbances != "none":
+        G[:2, 7:] = push
+        if purpose.disturbances == "forces":
+            G[7:, 7:] *= math.exp(-TICK / purpose.disturbance_time)
+    C[:2], D[:2] = G[:2], H[:2]
+    C[0, 5], C[1, 6] = -1.0, -1.0
+    return G, H, C, D
+
+
+def _tick_of_the_plane(vehicle: Vehicle, speed: float, purpose: Purpose) -> tuple[Array, Array]:
+    """beta and gamma after a tick: (2, 6) from themselves, both actuators and both commands, and
+    (2, 2) from the disturbances. An actuator without lag is its command."""
+    model = bicycle(vehicle, speed)
+    scale = np.array([purpose.full_scale, 1.0])
+    B = model.B[:, ::-1] * scale  # columns N_z, delta_f, as the inputs stand
+    A = np.zeros((4, 4))
+    A[:2, :2] = model.A
+    inputs = np.zeros((4, 4))  # commands of both actuators, then the disturbances
+    for i, tau in enumerate((vehicle.motor_lag, vehicle.steering_lag)):
+        if tau > 0.0:
+            A[:2, 2 + i] = B[:, i]
+            A[2 + i, 2 + i], inputs[2 + i, i] = -1.0 / tau, 1.0 / tau
+        else:
+            inputs[:2, i] = B[:, i]
+    per = (1.0 / (vehicle.mass * speed), 1.0 / vehicle.yaw_inertia)
+    inputs[:2, 2:] = np.diag(per if purpose.disturbances == "forces" else (1.0, 1.0))
+    G, H = LinearModel(A, inputs, np.eye(4), DYNAMIC, (), ()).discrete(TICK)
+    return np.hstack([G[:2], H[:2, :2]]), H[:2, 2:]
+
+
+def _weights(purpose: Purpose) -> Sequence[float]:
+    """Of the four that the cost judges, DESIGN section 4."""
+    return (
+        1.0 / BETA_SCALE**2,
+        0.0 if purpose.kind == ZERO_SLIP else 1.0 / GAMMA_SCALE**2,
+        EFFORT_WEIGHT,
+        EFFORT_WEIGHT / STEER_SCALE**2 if purpose.steers else 0.0,
+    )
+
+
+def regulator(model: DesignModel) -> Array:
+    """K (m, n) of u = -K x, which minimises the sum of the model's cost; by python-control.
+
+    The states that inputs move are regulated by `control.dlqr`; to the others, which move by
+    themselves and need not decay, the optimal answer follows from a linear equation for their part
+    of the cost to go.
+
+    Raises ModuleNotFoundError, naming the extra, without python-control.
+    """
+    try:
+        import control
+    except ModuleNotFoundError:
+        raise ModuleNotFoundError(
+            "designing this controller needs python-control: pip install 'sideslip[design]'"
+        ) from None
+    d = len(DYNAMIC)
+    A, B, W = model.G[:d, :d], model.H[:d], model.G[d:, d:]
+    K, P, _ = control.dlqr(A, B, model.Q[:d, :d], model.R, model.N[:d])
+    A12, N2 = model.G[:d, d:], model.N[d:]
+    closed = A - B @ K
+    # P12 = Q12 - K'N2' + (A - BK)'(P A12 + P12 W), stacked by columns
+    right = model.Q[:d, d:] - K.T @ N2.T + closed.T @ P @ A12
+    lhs = np.eye(right.size) - np.kron(W.T, closed.T)
+    P12 = np.linalg.solve(lhs, right.ravel(order="F")).reshape(right.shape, order="F")
+    answer = np.linalg.solve(
+        model.R + B.T @ P @ B, B.T @ (P @ A12 + P12 @ W) + N2.T
+    )
+    return np.asarray(np.hstack([K, answer]), np.float64)
+
+
+def closed_loop(model: DesignModel, K: Any) -> Array:
+    """The map of the states that inputs move over a period, (4, 4); its eigenvalues are poles."""
+    d = len(DYNAMIC)
+    closed: Array = model.G[:d, :d] - model.H[:d] @ np.asarray(K)[:, :d]
+    return closed
