@@ -5,6 +5,7 @@ from typing import Any
 
 from .controller import Controller, NoControl
 from .given import AnyEnv
+from .informed import Informed
 from .lqr import Lqr
 from .model_following import ModelFollowing
 from .two_dof import Feedforward, TwoDof
@@ -15,12 +16,14 @@ AGENTS: dict[str, Callable[..., Controller]] = {
     "two-dof": TwoDof,
     "model-following": ModelFollowing,
     "lqr": Lqr,
+    "informed": Informed,
 }
 
 __all__ = [
     "AGENTS",
     "Controller",
     "Feedforward",
+    "Informed",
     "Lqr",
     "ModelFollowing",
     "NoControl",

@@ -92,6 +92,7 @@ def design_model(vehicle: Vehicle, speed: float, purpose: Purpose) -> DesignMode
         judged = np.hstack([C, D]) @ now
         whole += judged.T @ W @ judged
         G, H = np.split(step @ now, [n], axis=1)
+    whole = 0.5 * (whole + whole.T)
     return DesignModel(G, H, whole[:n, :n], whole[n:, n:], whole[:n, n:], purpose)
 
 

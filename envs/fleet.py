@@ -144,7 +144,7 @@ class Fleet:
     @property
     def vehicle(self) -> Sequence[Vehicle]:
         """The true vehicle of each row's episode, with what its seed drew."""
-        return self._each(lambda i: vehicle_in(self.templates[i], self.params[i]))
+        return self._each(lambda i: vehicle_in(self.templates[i], self.params[i], self.states[i]))
 
     @property
     def nominal(self) -> Sequence[Vehicle]:

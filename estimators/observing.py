@@ -14,7 +14,8 @@ from .memory import FILTER
 
 @jit
 def _clipped(value: Any, limit: Any) -> Any:
-    return minimum(maximum(value, 0.0 - limit), limit)
+    """The value within +-limit; NaN stays, so that a filter that failed is seen."""
+    return value if value != value else minimum(maximum(value, 0.0 - limit), limit)
 
 
 @jit

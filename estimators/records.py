@@ -132,6 +132,18 @@ class SyncRecords:
                 base.annotate(**{key: value})
 
 
+def true_vehicles(base: Any, rows: Sequence[int]) -> list[Vehicle]:
+    """The true vehicles that some rows of a bare vector env drive in this episode.
+
+    Raises TypeError where they are out of reach.
+    """
+    if isinstance(base, SyncVectorEnv):
+        return [base.envs[i].unwrapped.vehicle for i in rows]  # type: ignore[attr-defined]
+    if not hasattr(base, "vehicle"):
+        raise TypeError(f"{type(base).__name__} does not tell which vehicles its rows drive")
+    return [base.vehicle[i] for i in rows]
+
+
 def _contiguous(fast: Any, rows: Any, packets: Any, counts: Any) -> Batch:
     """Arrays as compiled code takes them, copied only where they are not."""
     return Batch(

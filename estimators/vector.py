@@ -18,7 +18,8 @@ from ..envs.vehicle import Vehicle, vehicle_from
 from .batch import BatchEstimator
 from .designs import Told
 from .outputs import BETA, NEES, outputs_of
-from .records import Batch, BatchedRecords, SyncRecords, records_of
+from .records import Batch, BatchedRecords, SyncRecords, records_of, true_vehicles
+from .wrappers import TRUTH
 from .wrappers import EstimateObservation as Single
 
 Observations = npt.NDArray[np.float32]
@@ -75,7 +76,8 @@ class EstimateObservation(
         if mode not in (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP):
             raise ValueError(f"the vector env must reset rows itself; its autoreset_mode is {mode}")
         self._same_step = mode == AutoresetMode.SAME_STEP
-        self._vehicle = None if vehicle is None else vehicle_from(vehicle)
+        self._truth = isinstance(vehicle, str) and vehicle == TRUTH
+        self._vehicle = None if vehicle is None or self._truth else vehicle_from(vehicle)
         self.estimator = BatchEstimator(
             estimator, self._told(range(env.num_envs)), self._records.dt, options or {}
         )
@@ -139,6 +141,9 @@ class EstimateObservation(
 
     def _told(self, rows: Sequence[int]) -> list[Told]:
         told = self._records.told(rows)
+        if self._truth:
+            cars = true_vehicles(self.unwrapped, rows)
+            return [each._replace(vehicle=car) for each, car in zip(told, cars, strict=True)]
         if self._vehicle is None:
             return told
         return [each._replace(vehicle=self._vehicle) for each in told]

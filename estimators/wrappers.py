@@ -17,6 +17,7 @@ from .observing import observe_entry
 from .outputs import BETA, outputs_of
 
 _MAY_STAND_BETWEEN = (PassiveEnvChecker, OrderEnforcing)
+TRUTH = "truth"  # in place of a vehicle: the one that is driven
 _OFFERED = ("rows", "ticks_done", "packets", "delivered", "slow_sensors", "nominal", "layout")
 
 
@@ -30,8 +31,8 @@ class EstimateObservation(
 
     estimator: a name of `make_estimator`. outputs: states to append, each as `<state>_hat`, then,
     if `std`, each one's standard deviation as `<state>_std`. replace: the observation is these
-    alone. vehicle: what the estimator is told (a preset, a mapping; default the env's nominal).
-    options: of `make_estimator`. name: put before every name as `<name>_`.
+    alone. vehicle: what the estimator is told (a preset, a mapping; default the env's nominal;
+    "truth": the true car of each episode, as it is at the reset). options: of `make_estimator`. name: put before every name as `<name>_`.
 
     `info` gains `beta_hat` and `beta_std` where the estimator has beta and, if beta or gamma is
     among the outputs, `nees`: their normalised estimation error squared, divided by their number.
@@ -66,7 +67,8 @@ class EstimateObservation(
         gym.Wrapper.__init__(self, env)
         self._base = base_of(env)
         self._kind, self._options = estimator, dict(options or {})
-        self._vehicle = None if vehicle is None else vehicle_from(vehicle)
+        self._truth = isinstance(vehicle, str) and vehicle == TRUTH
+        self._vehicle = None if vehicle is None or self._truth else vehicle_from(vehicle)
         self._told: Any = None
         self.estimator: Estimator = self._current_estimator()
         inner: tuple[Entry, ...] = () if replace else env.get_wrapper_attr("layout")
@@ -81,6 +83,8 @@ class EstimateObservation(
         """The estimator for what the env tells now; the one at hand where nothing changed."""
         base = self._base
         vehicle = base.nominal if self._vehicle is None else self._vehicle
+        if self._truth:
+            vehicle = base.vehicle
         speed = getattr(base, "held_speed", None)
         clocks = {name: (s.period, s.delays, s.jitter) for name, s in base.slow_sensors.items()}
         told = vehicle, clocks, speed

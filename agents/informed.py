@@ -1,0 +1,81 @@
+"""The informed controller: LQG of the true linear car with the same sensors, DESIGN section 4."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium as gym
+
+from ..envs.scenario import Scenario
+from ..envs.sensors import HDOP_LAWS
+from ..envs.vehicle import Vehicle
+from ..estimators import EstimateObservation, vector
+from ..estimators.truth import STIFFNESSES, TruthObservation
+from ..estimators.truth_vector import TruthObservation as VectorTruthObservation
+from ..estimators.wrappers import TRUTH
+from .given import AnyEnv
+from .lqr import Lqr
+
+OUTPUTS = ["beta", "gamma", "F_d", "N_d"]
+
+
+def levels_of(scenario: Scenario) -> dict[str, Any]:
+    """Options of `exact-kf` that say the noise and the disturbances of a scenario.
+
+    The course's noise follows the HDOP that comes with each packet, as far as the scenario's does.
+    """
+    noise = dict(scenario.noise)
+    share = HDOP_LAWS[scenario.hdop_law]
+    told = {
+        "force_sd": scenario.disturbance_force,
+        "moment_sd": scenario.disturbance_moment,
+        "disturbance_time": scenario.disturbance_time,
+        "hdop_table": [(1.0, 1.0), (101.0, 1.0 + 100.0 * share)],
+    }
+    names = {"gyro": "gyro_noise", "camera_psi": "psi_noise", "camera_y": "y_l_noise"}
+    return told | {option: noise[key] for key, option in names.items() if key in noise}
+
+
+class Informed(Lqr):
+    """`lqr` designed on the true car: its gains are scheduled on the true stiffnesses too.
+
+    For an env whose observation has `true_front_stiffness` and `true_rear_stiffness` and the
+    estimates of a filter that was told the truth: `make_informed` builds both.
+
+    Arguments and errors are those of `lqr`.
+    """
+
+    def __init__(self, env: AnyEnv, **options: Any) -> None:
+        super().__init__(env, stiffness=[f"true_{name}" for name in STIFFNESSES], **options)
+
+
+def make_informed(
+    env_id: str,
+    num_envs: int | None = None,
+    vector_kwargs: Mapping[str, Any] | None = None,
+    **kwargs: Any,
+) -> tuple[Any, Informed]:
+    """(env, agent): the informed controller and the env whose observation it needs.
+
+    kwargs: of the env (scenario, vehicle, ...). num_envs: a vector env of so many rows, whose own
+    arguments are vector_kwargs; None: a single one. The filter is `exact-kf` with all of the id's
+    slow sensors, the true car of each episode and the scenario's levels of noise and disturbance.
+    Of the car, stiffness and friction may differ between episodes; the rest is the env's.
+
+    Raises what `gym.make` and `lqr` raise.
+    """
+    if num_envs is None:
+        env: Any = gym.make(env_id, **kwargs)
+        base: Any = env.unwrapped
+        car: Vehicle = base.vehicle
+        scenario, slow = base.scenario, base.slow_sensors
+        wrap, tell = EstimateObservation, TruthObservation
+    else:
+        env = gym.make_vec(env_id, num_envs=num_envs, vector_kwargs=dict(vector_kwargs or {}), **kwargs)
+        alone: Any = gym.make(env_id, **kwargs).unwrapped
+        car, scenario, slow = alone.vehicle, alone.scenario, alone.slow_sensors
+        wrap, tell = vector.EstimateObservation, VectorTruthObservation
+    options = levels_of(scenario) | {"slow": list(slow)}
+    if "gps" not in slow:
+        del options["hdop_table"]
+    env = tell(wrap(env, "exact-kf", outputs=OUTPUTS, std=False, vehicle=TRUTH, options=options))
+    return env, Informed(env, disturbance_time=scenario.disturbance_time, vehicle=car)

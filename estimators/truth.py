@@ -1,0 +1,77 @@
+"""TruthObservation: parameters of the true car beside the observation, for who is told them."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import numpy.typing as npt
+from gymnasium.utils import RecordConstructorArgs
+
+from ..envs.layout import Entry
+from ..envs.vehicle import Vehicle
+
+STIFFNESSES = ("front_stiffness", "rear_stiffness")
+LARGEST = 1e7  # of any parameter of a vehicle, SI
+
+
+def truth_entries(parameters: Sequence[str], inner: Sequence[Entry]) -> tuple[Entry, ...]:
+    """`true_<parameter>` of each parameter of a `Vehicle`, after the entries of an observation.
+
+    Raises ValueError for an unknown parameter, or where a name would stand twice.
+    """
+    fields = {each.name: each.metadata.get("unit") for each in dataclasses.fields(Vehicle)}
+    entries = []
+    for name in parameters:
+        unit = fields.get(name)
+        if unit is None:
+            known = ", ".join(key for key, value in fields.items() if value is not None)
+            raise ValueError(f"a vehicle has no parameter {name!r}; it has: {known}")
+        entries.append(Entry(f"true_{name}", unit, -LARGEST, LARGEST))
+    names = [entry.name for entry in (*inner, *entries)]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise ValueError(f"{', '.join(twice)} would stand twice in the observation")
+    return (*inner, *entries)
+
+
+def parameters_of(vehicle: Vehicle, parameters: Sequence[str]) -> npt.NDArray[np.float32]:
+    """The values of some parameters, (len(parameters),)."""
+    return np.array([getattr(vehicle, name) for name in parameters], np.float32)
+
+
+class TruthObservation(
+    gym.Wrapper[npt.NDArray[np.float32], Any, npt.NDArray[np.float32], Any], RecordConstructorArgs
+):
+    """Appends parameters of the car that is driven, as they are at the reset.
+
+    No sensor tells these: it makes the informed controller, with which others are compared, and
+    stands outside of any `EstimateObservation`.
+
+    parameters: names of `Vehicle`'s, appended as `true_<name>` in their units. `layout` describes
+    the whole observation. Raises ValueError for an unknown name or one that stands twice.
+    """
+
+    def __init__(self, env: gym.Env[Any, Any], parameters: Sequence[str] = STIFFNESSES) -> None:
+        RecordConstructorArgs.__init__(self, parameters=list(parameters))
+        gym.Wrapper.__init__(self, env)
+        self._parameters = tuple(parameters)
+        self.layout = truth_entries(self._parameters, env.get_wrapper_attr("layout"))
+        low, high = np.array([entry[2:] for entry in self.layout]).T.astype(np.float32)
+        self.observation_space = gym.spaces.Box(low, high, dtype=np.float32)
+        self._values = np.zeros(len(self._parameters), np.float32)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[npt.NDArray[np.float32], dict[str, Any]]:
+        """Reset the env and read its car."""
+        obs, info = self.env.reset(seed=seed, options=options)
+        base: Any = self.unwrapped
+        self._values = parameters_of(base.vehicle, self._parameters)
+        return np.concatenate([obs, self._values]), info
+
+    def step(self, action: Any) -> tuple[npt.NDArray[np.float32], Any, bool, bool, dict[str, Any]]:
+        """One env-step."""
+        obs, *rest = self.env.step(action)
+        return (np.concatenate([obs, self._values]), *rest)

@@ -1,0 +1,74 @@
+"""TruthObservation for vector environments."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import numpy.typing as npt
+from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
+from gymnasium.vector.utils import batch_space
+
+from .records import true_vehicles
+from .truth import STIFFNESSES, parameters_of, truth_entries
+
+Observations = npt.NDArray[np.float32]
+
+
+class TruthObservation(VectorWrapper[Observations, Any, Observations, Any, Any]):
+    """The vector twin of `sideslip.estimators.truth.TruthObservation`, with the same bits.
+
+    It stands outside of `sideslip.estimators.vector.EstimateObservation`. A row is told its new
+    car with the first observation of an episode; `final_obs` holds the old one's.
+
+    Raises TypeError where the env tells no layout or no vehicles, ValueError for an unknown name
+    or one that stands twice.
+    """
+
+    def __init__(
+        self, env: VectorEnv[Any, Any, Any], parameters: Sequence[str] = STIFFNESSES
+    ) -> None:
+        super().__init__(env)
+        if not hasattr(env, "layout"):
+            raise TypeError(
+                f"{type(env).__name__} tells no layout; wrap it in "
+                "sideslip.estimators.vector.EstimateObservation first"
+            )
+        self._parameters = tuple(parameters)
+        self.layout = truth_entries(self._parameters, env.layout)
+        low, high = np.array([entry[2:] for entry in self.layout]).T.astype(np.float32)
+        self.single_observation_space = gym.spaces.Box(low, high, dtype=np.float32)
+        self.observation_space = batch_space(self.single_observation_space, env.num_envs)
+        self._same_step = env.metadata.get("autoreset_mode") == AutoresetMode.SAME_STEP
+        self._values = np.zeros((env.num_envs, len(self._parameters)), np.float32)
+        self._ended = np.ones(env.num_envs, np.bool_)
+
+    def reset(
+        self, *, seed: Any = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observations, dict[str, Any]]:
+        """Reset the rows (those of options["reset_mask"]) and read their cars."""
+        mask = None if options is None else options.get("reset_mask")
+        rows = np.ones(self.num_envs, np.bool_) if mask is None else np.array(mask)
+        obs, infos = self.env.reset(seed=seed, options=options)
+        self._read(rows)
+        self._ended &= ~rows
+        return np.hstack([obs, self._values]), infos
+
+    def step(self, actions: Any) -> tuple[Observations, Any, Any, Any, dict[str, Any]]:
+        """One step of all rows."""
+        obs, rewards, terminated, truncated, infos = self.env.step(actions)
+        ended = np.logical_or(terminated, truncated)
+        if self._same_step:
+            for i in np.flatnonzero(ended):
+                infos["final_obs"][i] = np.concatenate([infos["final_obs"][i], self._values[i]])
+            self._read(ended)
+        else:
+            self._read(self._ended)
+        self._ended = ended
+        return np.hstack([obs, self._values]), rewards, terminated, truncated, infos
+
+    def _read(self, mask: npt.NDArray[np.bool_]) -> None:
+        rows = np.flatnonzero(mask)
+        cars = true_vehicles(self.unwrapped, rows.tolist())
+        for i, car in zip(rows, cars, strict=True):
+            self._values[i] = parameters_of(car, self._parameters)
