@@ -65,7 +65,8 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
     per second.
 
     ## Episode end
-    `terminated`: the car spun (sideslip above 0.5 rad) or left the ground. `truncated`: the
+    `terminated`: the car spun (sideslip above 0.5 rad) or left the ground, or the lane that a
+    driver keeps. `truncated`: the
     scenario's duration is over (the env truncates itself; there is no TimeLimit).
 
     ## Info

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 from .backend import jit
 from .elementary import smoothstep
 
-LEAD = 0.2  # of a gap's length: how far the path's transition reaches into the lanes beside it
+LEAD = 0.15  # of a gap's length: how far the path's transition reaches into the lanes beside it
 
 
 class Section(NamedTuple):
@@ -85,8 +85,8 @@ def sections(
 def path_of(track: str, width: float) -> Path:
     """The path through a track that begins at 0, in the standard's lengths.
 
-    It keeps to the centre of a lane but for the last fifth of the next gap's length, where it
-    begins to turn, and the first fifth of that before: there the car's side still is in the lane.
+    It keeps to the centre of a lane but turns a little before its end and has not quite turned
+    back at its beginning (`LEAD`), as far as the sides of the car stay between the cones.
     """
     shifts = []
     lanes = sections(track, width)

@@ -103,7 +103,9 @@ TABLE: dict[str, tuple[dict[str, Any], float, float, bool, dict[str, float]]] = 
 
 def test_every_paper_simulation_stands_in_the_table() -> None:
     assert set(TABLE) == set(OURS)
-    assert {name for name, each in SCENARIOS.items() if not each.scored} == {*OURS, *TWINS}
+    roads = {"split-friction", "curved-road", "curved-road-driver"}
+    unscored = {name for name, each in SCENARIOS.items() if not each.scored}
+    assert unscored - roads == {*OURS, *TWINS}
 
 
 @pytest.mark.smoke

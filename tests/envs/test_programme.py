@@ -56,6 +56,12 @@ def sine(start: float, hertz: float, t: np.ndarray) -> np.ndarray:
     return np.where(t >= start, np.sin(2.0 * np.pi * hertz * (t - start)), 0.0)
 
 
+def swept(t: np.ndarray) -> np.ndarray:
+    """The phase of a sweep from 0.4 to 0.5 Hz within 1.5 s: 2 pi times the integral of its Hz."""
+    end = 0.4 * 1.5 + 0.1 / 1.5 * 1.5**2 / 2.0
+    return 2.0 * np.pi * np.where(t < 1.5, 0.4 * t + 0.1 / 1.5 * t**2 / 2.0, end + 0.5 * (t - 1.5))
+
+
 def test_each_kind_is_what_its_name_says() -> None:
     t = np.arange(10_000) * TICK
     x = np.clip((t - [[0.5], [2.0], [3.5]]) / 0.2, 0.0, 1.0)
@@ -75,11 +81,34 @@ def test_each_kind_is_what_its_name_says() -> None:
         - 0.1 * 0.5 / 0.4 * sine(0.5, 0.5, t)
         + 0.03 * sine(0.5, 0.2, t)
         - 0.03 * 0.8 / 0.2 * sine(0.5, 0.8, t),
+        # FMVSS 126: three quarters of a wave, the second peak held, the last quarter
+        "sine-with-dwell": np.select(
+            [t < 0.5 + 1.875, t < 2.375 + 1.5, t < 3.875 + 0.625],
+            [0.1 * one, -0.1 + 0.0 * t, 0.1 * sine(2.0, 0.4, t)],
+        ),
+        "ramp": 0.1 * np.clip((t - 0.5) / 1.5, 0.0, 1.0),
+        "sweep": np.where(t > 0.5, 0.1 * np.sin(swept(t - 0.5)), 0.0),
+        "held-step": 0.1 * steps[0],
+        "driver": 0.0 * t,
     }
     assert set(expected) == set(STEERING_KINDS)
     for kind, angle in expected.items():
         # the sine's stated error, and the phase's rounding, on angles up to 0.3 rad
         np.testing.assert_allclose(steering(kind), angle, rtol=0.0, atol=1e-14)
+
+
+def test_the_dwell_of_fmvss_126_is_half_a_second_at_the_second_peak() -> None:
+    angle = steering("sine-with-dwell", 4.0, frequency=0.7, hold=0.5)
+    held = np.flatnonzero(angle == -0.1)
+    assert (held[0], len(held)) == (500 + round(750.0 / 0.7), 500)
+    assert np.all(np.diff(held) == 1)
+    before, after = angle[: held[0]], angle[held[-1] + 1 :]
+    # a tick is cut to whole milliseconds: at most half a tick from the peak, where the sine is flat
+    near = 0.1 * (1.0 - math.cos(2.0 * math.pi * 0.7 * 1.5 * TICK))
+    assert abs(before[-1] + 0.1) < near
+    assert abs(after[0] + 0.1) < near
+    moved = np.flatnonzero(angle)
+    assert moved[-1] - moved[0] + 1 == pytest.approx(1000.0 / 0.7 + 500.0, abs=2.0)
 
 
 @pytest.mark.parametrize("kind", STEERING_KINDS)
@@ -130,6 +159,18 @@ def test_draws_are_stable_up_to_the_critical_speed_less_5_percent(
         # the speed enters squared: the boundary is known to some roundings
         assert stable(drawn._replace(speed=limit * (1.0 - 1e-12)), car)
         assert not stable(drawn._replace(speed=limit * (1.0 + 1e-12)), car)
+
+
+@given(st.floats(0.7, 1.5), st.floats(0.7, 1.5), st.floats(0.5, 1.5), st.floats(0.5, 1.5))
+def test_a_car_whose_tyres_change_is_stable_before_and_after(
+    front: float, rear: float, later_front: float, later_rear: float
+) -> None:
+    drawn = DRAWN._replace(speed=9.0, front_stiffness=front, rear_stiffness=rear)
+    later = drawn._replace(front_stiffness=front * later_front, rear_stiffness=rear * later_rear)
+    changes = drawn._replace(tyre_change_time=4.0, front_change=later_front, rear_change=later_rear)
+    car = car_of(COMS)
+    assert stable(changes, car) == (stable(drawn, car) and stable(later, car))
+    assert stable(changes._replace(tyre_change_time=0.0), car) == stable(drawn, car)
 
 
 def test_wind_blows_from_its_start_up_to_its_end_at_its_arm_and_height() -> None:

@@ -16,6 +16,7 @@ from sideslip.envs.template import car_of
 pytestmark = pytest.mark.plain
 
 CAR = car_of(COMS)
+TRACK: dict[str, Any] = {"steering": "driver", "path": "iso-3888-2"}
 SCORED = [name for name, scenario in SCENARIOS.items() if scenario.scored]
 
 
@@ -48,15 +49,22 @@ def test_every_scored_scenario_draws_what_a_table_of_actions_would_need(name: st
     drawn = {Draws._fields[i] for i in np.flatnonzero(low < high)}
     expected = {"speed", "friction", "front_stiffness", "rear_stiffness", "side", "wind_side"}
     turns = {"onset", "amplitude"}
+    pairs = turns | {"amplitude_2", "frequency", "frequency_2", "frequency_3", "frequency_4"}
     expected |= {
         "straight": set(),
         "sine": turns | {"frequency"},
         "slalom": turns | {"frequency"},
         "lane-change": turns | {"frequency"},
         "step-steer": turns | {"hold"},
-        "random-steering": turns
-        | {"amplitude_2", "frequency", "frequency_2", "frequency_3", "frequency_4"},
+        "random-steering": pairs,
         "gust": {"wind_force", "wind_arm", "wind_start", "wind_length"},
+        "sine-with-dwell": turns | {"frequency"},
+        "double-lane-change": {"onset", "path_speed"},
+        "low-friction": turns | {"frequency"},
+        "brake-in-turn": turns,
+        "stiffness-step": pairs | {"tyre_change_time", "front_change", "rear_change"},
+        "sensor-outage": turns | {"frequency"},
+        "uneven-delay": pairs,
     }[name]
     assert drawn == expected
 
@@ -169,6 +177,24 @@ def test_round_trip_through_json(name: str) -> None:
         ({"surge": 1.0, "acceleration": 0.5}, "need the held speed"),
         ({"change_length": 0.0}, "change_length must be positive"),
         ({"surge_frequency": 0.0}, "surge_frequency must be positive"),
+        ({"path": "iso-3888-3"}, "unknown path 'iso-3888-3'; known: road, iso-3888-1, iso-3888-2"),
+        ({"path": "iso-3888-1"}, "path 'iso-3888-1' needs the steering 'driver', got 'straight'"),
+        ({"steering": "driver", "path_speed": 9.0}, "path_speed needs a track as path"),
+        (TRACK | {"path_speed": (0.0, 9.0)}, r"path_speed must be positive or None, got \(0.0"),
+        (TRACK | {"path_speed": 9.0, "speed": (0.0, 9.0)}, "path_speed needs a speed above zero"),
+        ({"driver_preview": 0.0}, "driver_preview must be positive, got 0.0"),
+        ({"driver_gain": math.nan}, "driver_gain nan is not finite"),
+        ({"driver_lag": -0.1}, "driver_lag is zero or more, got -0.1"),
+        ({"driver_rate": 0.0}, "driver_rate must be positive"),
+        ({"friction_right": 0.0}, "friction_right must be positive or None, got 0.0"),
+        ({"friction_right": math.inf}, "friction_right inf is not finite"),
+        ({"tyre_change_time": -1.0}, "tyre_change_time must be positive or None, got -1.0"),
+        ({"front_change": 0.0}, "front_change must be positive"),
+        ({"rear_change": (1.0, 0.5)}, r"rear_change \(1.0, 0.5\) is not finite, or its ends are"),
+        ({"curvature": (0.1, math.nan)}, r"curvature \(0.1, nan\) is not finite"),
+        ({"steering": "ramp", "hold": 0.0}, "hold of a ramp is 1 ms or more, got 0.0"),
+        ({"steering": "sweep", "hold": 0.0}, "hold of a sweep is 1 ms or more, got 0.0"),
+        ({"steering": "sine-with-dwell", "hold": -0.5}, "hold of a dwell is not negative"),
     ],
 )
 def test_values_that_cannot_be_are_refused_by_name(changes: dict[str, Any], message: str) -> None:
