@@ -16,7 +16,7 @@ from .elementary import sincos
 from .tracks import path_offset
 from .tyres import SLOW
 
-NEAR = 2.0  # wheelbases: a driver looks no nearer
+NEAR = 1.0  # wheelbases: a driver looks no nearer
 
 
 class Driver(NamedTuple):

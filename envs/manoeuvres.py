@@ -92,11 +92,11 @@ _MANOEUVRES = (
         hold=0.5,
         **_HARSH,
     ),
-    Scenario(  # at half the speed of a passenger car, on a track half as long
+    Scenario(  # the sections of the standard in the times they take at 25 to 32 km/h
         name="double-lane-change",
         duration=6.0,
         path="iso-3888-2",
-        path_speed=(8.0, 10.0),
+        path_speed=(7.0, 9.0),
         onset=(0.5, 1.0),
         **(_LANE | {"half_width": 2.0}),
         **_HARSH,
@@ -106,7 +106,7 @@ _MANOEUVRES = (
         duration=6.0,
         steering="lane-change",
         onset=(0.5, 1.5),
-        amplitude=(0.03, 0.07),
+        amplitude=(0.05, 0.07),
         frequency=(0.3, 0.6),
         **(_HARSH | {"friction": (0.27, 0.35)}),
     ),

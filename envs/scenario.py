@@ -72,9 +72,9 @@ class Scenario:
     mirror: bool = False
     path: str = "road"
     path_speed: Range | None = None
-    driver_preview: float = 1.0
+    driver_preview: float = 0.8
     driver_gain: float = 1.0
-    driver_lag: float = 0.15
+    driver_lag: float = 0.1
     driver_rate: float = 0.8
     speed: Range = 25.0 * KMH
     acceleration: float | None = None
