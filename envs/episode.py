@@ -17,8 +17,9 @@ from .vehicle import Vehicle
 
 T = TypeVar("T")
 
-NUMBERS = REPORT._fields[: REPORT.failure]
-"""The floats of `info`, in the order of a report; `failure` and `is_success` follow."""
+_NUMBERS = REPORT._fields[: REPORT.failure]  # of `info`; `failure` and `is_success` follow
+_KEYS = (*_NUMBERS, "failure", "is_success")
+_MASKS = tuple(f"_{key}" for key in _KEYS)
 
 
 def vehicle_in(template: Template, params: Array, state: Array) -> Vehicle:
@@ -56,13 +57,26 @@ def record_in(state: Array, rows: Array, packets: Array) -> Record:
     return Record(rows.copy(), packets.copy(), int(state[Z.clock + 2]) - len(rows) + 1)
 
 
-def info_of(report: Array) -> dict[str, Any]:
-    """`info` of a step or a reset from a report (len(Report),)."""
-    values = report.tolist()
-    info = dict(zip(NUMBERS, values, strict=False))
-    failure = info["failure"] = int(values[REPORT.failure])
-    info["is_success"] = values[REPORT.ended] == 1.0 and failure == RUNNING
-    return info
+def info_of(report: Array) -> tuple[dict[str, Any], int]:
+    """`info` of a step or a reset from a report (len(Report),), and how many packets came."""
+    (
+        t, beta, gamma, psi, beta_ref, gamma_ref, steer, yaw_moment, cost,
+        code, delivered, _, ended,
+    ) = report.tolist()  # fmt: skip
+    failure = int(code)
+    return {
+        "t": t,
+        "beta": beta,
+        "gamma": gamma,
+        "psi": psi,
+        "beta_ref": beta_ref,
+        "gamma_ref": gamma_ref,
+        "steer": steer,
+        "yaw_moment": yaw_moment,
+        "cost": cost,
+        "failure": failure,
+        "is_success": ended == 1.0 and failure == RUNNING,
+    }, int(delivered)
 
 
 def infos_of(reports: Array, rows: npt.NDArray[np.bool_]) -> dict[str, Any]:
@@ -78,14 +92,11 @@ def infos_of(reports: Array, rows: npt.NDArray[np.bool_]) -> dict[str, Any]:
         columns[:, rows] = reports[rows].T
     failure = columns[REPORT.failure].astype(np.int64)
     success = (columns[REPORT.ended] == 1.0) & (failure == RUNNING)
-    masks = iter(np.tile(rows, (len(NUMBERS) + 2, 1)))
-    infos: dict[str, Any] = {}
-    for key, values in zip(
-        (*NUMBERS, "failure", "is_success"),
-        (*columns[: len(NUMBERS)], failure, success),
-        strict=True,
-    ):
-        infos[key], infos[f"_{key}"] = values, next(masks)
+    told = (*columns[: len(_NUMBERS)], failure, success)
+    masks = np.empty((len(told), len(rows)), np.bool_)
+    masks[:] = rows
+    infos: dict[str, Any] = dict(zip(_KEYS, told, strict=True))
+    infos.update(zip(_MASKS, masks, strict=True))
     return infos
 
 

@@ -214,8 +214,9 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
         return obs, -info["cost"], terminated, truncated, info
 
     def _info(self, done: int) -> dict[str, Any]:
-        self.ticks_done, self.delivered = done, int(self._report[REPORT.packets])
-        return info_of(self._report)
+        self.ticks_done = done
+        info, self.delivered = info_of(self._report)
+        return info
 
     @property
     def record(self) -> Record:

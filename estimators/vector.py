@@ -7,7 +7,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
-from gymnasium.envs.registration import EnvSpec, WrapperSpec
+from gymnasium.envs.registration import EnvSpec, VectorizeMode, WrapperSpec
 from gymnasium.error import ResetNeeded
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
@@ -99,6 +99,12 @@ class EstimateObservation(
         name, kwargs = Single.class_name(), copy.deepcopy(self._saved_kwargs)
         twin = WrapperSpec(name, f"{Single.__module__}:{Single.__name__}", kwargs)
         spec.additional_wrappers += (twin,)
+        if spec.kwargs.get("vectorization_mode") == VectorizeMode.VECTOR_ENTRY_POINT.value:
+            spec.kwargs["vectorization_mode"] = VectorizeMode.SYNC.value
+            spec.kwargs.pop("info", None)
+            if "autoreset_mode" in spec.kwargs:
+                mode = spec.kwargs.pop("autoreset_mode")
+                spec.kwargs["vector_kwargs"] = {"autoreset_mode": mode}
         how = spec.kwargs.get("vector_kwargs", {})
         if isinstance(how.get("autoreset_mode"), AutoresetMode):
             how["autoreset_mode"] = how["autoreset_mode"].value
@@ -187,8 +193,11 @@ class EstimateObservation(
         for key, place in says.keys:
             if place == NEES and not known:
                 continue
-            values = said[:, place].copy()
-            infos[key], infos[f"_{key}"] = values, mask.copy()
+            values, told = said[:, place].copy(), mask.copy()
+            if place == NEES:  # some rows' truth may be untold
+                told &= infos.get("_beta", True)
+                values[~told] = 0.0
+            infos[key], infos[f"_{key}"] = values, told
             if place == BETA:
                 self._records.annotate(key, values, mask)
 

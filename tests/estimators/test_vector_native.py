@@ -1,0 +1,136 @@
+"""EstimateObservation around the vector env: the bits of the one around single environments."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from sideslip.estimators import FILTERS
+from sideslip.estimators.vector import EstimateObservation
+from sideslip.estimators.wrappers import EstimateObservation as Single
+from tests.envs.batches import MODES, pair
+from tests.estimators.fleets import BAD, UNEVEN, VISION, home, outputs, same_bits
+
+pytestmark = pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning")
+FUSION = "sideslip/YawFusion-v0"
+
+
+def wrapped(env_id: str, count: int, mode: str, layer: dict[str, Any], **kwargs: Any) -> Any:
+    """Around SyncVectorEnv, and around the vector env."""
+    return [EstimateObservation(env, **layer) for env in pair(env_id, count, mode, **kwargs)]
+
+
+def drive(alone: Any, together: Any, steps: int) -> int:
+    ended = 0
+    for step in range(steps):
+        shape = alone.action_space.shape
+        told = np.random.default_rng(step).uniform(-1.0, 1.0, shape).astype(np.float32)
+        if step % 7 == 6:
+            told[step % len(told)] = BAD
+        one = alone.step(told)
+        same_bits(one, together.step(told))
+        ended += int(np.logical_or(one[2], one[3]).sum())
+    return ended
+
+
+QUICK = ("exact-kf", "course-kf")
+KINDS = [pytest.param(name, marks=() if name in QUICK else (pytest.mark.long,)) for name in FILTERS]
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("name", KINDS)
+def test_every_filter_says_the_same(name: Any, mode: str) -> None:
+    env_id, sensor = home(name)
+    layer = {"estimator": name, "outputs": outputs(name)}
+    clocks: dict[str, Any] = {sensor: {"phase": None, "loss": 0.2}}
+    alone, together = wrapped(env_id, 3, mode, layer, **clocks)
+    assert together.layout == alone.layout
+    same_bits(alone.reset(seed=[11, 5, 7]), together.reset(seed=[11, 5, 7]))
+    assert drive(alone, together, 60) > 6
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("env_id", [VISION, UNEVEN, FUSION])
+def test_so_it_does_over_many_steps(env_id: str, mode: str) -> None:
+    alone, together = wrapped(env_id, 5, mode, {"estimator": "multirate-kf"})
+    same_bits(alone.reset(seed=1), together.reset(seed=1))
+    assert drive(alone, together, 20_000) > 200
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_masks_and_other_scenarios_tell_the_filters(mode: str) -> None:
+    alone, together = wrapped(VISION, 3, mode, {"estimator": "multirate-kf"})
+    same_bits(alone.reset(seed=1), together.reset(seed=1))
+    for k, scenario in enumerate(("uneven-delay-fig5", "tie-vision-fig7", "sine")):
+        drive(alone, together, 12)
+        mask = np.array([True, k == 1, False])
+        options = {"reset_mask": mask, "scenario": scenario, "duration": 0.08}
+        one = alone.reset(seed=k, options=dict(options))
+        same_bits(one, together.reset(seed=k, options=dict(options)))
+    assert drive(alone, together, 30) > 3
+
+
+def test_rows_of_different_scenarios_have_their_own_filters() -> None:
+    """Each row has the bits of the single env, wrapped and reset alone."""
+    layer: dict[str, Any] = {"estimator": "multirate-kf"}
+    scenarios = ["uneven-delay-fig5", "tie-vision-fig7", "sine"]
+    together = EstimateObservation(gym.make_vec(VISION, num_envs=3), **layer)
+    obs, infos = together.reset(seed=4, options={"scenario": scenarios, "friction": 0.8})
+    cars = [Single(gym.make(VISION), **layer) for _ in scenarios]
+    for i, car in enumerate(cars):
+        options = {"scenario": scenarios[i], "friction": 0.8}
+        alone, info = car.reset(seed=4 + i, options=options)
+        assert alone.tobytes() == obs[i].tobytes()
+        assert info == {key: infos[key][i] for key in info}
+    for step in range(40):
+        told = np.full((3, 1), 0.02 * step, np.float32)
+        obs, rewards, _, _, infos = together.step(told)
+        for i, car in enumerate(cars):
+            alone, reward, _, _, info = car.step(told[i])
+            assert alone.tobytes() == obs[i].tobytes() and reward == rewards[i]
+            assert info == {key: infos[key][i] for key in info}
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_nees_is_told_where_the_truth_is(mode: str) -> None:
+    """With infos at the ends only, that is where a row's episode ended."""
+    every, ends = (
+        EstimateObservation(
+            gym.make_vec(VISION, num_envs=3, autoreset_mode=mode, info=info, on_bad_action="fail"),
+            "multirate-kf",
+        )
+        for info in ("all", "ends")
+    )
+    every.reset(seed=0)
+    assert "nees" not in ends.reset(seed=0)[1]
+    for step in range(20):
+        told = np.zeros((3, 1), np.float32)
+        if step % 5 == 4:
+            told[step % 3] = BAD
+        one, other = every.step(told), ends.step(told)
+        same_bits((*one[:4], {}), (*other[:4], {}))
+        assert other[4]["beta_hat"].tobytes() == one[4]["beta_hat"].tobytes()
+        ended = one[2] | one[3]
+        if mode == "SameStep":
+            one, other = ({**each[4].get("final_info", {})} for each in (one, other))  # type: ignore[assignment]
+            same_bits((0.0, one), (0.0, other))
+        elif ended.any():
+            assert other[4]["_nees"].tolist() == ended.tolist()
+            assert other[4]["nees"][ended].tobytes() == one[4]["nees"][ended].tobytes()
+            assert not other[4]["nees"][~ended].any()
+        else:
+            assert "nees" not in other[4]
+
+
+@pytest.mark.parametrize("told", [{}, {"autoreset_mode": "SameStep", "info": "ends"}])
+def test_the_spec_builds_environments_wrapped_one_by_one(told: dict[str, Any]) -> None:
+    env = gym.make_vec(VISION, num_envs=2, **told)
+    together = EstimateObservation(env, "multirate-kf")
+    assert together.spec is not None
+    again = gym.make_vec(gym.envs.registration.EnvSpec.from_json(together.spec.to_json()))
+    assert again.num_envs == 2
+    assert again.metadata["autoreset_mode"] == env.metadata["autoreset_mode"]
+    one, other = again.reset(seed=4)[0], together.reset(seed=4)[0]
+    assert one.tobytes() == other.tobytes()
