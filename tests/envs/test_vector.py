@@ -12,6 +12,7 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 from gymnasium.vector.utils import batch_space
+from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
 from sideslip.envs import StabilityVectorEnv
 
@@ -221,6 +222,7 @@ def test_spaces_and_returned_arrays_follow_gymnasium(name: str) -> None:
     assert env.closed
 
 
+@pytest.mark.plain
 def test_disabled_rows_wait_for_a_reset() -> None:
     """Each row's episode is the single env's; a row that is over refuses the step of all."""
     alone, env = (
@@ -239,8 +241,8 @@ def test_disabled_rows_wait_for_a_reset() -> None:
     same_cars(alone, env)
 
 
-def test_the_order_of_bad_rows_does_not_matter_to_their_neighbours() -> None:
-    """A row that fails leaves the others' bits alone."""
+@pytest.mark.plain
+def test_a_row_that_fails_leaves_its_neighbours_alone() -> None:
     one, other = (batch(FUSION, 4, scenario=SHORT, on_bad_action="fail") for _ in range(2))
     for env in (one, other):
         env.reset(seed=0)
@@ -253,3 +255,21 @@ def test_the_order_of_bad_rows_does_not_matter_to_their_neighbours() -> None:
         kept = [0, 1, 3]
         assert bits([each[kept] for each in first[:4]]) == bits([each[kept] for each in second[:4]])
         first, second = one.step(still), other.step(still)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_gymnasiums_vector_wrappers_go_around_it(mode: str) -> None:
+    """Episode statistics are those around single environments, but for the time they took."""
+    alone, together = pair(FUSION, 3, mode)
+    wrapped: list[Any] = [RecordEpisodeStatistics(env) for env in (alone, together)]
+    same(*(env.reset(seed=0) for env in wrapped))
+    ended = 0
+    for step in range(120):
+        told = actions(alone, step)
+        (*one, first), (*other, second) = (env.step(told) for env in wrapped)
+        for infos in (first, second):
+            if "episode" in infos:
+                ended += infos["_episode"].sum()
+                infos["episode"].pop("t")
+        same((*one, first), (*other, second))
+    assert ended > 20

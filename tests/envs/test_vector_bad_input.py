@@ -11,6 +11,8 @@ from sideslip.envs import FAILURES, StabilityVectorEnv
 
 from .batches import batch, plain
 
+pytestmark = pytest.mark.plain
+
 FUSION, AFS = "sideslip/YawFusion-v0", "sideslip/AfsYawFusion-v0"
 
 ARGUMENTS: list[tuple[dict[str, Any], type[Exception], str]] = [

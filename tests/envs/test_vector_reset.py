@@ -82,6 +82,7 @@ def test_each_row_may_have_options_of_its_own(options: dict[str, Any], mode: str
     assert all(each == together.setting.scenario for each in together.scenario)  # all were reset
 
 
+@pytest.mark.plain
 def test_rows_that_are_told_the_same_share_what_is_built() -> None:
     env = batch(FUSION, 4)
     env.reset(seed=0, options={"scenario": ["sine", "slalom", "sine", "sine"]})
