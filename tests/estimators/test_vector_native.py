@@ -10,10 +10,10 @@ from sideslip.estimators import FILTERS
 from sideslip.estimators.vector import EstimateObservation
 from sideslip.estimators.wrappers import EstimateObservation as Single
 from tests.envs.batches import MODES, pair
-from tests.estimators.fleets import BAD, UNEVEN, VISION, home, outputs, same_bits
+from tests.envs.helpers import IDS
+from tests.estimators.fleets import BAD, VISION, home, outputs, same_bits
 
 pytestmark = pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning")
-FUSION = "sideslip/YawFusion-v0"
 
 
 def wrapped(env_id: str, count: int, mode: str, layer: dict[str, Any], **kwargs: Any) -> Any:
@@ -52,9 +52,10 @@ def test_every_filter_says_the_same(name: Any, mode: str) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("env_id", [VISION, UNEVEN, FUSION])
-def test_so_it_does_over_many_steps(env_id: str, mode: str) -> None:
-    alone, together = wrapped(env_id, 5, mode, {"estimator": "multirate-kf"})
+@pytest.mark.parametrize("env_id", IDS)
+def test_so_it_does_over_a_hundred_thousand_steps(env_id: str, mode: str) -> None:
+    name = "course-kf" if env_id == "sideslip/YawGps-v0" else "multirate-kf"
+    alone, together = wrapped(env_id, 5, mode, {"estimator": name})
     same_bits(alone.reset(seed=1), together.reset(seed=1))
     assert drive(alone, together, 20_000) > 200
 
