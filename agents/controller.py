@@ -1,7 +1,6 @@
 """What every classical controller shares: named inputs, batches, memory outside the object."""
 
 from abc import ABC, abstractmethod
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt

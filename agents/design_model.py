@@ -181,9 +181,7 @@ def regulator(model: DesignModel) -> Array:
     right = model.Q[:d, d:] - K.T @ N2.T + closed.T @ P @ A12
     lhs = np.eye(right.size) - np.kron(W.T, closed.T)
     P12 = np.linalg.solve(lhs, right.ravel(order="F")).reshape(right.shape, order="F")
-    answer = np.linalg.solve(
-        model.R + B.T @ P @ B, B.T @ (P @ A12 + P12 @ W) + N2.T
-    )
+    answer = np.linalg.solve(model.R + B.T @ P @ B, B.T @ (P @ A12 + P12 @ W) + N2.T)
     return np.asarray(np.hstack([K, answer]), np.float64)
 
 

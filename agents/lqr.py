@@ -162,6 +162,4 @@ class Lqr(Controller):
 
     def _law(self, inputs: Array, state: Array, action: npt.NDArray[np.float64]) -> None:
         share = 0.5 * self.vehicle.rear_track / self.vehicle.wheel_radius / self.full_scale
-        _lqr_law(
-            inputs, self.table, self.axes, int(self.scheduled), share, self.authority, action
-        )
+        _lqr_law(inputs, self.table, self.axes, int(self.scheduled), share, self.authority, action)

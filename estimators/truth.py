@@ -11,6 +11,7 @@ from gymnasium.utils import RecordConstructorArgs
 
 from ..envs.layout import Entry
 from ..envs.vehicle import Vehicle
+from .estimator import Estimator
 
 STIFFNESSES = ("front_stiffness", "rear_stiffness")
 LARGEST = 1e7  # of any parameter of a vehicle, SI
@@ -39,6 +40,27 @@ def truth_entries(parameters: Sequence[str], inner: Sequence[Entry]) -> tuple[En
 def parameters_of(vehicle: Vehicle, parameters: Sequence[str]) -> npt.NDArray[np.float32]:
     """The values of some parameters, (len(parameters),)."""
     return np.array([getattr(vehicle, name) for name in parameters], np.float32)
+
+
+def as_built(estimator: Estimator, built: Vehicle, vehicle: Vehicle) -> Vehicle:
+    """The car to build an estimator for, so that the one at hand serves wherever it can.
+
+    Where gains follow P nothing is designed from the stiffnesses: `tell_stiffness` will do.
+    """
+    if estimator.filters[0].periodic:
+        return vehicle
+    return vehicle.replace(
+        name=built.name,
+        friction=built.friction,
+        front_stiffness=built.front_stiffness,
+        rear_stiffness=built.rear_stiffness,
+    )
+
+
+def tell_stiffness(estimator: Estimator, vehicle: Vehicle) -> None:
+    """Let a filter have a car's stiffnesses from its next reset on."""
+    for f in estimator.filters:
+        f.car[4], f.car[5] = vehicle.front_stiffness, vehicle.rear_stiffness
 
 
 class TruthObservation(
@@ -73,5 +95,5 @@ class TruthObservation(
 
     def step(self, action: Any) -> tuple[npt.NDArray[np.float32], Any, bool, bool, dict[str, Any]]:
         """One env-step."""
-        obs, *rest = self.env.step(action)
-        return (np.concatenate([obs, self._values]), *rest)
+        obs, reward, terminated, truncated, info = self.env.step(action)
+        return np.concatenate([obs, self._values]), reward, terminated, truncated, info

@@ -19,6 +19,7 @@ from .batch import BatchEstimator
 from .designs import Told
 from .outputs import BETA, NEES, outputs_of
 from .records import Batch, BatchedRecords, SyncRecords, records_of, true_vehicles
+from .truth import as_built, tell_stiffness
 from .wrappers import TRUTH
 from .wrappers import EstimateObservation as Single
 
@@ -78,9 +79,9 @@ class EstimateObservation(
         self._same_step = mode == AutoresetMode.SAME_STEP
         self._truth = isinstance(vehicle, str) and vehicle == TRUTH
         self._vehicle = None if vehicle is None or self._truth else vehicle_from(vehicle)
-        self.estimator = BatchEstimator(
-            estimator, self._told(range(env.num_envs)), self._records.dt, options or {}
-        )
+        told = self._told(range(env.num_envs))
+        self._built = told[0].vehicle
+        self.estimator = BatchEstimator(estimator, told, self._records.dt, options or {})
         inner = () if replace else getattr(env, "layout", self._records.layout)
         self._says = outputs_of(estimator, self.estimator.names, outputs, std, name, inner)
         self.layout: tuple[Entry, ...] = self._says.layout
@@ -158,7 +159,16 @@ class EstimateObservation(
         """Reset the estimators of some rows with the clocks of their new episodes."""
         rows = np.flatnonzero(mask).tolist()
         if rows:
-            self.estimator.tell(rows, self._told(rows))
+            told = self._told(rows)
+            if not self._truth:
+                self.estimator.tell(rows, told)
+            else:
+                first = self.estimator[0]
+                plain = [as_built(first, self._built, each.vehicle) for each in told]
+                cars = zip(told, plain, strict=True)
+                self.estimator.tell(rows, [each._replace(vehicle=car) for each, car in cars])
+                for i, each in zip(rows, told, strict=True):
+                    tell_stiffness(self.estimator[i], each.vehicle)
             self.estimator.reset(mask)
 
     def _finish(self, infos: dict[str, Any], ended: Mask) -> None:

@@ -15,6 +15,7 @@ from .estimator import Estimator
 from .make import make_estimator
 from .observing import observe_entry
 from .outputs import BETA, outputs_of
+from .truth import as_built, tell_stiffness
 
 _MAY_STAND_BETWEEN = (PassiveEnvChecker, OrderEnforcing)
 TRUTH = "truth"  # in place of a vehicle: the one that is driven
@@ -32,7 +33,8 @@ class EstimateObservation(
     estimator: a name of `make_estimator`. outputs: states to append, each as `<state>_hat`, then,
     if `std`, each one's standard deviation as `<state>_std`. replace: the observation is these
     alone. vehicle: what the estimator is told (a preset, a mapping; default the env's nominal;
-    "truth": the true car of each episode, as it is at the reset). options: of `make_estimator`. name: put before every name as `<name>_`.
+    "truth": the true car of each episode, as it is at the reset). options: of `make_estimator`.
+    name: put before every name as `<name>_`.
 
     `info` gains `beta_hat` and `beta_std` where the estimator has beta and, if beta or gamma is
     among the outputs, `nees`: their normalised estimation error squared, divided by their number.
@@ -85,6 +87,8 @@ class EstimateObservation(
         vehicle = base.nominal if self._vehicle is None else self._vehicle
         if self._truth:
             vehicle = base.vehicle
+            if self._told is not None:
+                vehicle = as_built(self.estimator, self._told[0], vehicle)
         speed = getattr(base, "held_speed", None)
         clocks = {name: (s.period, s.delays, s.jitter) for name, s in base.slow_sensors.items()}
         told = vehicle, clocks, speed
@@ -98,6 +102,8 @@ class EstimateObservation(
                 **self._options,
             )
             self._told = told
+        if self._truth:
+            tell_stiffness(self.estimator, base.vehicle)
         return self.estimator
 
     def reset(

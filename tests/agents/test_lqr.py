@@ -1,0 +1,171 @@
+"""The LQR: its model is the plant, its gains are python-control's, its loops are stable."""
+
+import sys
+from typing import Any
+
+import control
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from sideslip.agents import Lqr, make_agent
+from sideslip.agents.design_model import (
+    DYNAMIC,
+    Purpose,
+    closed_loop,
+    design_model,
+    regulator,
+)
+from sideslip.agents.lqr import SPEEDS
+from sideslip.envs import COMS, PASSENGER_CAR
+from sideslip.envs.reference import MODEL, ZERO_SLIP, reference, target_of
+from sideslip.estimators import EstimateObservation
+
+SMALL = {
+    "base": "straight",
+    "small_angle": True,
+    "linear_tyres": True,
+    "roll": False,
+    "mirror": False,
+    "speed": 7.0,
+    "front_stiffness": 1.0,
+    "rear_stiffness": 1.0,
+    "disturbance_force": 0.0,
+    "disturbance_moment": 0.0,
+    "noise": {"wheel": 0.0},
+}
+BOTH = Purpose(10, COMS.yaw_moment_limit, True, MODEL, "forces")
+
+
+def estimating(env: Any, *disturbances: str) -> Any:
+    return EstimateObservation(env, "exact-kf", outputs=["beta", "gamma", *disturbances])
+
+
+@pytest.fixture
+def steered() -> Any:
+    return estimating(gym.make("sideslip/AfsYawFusion-v0", scenario=SMALL))
+
+
+def agent_of(env: Any, **options: Any) -> Lqr:
+    agent = make_agent("lqr", env, **options)
+    assert isinstance(agent, Lqr)
+    return agent
+
+
+@pytest.mark.parametrize("lag", [0.0, 0.005])
+@pytest.mark.parametrize("period", [1, 10])
+def test_the_model_is_the_plant_and_its_cost_the_envs(period: int, lag: float) -> None:
+    """Two steps of the env and of x+ = G x + H u, and what they cost, steering and all."""
+    car = {"base": "coms", "motor_lag": lag, "steering_lag": 6.0 * lag, "steering_rate": 1e6}
+    scenario = SMALL | {"steering": "step", "onset": -10.0, "hold": 1e6, "amplitude": 0.01}
+    env: Any = gym.make(
+        "sideslip/AfsYawFusion-v0", scenario=scenario, vehicle=car, control_period=period
+    )
+    env.reset(seed=0)
+    vehicle = env.unwrapped.vehicle
+    model = design_model(vehicle, 7.0, Purpose(period, vehicle.yaw_moment_limit, True, MODEL))
+    refs = reference(0.01, 7.0, target_of(vehicle), MODEL)
+    x = np.array([0.0, 0.0, 0.0, 0.01, 0.01, *refs])
+    for action in ([0.1, 0.05], [-0.2, 0.1]):
+        *_, info = env.step(np.array(action, np.float32))
+        u = np.array(action, np.float32) * np.array([1.0, vehicle.steering_authority])
+        assert info["cost"] == pytest.approx(
+            x @ model.Q @ x + u @ model.R @ u + 2 * x @ model.N @ u
+        )
+        x = model.G @ x + model.H @ u
+        assert (info["beta"], info["gamma"]) == pytest.approx((x[0], x[1]), rel=1e-5)
+
+
+@pytest.mark.parametrize("speed", [2.0, 7.0, 30.0])
+@pytest.mark.parametrize("kind", [ZERO_SLIP, MODEL])
+@pytest.mark.parametrize("steers", [False, True])
+def test_gains_are_python_controls_for_all_states_at_once(
+    speed: float, kind: int, steers: bool
+) -> None:
+    """`dlqr` itself needs states that can be brought to rest: what is held decays slowly there."""
+    purpose = Purpose(10, COMS.yaw_moment_limit, steers, kind, "rates")
+    model = design_model(COMS, speed, purpose)
+    G = model.G.copy()
+    held = range(len(DYNAMIC), len(G))
+    G[held, held] *= 1.0 - 1e-8
+    wanted, _, _ = control.dlqr(G, model.H, model.Q, model.R, model.N)
+    scale = np.abs(wanted).max()
+    assert regulator(model) / scale == pytest.approx(np.asarray(wanted) / scale, abs=1e-6)
+
+
+def test_tabled_gains_are_the_designed_ones(steered: Any) -> None:
+    agent = agent_of(steered)
+    for speed in (SPEEDS[3], SPEEDS[20]):
+        wanted = regulator(design_model(COMS, speed, agent.purpose))
+        assert agent.gains(speed) == pytest.approx(wanted, rel=1e-12)
+    assert (agent.gains(0.1) == agent.gains(SPEEDS[0])).all()
+    assert (agent.gains(99.0) == agent.gains(SPEEDS[-1])).all()
+
+
+@pytest.mark.parametrize("car", [COMS, PASSENGER_CAR], ids=["coms", "passenger-car"])
+@pytest.mark.parametrize("steers", [False, True])
+def test_the_closed_loop_is_stable_over_the_speeds(car: Any, steers: bool) -> None:
+    """At the tabled speeds and between; the COMS alone is unstable above 17.6 m/s."""
+    purpose = Purpose(10, car.yaw_moment_limit, steers, MODEL)
+    gains = [regulator(design_model(car, speed, purpose)) for speed in SPEEDS[::4]]
+    for i, (low, high) in enumerate(zip(SPEEDS[::4], SPEEDS[4::4], strict=False)):
+        for share in (0.0, 0.5):
+            K = (1.0 - share) * gains[i] + share * gains[i + 1]
+            model = design_model(car, low + share * (high - low), purpose)
+            assert np.abs(np.linalg.eigvals(closed_loop(model, K))).max() < 1.0
+
+
+def test_it_follows_the_references_where_they_can_be_had(steered: Any) -> None:
+    """With both inputs free of limits, beta and gamma reach the model's steady state."""
+    model = design_model(COMS, 7.0, agent_of(steered).purpose)
+    K, d = regulator(model), len(DYNAMIC)
+    refs = reference(0.01, 7.0, target_of(COMS), MODEL)
+    held = np.array([0.01, *refs])
+    closed = model.G - model.H @ K
+    rest = np.linalg.solve(np.eye(d) - closed[:d, :d], closed[:d, d : d + 3] @ held)
+    assert rest[:2] == pytest.approx(refs, rel=0.02)
+
+
+def test_the_law_is_minus_k_x(steered: Any) -> None:
+    names = [entry.name for entry in steered.get_wrapper_attr("layout")]
+    agent = agent_of(steered)
+    obs = np.zeros(len(names), np.float32)
+    told = {
+        "wheel_left": 6.9, "wheel_right": 7.1, "torque_left": -1.0, "torque_right": 2.0,
+        "steer": 0.001, "steer_command": 0.002, "beta_ref": 1e-4, "gamma_ref": 2e-3,
+        "beta_hat": 2e-4, "gamma_hat": 1e-3,
+    }  # fmt: skip
+    for name, value in told.items():
+        obs[names.index(name)] = value
+    share = 3.0 / (2.0 * COMS.motor_torque)
+    x = [2e-4, 1e-3, share, 0.001, 0.002, 1e-4, 2e-3]
+    wanted = -agent.gains(7.0) @ x / [1.0, COMS.steering_authority]
+    action, _ = agent.predict(obs)
+    assert action == pytest.approx(wanted, rel=1e-4) and np.abs(wanted).max() < 1.0
+
+
+def test_disturbances_and_gyro_are_read_where_they_are() -> None:
+    plain = gym.make("sideslip/YawGps-v0")
+    assert "gyro" in agent_of(EstimateObservation(plain, "dakf", outputs=["beta"])).needs
+    assert agent_of(estimating(plain)).purpose.disturbances == "none"
+    assert agent_of(estimating(plain, "F_d", "N_d")).purpose.disturbances == "forces"
+    walks = EstimateObservation(plain, "dakf", outputs=["beta", "gamma", "d1", "d2"])
+    assert agent_of(walks).purpose.disturbances == "rates"
+
+
+def test_bad_input(steered: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ValueError, match=r"beta_hat.*EstimateObservation"):
+        make_agent("lqr", gym.make("sideslip/YawFusion-v0"))
+    with pytest.raises(ValueError, match="disturbance_time is positive"):
+        make_agent("lqr", steered, disturbance_time=0.0)
+    with pytest.raises(ValueError, match="names two entries or none"):
+        make_agent("lqr", steered, stiffness=["a"])
+    with pytest.raises(ValueError, match="span rises from above zero"):
+        make_agent("lqr", steered, span=(1.0, 0.5))
+    with pytest.raises(TypeError, match="weight"):
+        make_agent("lqr", steered, weight=1.0)
+    with pytest.raises(ValueError, match="positive speed"):
+        design_model(COMS, 0.0, BOTH)
+    monkeypatch.setitem(sys.modules, "control", None)
+    with pytest.raises(ModuleNotFoundError, match=r"sideslip\[design\]"):
+        make_agent("lqr", steered, disturbance_time=0.123)
