@@ -82,8 +82,25 @@ def riccati_variances(
     seconds: float = 8.0,
     **options: float,
 ) -> dict[str, Array]:
-    """Variances of the optimal estimates by state, (ticks,) each, from a start that is known: a
-    periodic Riccati recursion in NumPy and textbook letters.
+    """Variances of the optimal estimates by state, (ticks,) each: the diagonals of
+    `riccati_covariances`, which says what it takes and raises."""
+    P, names = riccati_covariances(
+        vehicle, sensors=sensors, speed=speed, dt=dt, seconds=seconds, **options
+    )
+    return {name: P[:, i, i].copy() for i, name in enumerate(names)}
+
+
+def riccati_covariances(
+    vehicle: Vehicle,
+    *,
+    sensors: Mapping[str, SlowSensor],
+    speed: float,
+    dt: float = TICK,
+    seconds: float = 8.0,
+    **options: float,
+) -> tuple[Array, tuple[str, ...]]:
+    """Covariances of the optimal estimates at every tick, (ticks, n, n), and the n states' names,
+    from a start that is known: a periodic Riccati recursion in NumPy and textbook letters.
 
     States are the bicycle's with the camera's, and the disturbing force and moment "F_d", "N_d".
     options: the standard deviations of `NOISE` and `DISTURBANCE` of `estimators.options`. Raises
@@ -109,8 +126,8 @@ def riccati_variances(
     noise[:n, :n] = Q
     P, gyro = np.zeros((N, N)), np.eye(1, N, 1)
     P[n - 2, n - 2], P[n - 1, n - 1] = sd["force_sd"] ** 2, sd["moment_sd"] ** 2
-    x, variances = np.zeros(N), np.zeros((round(seconds / dt), n))
-    for k in range(len(variances)):
+    x, covariances = np.zeros(N), np.zeros((round(seconds / dt), n, n))
+    for k in range(len(covariances)):
         for link in links:
             L = link.latch(k - 1, N)
             P = L @ P @ L.T
@@ -120,8 +137,8 @@ def riccati_variances(
         for link in links:
             for C in link.arriving(k, N):
                 _, P = kalman.update(x, P, C, link.R, np.zeros(len(C)))
-        variances[k] = np.diag(P)[:n]
-    return dict(zip(names, variances.T, strict=True))
+        covariances[k] = P[:n, :n]
+    return covariances, names
 
 
 def _disturbed(
