@@ -4,10 +4,12 @@ from collections.abc import Callable
 from typing import Any
 
 from .controller import Controller, NoControl
+from .esc import Esc
 from .given import AnyEnv
 from .informed import Informed
 from .lqr import Lqr
 from .model_following import ModelFollowing
+from .sliding_mode import SlidingMode
 from .two_dof import Feedforward, TwoDof
 
 AGENTS: dict[str, Callable[..., Controller]] = {
@@ -15,6 +17,8 @@ AGENTS: dict[str, Callable[..., Controller]] = {
     "feedforward": Feedforward,
     "two-dof": TwoDof,
     "model-following": ModelFollowing,
+    "esc": Esc,
+    "sliding-mode": SlidingMode,
     "lqr": Lqr,
     "informed": Informed,
 }
@@ -22,11 +26,13 @@ AGENTS: dict[str, Callable[..., Controller]] = {
 __all__ = [
     "AGENTS",
     "Controller",
+    "Esc",
     "Feedforward",
     "Informed",
     "Lqr",
     "ModelFollowing",
     "NoControl",
+    "SlidingMode",
     "TwoDof",
     "make_agent",
 ]

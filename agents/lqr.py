@@ -23,7 +23,7 @@ STATES = ("steer", "steer_command", "beta_ref", "gamma_ref")
 
 
 @jit
-def _cell(axis: Any, at: Any) -> Any:
+def cell(axis: Any, at: Any) -> Any:
     """(i, share): where a value lies in an axis, held at its ends; (0, 0) of a single knot."""
     if len(axis) < 2:
         return 0, 0.0
@@ -37,9 +37,9 @@ def _cell(axis: Any, at: Any) -> Any:
 @jit
 def interpolated(table: Any, axes: Any, v: Any, front: Any, rear: Any, K: Any) -> None:
     """Fill K (m, n) from a table (speeds, fronts, rears, m, n), linear along each axis."""
-    i, a = _cell(axes[0], v)
-    j, b = _cell(axes[1], front)
-    k, c = _cell(axes[2], rear)
+    i, a = cell(axes[0], v)
+    j, b = cell(axes[1], front)
+    k, c = cell(axes[2], rear)
     K[:] = 0.0
     for corner in range(8):
         p, q, r = corner & 1, (corner >> 1) & 1, corner >> 2
