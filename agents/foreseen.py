@@ -1,0 +1,239 @@
+"""An episode known before it begins: what the driver, the wind and the disturbances will do."""
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from ..envs.actuators import Lag, lag_of, lagged
+from ..envs.backend import plain
+from ..envs.dynamics import Car, Motion, Road
+from ..envs.kernel import step_vehicle
+from ..envs.layout import Drive, P, Task, Z
+from ..envs.programme import (
+    FOREVER,
+    STEERING_WIDTH,
+    Pace,
+    Wind,
+    acceleration_command,
+    steering_at,
+    wind_at,
+)
+from ..envs.record import TICK
+from ..envs.reference import Target
+from ..envs.switches import REPORT, Switches
+
+Array = npt.NDArray[np.float64]
+
+
+class Known(NamedTuple):
+    """What is known of one step of the plan; its `command` and `weight` are of the step's start."""
+
+    steer_start: Any  # rad, front steering angle without what is added
+    steer_middle: Any
+    steer_end: Any
+    command: Any  # rad, the driver's
+    F_d: Any  # N, mean over the step, with the wind's
+    N_d: Any  # N m
+    N_x: Any  # N m
+    C_f: Any  # N/rad
+    C_r: Any
+    mu: Any
+    speed: Any  # m/s, the driver's wish
+    ahead: Any  # m/s2, the driver's acceleration, fed forward
+    weight: Any  # s for which the cost rate at the start counts
+
+
+class State(NamedTuple):
+    """What a plan may have to carry from step to step: motion, actuators, the driver's integral."""
+
+    v_x: Any
+    v_y: Any
+    gamma: Any
+    psi: Any
+    X: Any
+    Y: Any
+    s: Any
+    y: Any
+    theta: Any
+    phi: Any
+    phi_dot: Any
+    T_l: Any
+    T_r: Any
+    integral: Any
+    slewing: Any
+    added: Any
+
+
+class Fixed(NamedTuple):
+    """What does not change within an episode; hashable, so that it can name a solver.
+
+    car: with zeros for what `Known` tells. motor, steering: of a step; motor_tick, steering_tick:
+    of a tick. ticks: of a step. steps: in a control period. periods: of the episode. width: of
+    the action.
+    """
+
+    car: Car
+    road: Road
+    pace: Pace
+    motor: Lag
+    steering: Lag
+    motor_tick: Lag
+    steering_tick: Lag
+    target: Target
+    task: Task
+    switches: Switches
+    width: int
+    ticks: int
+    steps: int
+    periods: int
+
+
+@dataclass(frozen=True)
+class Foreseen:
+    """An episode as a plan sees it.
+
+    known: (len(Known), periods * steps + 1), the last column of the episode's end. start: the
+    state at tick 0. driver: (periods, n) rad, the driver's command at every tick.
+    """
+
+    fixed: Fixed
+    known: Array
+    start: State
+    driver: Array
+
+
+def foresee(base: Any, steps: int = 1) -> Foreseen:
+    """The rest of an episode that was just reset.
+
+    base: the unwrapped env at tick 0. steps: of the plan in one control period, which they divide.
+    Raises ValueError where they do not, and for an env that is not at the start of an episode.
+    """
+    n = base.control_period
+    if steps < 1 or n % steps:
+        raise ValueError(f"{steps} steps do not divide a control period of {n} ticks")
+    snapshot = base.get_state()
+    p, z = snapshot["params"], snapshot["state"]
+    if z[Z.clock + 2] != 0.0:
+        raise ValueError("an episode is foreseen from its start: call reset() first")
+    start = state_of(z)
+    fixed = _fixed(base, p, snapshot["template"].switches, n // steps, steps)
+    ticks = fixed.periods * n
+    drive = _drive_alone(base, snapshot, ticks)
+    every = np.arange(ticks + 1)
+    programme = tuple(p[P.steering : P.steering + STEERING_WIDTH].tolist())
+    command = np.array([steering_at(float(tick), programme) for tick in every])
+    known = _known(p, fixed, drive, command)
+    return Foreseen(fixed, known, start, command[:-1].reshape(-1, n))
+
+
+def state_of(z: Array) -> State:
+    """The State in a packed state vector of the env."""
+    motion = z[Z.motion : Z.motion + len(Motion._fields)].tolist()
+    drive = Drive(*z[Z.drive : Z.drive + len(Drive._fields)].tolist())
+    return State(*motion, drive.T_l, drive.T_r, drive.integral, drive.slewing, drive.added)
+
+
+def _part(kind: Any, p: Array, at: int) -> Any:
+    return kind(*p[at : at + len(kind._fields)].tolist())
+
+
+def _fixed(base: Any, p: Array, switches: Any, ticks: int, steps: int) -> Fixed:
+    vehicle, lags = base.vehicle, base.scenario.lags
+    motor, steering = (
+        (vehicle.motor_lag, vehicle.steering_lag) if lags else (0.0, 0.0)
+    )
+    task = _part(Task, p, P.task)
+    return Fixed(
+        _part(Car, p, P.car)._replace(C_f=0.0, C_r=0.0, mu=0.0),
+        _part(Road, p, P.road),
+        _part(Pace, p, P.pace)._replace(
+            speed=0.0, acceleration=0.0, start=0.0, end=FOREVER, surge=0.0
+        ),
+        lag_of(motor, ticks * TICK),
+        lag_of(steering, ticks * TICK),
+        lag_of(motor, TICK),
+        lag_of(steering, TICK),
+        _part(Target, p, P.target),
+        task,
+        Switches(*np.asarray(switches).tolist()),
+        base.action_space.shape[0],
+        ticks,
+        steps,
+        -int(-task.duration // (ticks * steps)),
+    )
+
+
+def _drive_alone(base: Any, snapshot: Any, ticks: int) -> Array:
+    """(ticks + 1, len(Drive)): the env's own ticks without control.
+
+    The disturbances, and the front wheels without what is added, do not depend on the motion.
+    """
+    p, z = snapshot["params"], snapshot["state"]
+    bounds = np.array([[entry.low, entry.high] for entry in base.layout]).T.copy()
+    obs = np.empty(len(base.layout), np.float32)
+    rows, packets, report = snapshot["rows"], snapshot["packets"], np.zeros(len(REPORT))
+    action = np.zeros(base.action_space.shape, np.float32)
+    switches = snapshot["template"].switches
+    drive = np.empty((ticks + 1, len(Drive._fields)))
+    for tick in range(ticks + 1):
+        drive[tick] = z[Z.drive : Z.drive + drive.shape[1]]
+        step_vehicle(p, z, switches, action, 1, bounds, obs, rows, packets, report)
+    return drive
+
+
+def _known(p: Array, fixed: Fixed, drive: Array, command: Array) -> Array:
+    """(len(Known), steps of the plan + 1)."""
+    q, last = fixed.ticks, len(command) - 1
+    at = np.arange(0, last, q)
+    names = Drive._fields
+    angle = drive[:, names.index("delta_f")]
+
+    def wheels(ticks: Any, rest: float) -> Array:
+        """The front wheels without what is added, once `rest` of a tick's deviation is left."""
+        return np.asarray(plain(lagged)(command[ticks], angle[ticks], rest))
+
+    lag, middle = fixed.steering_tick, at + q // 2
+    wind = _part(Wind, p, P.wind)
+    blown = np.array([wind_at(float(tick), wind) for tick in range(last)])
+    forces = np.column_stack(
+        [drive[:last, names.index("F_d")], drive[:last, names.index("N_d")], np.zeros(last)]
+    )
+    push = (forces + blown).reshape(-1, q, 3).mean(axis=1)
+    pace = np.array([_wish(float(tick), _part(Pace, p, P.pace)) for tick in at])
+    car = _part(Car, p, P.car)
+    table = Known(
+        wheels(at, lag.start),
+        wheels(middle, lag.middle if q % 2 else lag.start),
+        wheels(at + q - 1, lag.end),
+        command[at],
+        *push.T,
+        *(np.full(len(at), value) for value in (car.C_f, car.C_r, car.mu)),
+        *pace.T,
+        _weights(at, fixed),
+    )
+    known = np.array(table)
+    end = known[:, -1:].copy()  # of the episode's end only command and weight are looked at
+    end[Known._fields.index("command")] = command[last]
+    end[Known._fields.index("weight")] = 0.5 * (q + 1) * TICK if last == fixed.task.duration else 0.0
+    return np.hstack([known, end])
+
+
+def _wish(tick: float, pace: Pace) -> tuple[float, float]:
+    """(speed in m/s, acceleration in m/s2 fed forward) that the driver wants at a tick."""
+    bare = pace._replace(hold=1.0, k_p=0.0, k_i=0.0)
+    ahead = acceleration_command(tick, 0.0, 0.0, bare, np.inf)[0]
+    both = acceleration_command(tick, 0.0, 0.0, bare._replace(k_p=1.0), np.inf)[0]
+    return both - ahead, ahead
+
+
+def _weights(at: Array, fixed: Fixed) -> Array:
+    """Seconds for which the cost rate at each step's start stands in the sum over ticks 1 .. T.
+
+    The sum over every q-th tick by the trapezoid rule, its end kept apart; exact for q = 1.
+    """
+    q = fixed.ticks
+    weights = np.where(at < fixed.task.duration, q * TICK, 0.0)
+    weights[0] = 0.5 * (q - 1) * TICK
+    return np.asarray(weights)

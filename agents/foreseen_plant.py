@@ -1,0 +1,118 @@
+"""The plant of a foreseen episode on CasADi's symbols: one step ahead, and what it costs."""
+
+from typing import Any, NamedTuple
+
+import casadi as ca
+
+from ..envs.actuators import distribute, lagged, yaw_moment
+from ..envs.dynamics import Motion, Push, rk4, sideslip_angle
+from ..envs.programme import acceleration_command
+from ..envs.record import TICK
+from ..envs.reference import cost_rate, reference
+from ..envs.tyres import Inputs, load_of
+from .foreseen import Fixed, Known, State
+from .symbolic import SYMBOLS, plain, symbolic
+
+_rk4, _load_of, _distribute = symbolic(rk4), symbolic(load_of), symbolic(distribute)
+_acceleration, _reference = symbolic(acceleration_command), symbolic(reference)
+_slip, _lagged, _yaw_moment = symbolic(sideslip_angle), symbolic(lagged), symbolic(yaw_moment)
+_uncapped = plain(cost_rate, SYMBOLS | {"minimum": lambda rate, cap: rate})
+
+TORQUES = ("T_l", "T_r")
+
+
+class Step(NamedTuple):
+    """What one step of the plan leads to."""
+
+    state: State
+    effort: Any  # cost of the actuators' work within the step
+    slewed: Any  # rad, by how much the added steering moved
+
+
+def carried(fixed: Fixed) -> tuple[str, ...]:
+    """The states that matter to the cost in an episode, in the order of `State`."""
+    road = fixed.road
+    needed = {"v_x", "v_y", "gamma", *TORQUES}
+    if fixed.switches.roll:
+        needed |= {"phi", "phi_dot"}
+    if fixed.pace.hold and fixed.pace.k_i:
+        needed |= {"integral"}
+    if fixed.width > 1:
+        needed |= {"slewing", "added"}
+    if road.curvature or road.across or road.along:
+        needed |= {"psi", "s", "y", "theta"}
+    return tuple(name for name in State._fields if name in needed)
+
+
+def node_cost(fixed: Fixed, x: State, known: Known) -> Any:
+    """What the motion at a step's start costs, without the cap, for the seconds it stands for."""
+    kind = fixed.switches.reference
+    beta = _slip(x.v_x, x.v_y, fixed.switches.small_angle)
+    beta_ref, gamma_ref = _reference(known.command, x.v_x, fixed.target, kind)
+    return known.weight * _uncapped(beta - beta_ref, x.gamma - gamma_ref, 0.0, 0.0, kind)
+
+
+def advance(fixed: Fixed, x: State, action: Any, known: Known) -> Step:
+    """One step of the plan: the env's own Runge-Kutta step over `fixed.ticks` ticks.
+
+    action: shares of full scale, as the env takes them. The driver's acceleration is that of the
+    step's start; added steering acts by its mean over the step.
+    """
+    car = fixed.car._replace(C_f=known.C_f, C_r=known.C_r, mu=known.mu)
+    task, switches, q = fixed.task, fixed.switches, fixed.ticks
+    pace = fixed.pace._replace(speed=known.speed, acceleration=known.ahead)
+    limit = 2.0 * car.T_max / (car.m * car.r)
+    a_x, grown = _acceleration(0.0, x.v_x, x.integral, pace, limit)
+    to_l, to_r = _distribute(action[0] * task.yaw_scale, a_x, car, task.yaw_first)
+    slewing = action[1] * task.authority if fixed.width > 1 else 0.0
+    moved = slewing - x.slewing if fixed.width > 1 else 0.0
+    # the angle moves at its full rate and then rests: its mean over the step
+    extra = slewing - moved * ca.fabs(moved) / (2.0 * q * task.slew)
+
+    def load_at(known_angle: Any, steering: float, motor: float) -> Any:
+        inputs = Inputs(
+            known_angle + _lagged(extra, x.added, steering),
+            _lagged(to_l, x.T_l, motor),
+            _lagged(to_r, x.T_r, motor),
+        )
+        return _load_of(inputs, car, switches.small_angle)
+
+    motor, steering = fixed.motor, fixed.steering
+    loads = (
+        load_at(known.steer_start, steering.start, motor.start),
+        load_at(known.steer_middle, steering.middle, motor.middle),
+        load_at(known.steer_end, steering.end, motor.end),
+    )
+    motion = _rk4(
+        Motion(*x[: len(Motion._fields)]),
+        loads,
+        Push(known.F_d, known.N_d, known.N_x),
+        car,
+        fixed.road,
+        q * TICK,
+        switches.small_angle,
+        switches.law,
+        switches.roll,
+    )
+    effort = 0.0
+    for tick in range(q):
+        left, right = fixed.motor_tick, fixed.steering_tick
+        rest = left.mean * left.end**tick
+        share = _yaw_moment(_lagged(to_l, x.T_l, rest), _lagged(to_r, x.T_r, rest), car)
+        added = _lagged(extra, x.added, right.mean * right.end**tick)
+        effort += TICK * _uncapped(0.0, 0.0, share / task.yaw_scale, added, switches.reference)
+    after = State(
+        *motion,
+        _lagged(to_l, x.T_l, motor.end),
+        _lagged(to_r, x.T_r, motor.end),
+        x.integral + q * (grown - x.integral),
+        slewing,
+        _lagged(extra, x.added, steering.end),
+    )
+    return Step(after, effort, moved)
+
+
+def scales(fixed: Fixed, names: tuple[str, ...]) -> list[float]:
+    """Physical units of one unit of each state in the solver: all are of order one."""
+    small = {"phi": 0.1, "phi_dot": 0.5, "slewing": 0.1, "added": 0.1}
+    return [fixed.car.T_max if name in TORQUES else small.get(name, 1.0) for name in names]

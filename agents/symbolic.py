@@ -1,0 +1,60 @@
+"""The plant's own text on CasADi's symbols: `envs.backend.plain` with CasADi's primitives."""
+
+import types
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+from ..envs.backend import plain
+
+try:
+    import casadi as ca
+except ModuleNotFoundError:
+    raise ModuleNotFoundError(
+        "the plant on symbols needs CasADi: pip install 'sideslip[mpc]'"
+    ) from None
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+SYMBOLS: dict[str, Callable[..., Any]] = {
+    "minimum": ca.fmin,
+    "maximum": ca.fmax,
+    "absolute": ca.fabs,
+    "floor": ca.floor,
+    "sqrt": ca.sqrt,
+    "select": ca.if_else,
+    "to_float": lambda a: a * 1.0,
+}
+"""The primitives for CasADi's SX and MX, by the names the equations use."""
+
+_ELEMENTARY: dict[str, Callable[..., Any]] = {
+    "sincos": lambda x: (ca.sin(x), ca.cos(x)),
+    "atan": ca.atan,
+    "atan2": ca.atan2,
+}
+"""CasADi's own in place of our polynomials: they agree to 1e-15 and have short derivatives."""
+
+_OURS = __name__.rpartition(".agents")[0]
+
+
+def symbolic(function: F) -> F:
+    """The same text for CasADi expressions.
+
+    Conditions may be compared and selected, but not joined by `&` or `|`, which CasADi's
+    expressions lack; such a text raises TypeError when it is called.
+    """
+    rebuilt = plain(function, SYMBOLS)
+    _replace(rebuilt, set())
+    return rebuilt
+
+
+def _replace(function: Any, done: set[int]) -> None:
+    """Put `_ELEMENTARY` into a rebuilt function and those it calls, which are its own copies."""
+    done.add(id(function))
+    names = function.__globals__
+    for name in function.__code__.co_names:
+        callee = names.get(name)
+        if name in _ELEMENTARY:
+            names[name] = _ELEMENTARY[name]
+        elif isinstance(callee, types.FunctionType) and id(callee) not in done:
+            if callee.__module__.startswith(_OURS):
+                _replace(callee, done)
