@@ -10,14 +10,32 @@ import numpy.typing as npt
 
 from ..envs.actuators import within_stop
 from ..envs.backend import ARRAYS, plain
+from ..envs.reference import BETA_SCALE, GAMMA_SCALE
+from ..envs.tyres import SLOW
 from .foreseen import Fixed, Foreseen, Known, State
 from .foreseen_plant import advance, carried, node_cost, scales
 
 Array = npt.NDArray[np.float64]
 
 TOLERANCE = 1e-6
-MOST_ITERATIONS = 200
+MOST_ITERATIONS = 60
 SOLVED = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
+_OPTIONS = {
+    "print_time": False,
+    "error_on_fail": False,
+    "ipopt.print_level": 0,
+    "ipopt.sb": "yes",
+    "ipopt.tol": TOLERANCE,
+    "ipopt.max_iter": MOST_ITERATIONS,
+    # where tyres and motors saturate the text has kinks, at which dual variables do not settle:
+    # a feasible plan whose cost stands still will do
+    "ipopt.acceptable_tol": 1e10,
+    "ipopt.acceptable_dual_inf_tol": 1e10,
+    "ipopt.acceptable_compl_inf_tol": 1e-2,
+    "ipopt.acceptable_constr_viol_tol": 1e-3,
+    "ipopt.acceptable_obj_change_tol": 1e-4,
+    "ipopt.acceptable_iter": 5,
+}
 
 
 @dataclass(frozen=True)
@@ -26,13 +44,44 @@ class Problem:
 
     Its variables are (len(names) + width, periods + 1), states in units of `scale`, then the
     action; its parameters (len(Known), periods + 1); its constraints (len(names), periods) zeros
-    and, where the action steers, the movement of the added steering (1, periods).
+    and, where the action steers, the movement of the added steering (1, periods). slopes: of the
+    states after a step by the variables of its start, (len(names), len(names) + width) a period.
     """
 
     fixed: Fixed
     names: tuple[str, ...]
     scale: Array
     solver: Any
+    slopes: Any
+
+    @property
+    def at(self) -> list[int]:
+        """Where the carried states stand in a State."""
+        return [State._fields.index(name) for name in self.names]
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """States (K + 1, len(State)) at the start of every period and at the end, actions (K, width)
+    as shares of full scale."""
+
+    states: Array
+    actions: Array
+
+
+@dataclass(frozen=True)
+class Solution:
+    """What IPOPT made of a start: its trajectory, objective, return text and iterations."""
+
+    trajectory: Trajectory
+    objective: float
+    status: str
+    iterations: int
+
+    @property
+    def solved(self) -> bool:
+        """Whether IPOPT says so."""
+        return self.status in SOLVED
 
 
 @functools.lru_cache(maxsize=8)
@@ -61,30 +110,22 @@ def problem_of(fixed: Fixed) -> Problem:
         "f": ca.sum2(node.map(K + 1)(W, C)) + ca.sum2(effort),
         "g": ca.vertcat(*rest),
     }
-    options = {
-        "print_time": False,
-        "error_on_fail": False,
-        "ipopt.print_level": 0,
-        "ipopt.sb": "yes",
-        "ipopt.tol": TOLERANCE,
-        "ipopt.max_iter": MOST_ITERATIONS,
-    }
-    return Problem(fixed, names, scale, ca.nlpsol("clairvoyant", "ipopt", nlp, options))
+    solver = ca.nlpsol("clairvoyant", "ipopt", nlp, _OPTIONS)
+    slopes = ca.Function("slopes", [w, known], [ca.jacobian(after, w)], {"cse": True})
+    return Problem(fixed, names, scale, solver, slopes.map(K))
 
 
-def solve(foreseen: Foreseen, actions: Array, states: list[State]) -> tuple[Array, float, str]:
-    """(actions (K, width), objective, IPOPT's return text) from a start.
+def solve(foreseen: Foreseen, start: Trajectory, grip: float = 1.0) -> Solution:
+    """The plan that IPOPT finds from a trajectory, which need not obey the plant.
 
-    actions: (K, width) shares of full scale. states: at the start of every period and at the end,
-    of the run that the actions gave.
+    grip: factor on the friction of road and tyres.
     """
     fixed = foreseen.fixed
     problem = problem_of(fixed)
-    size, K = len(problem.names), fixed.periods
-    at = [State._fields.index(name) for name in problem.names]
-    guess = np.zeros((size + fixed.width, K + 1))
-    guess[:size] = (np.array(states)[:, at] / problem.scale).T
-    guess[size:, :K] = actions.T
+    size, K, at = len(problem.names), fixed.periods, problem.at
+    guess = _packed(problem, start)
+    known = foreseen.known.copy()
+    known[Known._fields.index("mu")] *= grip
     low, high = np.full_like(guess, -np.inf), np.full_like(guess, np.inf)
     low[:size, 0] = high[:size, 0] = np.array(foreseen.start)[at] / problem.scale
     low[size:], high[size:] = -1.0, 1.0
@@ -93,13 +134,53 @@ def solve(foreseen: Foreseen, actions: Array, states: list[State]) -> tuple[Arra
         low[size + 1, :K], high[size + 1, :K] = _steering_room(foreseen)
         limits = np.concatenate([limits, np.full(K, fixed.task.slew * fixed.ticks)])
     low[size:, K] = high[size:, K] = 0.0  # nothing acts after the end
-    with np.errstate(all="ignore"):
-        found = problem.solver(
-            x0=_flat(guess), p=_flat(foreseen.known), lbx=_flat(low), ubx=_flat(high),
-            lbg=-limits, ubg=limits,
-        )  # fmt: skip
-    best = np.array(found["x"]).reshape(guess.shape, order="F")[size:, :K].T
-    return best, float(found["f"]), str(problem.solver.stats()["return_status"])
+    found = problem.solver(
+        x0=_flat(guess), p=_flat(known), lbx=_flat(low), ubx=_flat(high),
+        lbg=-limits, ubg=limits,
+    )  # fmt: skip
+    best = np.array(found["x"]).reshape(guess.shape, order="F")
+    states = start.states.copy()
+    states[:, at] = best[:size].T * problem.scale
+    stats = problem.solver.stats()
+    return Solution(
+        Trajectory(states, np.clip(best[size:, :K].T, -1.0, 1.0)),
+        float(found["f"]),
+        str(stats["return_status"]),
+        int(stats["iter_count"]),
+    )
+
+
+def tracking_gains(foreseen: Foreseen, plan: Trajectory) -> Array:
+    """(K, width, len(State)): what the actions give back for a deviation from the plan.
+
+    A car that slides is unstable: the plan alone, on a plant that differs by its step's error,
+    would be lost. The gains are those of the linear-quadratic regulator along the plan.
+    """
+    problem = problem_of(foreseen.fixed)
+    size, K, at = len(problem.names), foreseen.fixed.periods, problem.at
+    slopes = np.array(problem.slopes(_packed(problem, plan)[:, :K], foreseen.known[:, :K]))
+    slopes = slopes.reshape(size, K, -1).transpose(1, 0, 2)
+    v = max(float(plan.states[0, 0]), SLOW)
+    weight = {"v_y": 1.0 / (BETA_SCALE * v), "gamma": 1.0 / GAMMA_SCALE}
+    Q = np.diag([(weight.get(n, 0.0) * c) ** 2 for n, c in zip(problem.names, problem.scale)])
+    R = np.eye(foreseen.fixed.width)
+    P, gains = Q, np.zeros((K, len(R), len(State._fields)))
+    for k in reversed(range(K)):
+        A, B = slopes[k, :, :size], slopes[k, :, size:]
+        gain = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
+        gains[k][:, at] = gain / problem.scale
+        P = Q + A.T @ P @ (A - B @ gain)
+        P = 0.5 * (P + P.T)
+    return gains
+
+
+def _packed(problem: Problem, trajectory: Trajectory) -> Array:
+    """The solver's variables of a trajectory."""
+    size, K = len(problem.names), problem.fixed.periods
+    packed = np.zeros((size + problem.fixed.width, K + 1))
+    packed[:size] = (trajectory.states[:, problem.at] / problem.scale).T
+    packed[size:, :K] = trajectory.actions.T
+    return packed
 
 
 def _flat(columns: Array) -> Array:
