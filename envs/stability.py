@@ -191,7 +191,20 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
                 raise ValueError(f"an action has shape {expected}, got shape {force.shape}")
             force = np.full(expected, np.nan, np.float32)
         obs = np.empty(len(self.layout), np.float32)
-        done = step_vehicle(
+        done = self._advance(force, obs)
+        if done <= 0:
+            if done == REFUSED:
+                raise ValueError(f"action {force.tolist()} is not finite; nothing was stepped")
+            obs = np.zeros_like(obs)
+        info = self._info(done)
+        terminated = info["failure"] != RUNNING
+        truncated = info["is_success"]
+        self._over = terminated or truncated
+        return obs, -info["cost"], terminated, truncated, info
+
+    def _advance(self, force: npt.NDArray[np.float32], obs: npt.NDArray[np.float32]) -> int:
+        """One control period; what `step_vehicle` returns."""
+        return step_vehicle(
             self._params,
             self._state,
             self._now.switches,
@@ -203,15 +216,6 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
             self.packets,
             self._report,
         )
-        if done <= 0:
-            if done == REFUSED:
-                raise ValueError(f"action {force.tolist()} is not finite; nothing was stepped")
-            obs = np.zeros_like(obs)
-        info = self._info(done)
-        terminated = info["failure"] != RUNNING
-        truncated = info["is_success"]
-        self._over = terminated or truncated
-        return obs, -info["cost"], terminated, truncated, info
 
     def _info(self, done: int) -> dict[str, Any]:
         self.ticks_done = done

@@ -11,7 +11,13 @@ from sideslip.envs import Record, StabilityEnv
 from sideslip.envs.sensors import Noise
 
 assert sideslip.__version__  # importing it registers the ids
-IDS = tuple(sorted(name for name in gymnasium.registry if name.startswith("sideslip/")))
+IDS = tuple(
+    sorted(
+        name
+        for name in gymnasium.registry
+        if name.startswith("sideslip/") and name != "sideslip/Outside-v0"  # needs an extra
+    )
+)
 
 SILENT: dict[str, float] = dict.fromkeys(Noise._fields, 0.0)
 """Sensors without noise."""

@@ -1,0 +1,257 @@
+"""Outside plants: CommonRoad's vehicle models as another truth than ours.
+
+M. Althoff and G. Wuersching, "CommonRoad: Vehicle Models", 2020: a linear single-track model, a
+single-track model that drifts (Magic Formula, wheel speeds) and a multi-body model, all of the
+same BMW 320i. They need the extra `outside`, loaded when a plant is made.
+
+What the models lack is added here: the yaw moment as motor torques on the rear wheels of the
+multi-body model, and as N_z / I_z on the yaw acceleration of the others, which have no left and
+right wheels. Steering angles are prescribed, not sent through the models' rate limit. The
+multi-body model's axes are those of its z-down source read as y left: its labels are mirrored
+(the wheel called left rear is on the right) and its roll has the other sign than ours.
+"""
+
+import dataclasses
+import functools
+import math
+from collections.abc import Callable
+from importlib import import_module
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from .actuators import yaw_moment
+from .dynamics import Motion
+from .template import car_of
+from .vehicle import GRAVITY, Vehicle
+
+Array = npt.NDArray[np.float64]
+
+BMW_320I = 2  # CommonRoad's number of the car
+MOTOR_TORQUE = 300.0  # N m of one in-wheel motor, which CommonRoad's car does not have: ours
+SLOWEST = 0.1  # m/s: below it the models switch to kinematics
+STABLE = 1.5  # of the fastest eigenvalue times the step; Runge-Kutta's limit is 2.78
+
+
+class Acting(NamedTuple):
+    """What acts on the car during a step."""
+
+    steer: float  # rad, front wheels
+    T_l: float = 0.0  # N m, left rear motor
+    T_r: float = 0.0  # N m, right rear motor
+    F_y: float = 0.0  # N, lateral force at the centre of gravity
+    N_z: float = 0.0  # N m, yaw moment besides the motors'
+    N_x: float = 0.0  # N m, roll moment on the body
+
+
+@functools.cache
+def _module(name: str) -> Any:
+    try:
+        return import_module(f"vehiclemodels.{name}")
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(
+            "an outside plant needs commonroad-vehicle-models: pip install 'sideslip[outside]'",
+            name=error.name,
+        ) from error
+
+
+@functools.cache
+def _parameters() -> Any:
+    """The BMW's parameters, with all drive and brake torque on the rear wheels."""
+    p = _module("vehicle_parameters").setup_vehicle_parameters(BMW_320I)
+    return dataclasses.replace(p, T_sb=0.0, T_se=0.0)
+
+
+@functools.cache
+def outside_vehicle() -> Vehicle:
+    """The BMW 320i as our `Vehicle`: what estimators and controllers are told of an outside plant.
+
+    Cornering stiffness is the Magic Formula's slope p_Ky1 F_z at the tyre's standing load; roll
+    stiffness and damping are those of the springs, the anti-roll bars and the dampers.
+    """
+    p = _parameters()
+    per_arm = 0.5 * p.m * GRAVITY / (p.a + p.b)  # standing load of a tyre over the other axle's arm
+    arm = p.h_s - 0.5 * (p.h_raf + p.h_rar)
+    return Vehicle(
+        name="bmw-320i",
+        mass=p.m,
+        yaw_inertia=p.I_z,
+        front_arm=p.a,
+        rear_arm=p.b,
+        front_stiffness=-p.tire.p_ky1 * per_arm * p.b,
+        rear_stiffness=-p.tire.p_ky1 * per_arm * p.a,
+        front_track=p.T_f,
+        rear_track=p.T_r,
+        wheel_radius=p.R_w,
+        gravity_height=p.h_cg,
+        motor_torque=MOTOR_TORQUE,
+        preview=12.0,
+        friction=p.tire.p_dy1,
+        sprung_mass=p.m_s,
+        roll_arm=arm,
+        roll_inertia=p.I_Phi_s + p.m_s * arm**2,
+        roll_stiffness=0.5 * (p.T_f**2 * p.K_sf + p.T_r**2 * p.K_sr) - p.K_tsf - p.K_tsr,
+        roll_damping=0.5 * (p.T_f**2 * p.K_sdf + p.T_r**2 * p.K_sdr),
+    )
+
+
+class OutsidePlant:
+    """One of the models with its state `x` and the newest step's `acting`.
+
+    friction: the tyre's peak lateral friction, in place of CommonRoad's 1.05 (None); the
+    longitudinal one keeps its ratio to it. stiffness: a factor on the cornering stiffness of all
+    tyres. A state that is no longer finite stays so (`finite`).
+    """
+
+    law = ""  # the name of the model's module and function
+    wheels = slice(0)  # wheel speeds in x, which may not be negative
+    loaded = 0.0  # the most of the car's weight that rests on one wheel speed
+
+    def __init__(self, friction: float | None = None, stiffness: float = 1.0) -> None:
+        base = _parameters()
+        tyre, scale = base.tire, 1.0 if friction is None else friction / base.tire.p_dy1
+        tyre = dataclasses.replace(
+            tyre,
+            p_dy1=scale * tyre.p_dy1,
+            p_dx1=scale * tyre.p_dx1,
+            p_ky1=stiffness * tyre.p_ky1,
+        )
+        self.p = dataclasses.replace(base, tire=tyre)
+        self.car = car_of(outside_vehicle())
+        self._law: Callable[..., list[float]] = getattr(_module(self.law), self.law)
+        slope = self.loaded * self.p.m * GRAVITY * tyre.p_kx1  # N, of force over slip
+        self._fastest = self.p.R_w**2 * slope / self.p.I_y_w  # 1/s of the slip at 1 m/s
+        self.acting = Acting(0.0)
+        self.x = np.zeros(0)
+
+    def start(self, motion: Motion) -> None:
+        """Put the car at a Motion's velocities, heading and place, wheels rolling."""
+        raise NotImplementedError
+
+    def derivative(self, x: Array, acting: Acting) -> Array:
+        """dx/dt of a state, which is left alone (the models themselves change it)."""
+        raise NotImplementedError
+
+    @property
+    def motion(self) -> Motion:
+        """Where the car is, on a straight road along the ground's x axis."""
+        raise NotImplementedError
+
+    @property
+    def specific_force(self) -> tuple[float, float]:
+        """(a_x, a_y) in m/s2 as accelerometers at the centre of gravity feel them now."""
+        raise NotImplementedError
+
+    @property
+    def finite(self) -> bool:
+        """Whether the state is still a number; a spun multi-body car's is not."""
+        return bool(np.isfinite(self.x).all())
+
+    def step(self, acting: Acting, h: float) -> None:
+        """h seconds of the classical Runge-Kutta method, in as many parts as the wheels need."""
+        eigenvalue = self._fastest / max(abs(float(self.x[3])), SLOWEST)
+        parts = max(1, math.ceil(h * eigenvalue / STABLE)) if self.finite else 1
+        self.acting = acting
+        try:
+            for _ in range(parts):
+                self.x = self._rk4(self.x, acting, h / parts)
+                self.x[self.wheels] = np.maximum(self.x[self.wheels], 0.0)
+        except (ArithmeticError, ValueError):  # a wheel at rest in a spin, the sine of infinity
+            self.x = np.full_like(self.x, np.nan)
+
+    def _rk4(self, x: Array, acting: Acting, h: float) -> Array:
+        a = self.derivative(x, acting)
+        b = self.derivative(x + 0.5 * h * a, acting)
+        c = self.derivative(x + 0.5 * h * b, acting)
+        d = self.derivative(x + h * c, acting)
+        return x + h / 6.0 * (a + 2.0 * (b + c) + d)
+
+
+class SingleTrack(OutsidePlant):
+    """Linear tyres; states X, Y, steering angle, speed, heading, yaw rate, slip angle."""
+
+    law = "vehicle_dynamics_st"
+
+    def start(self, motion: Motion) -> None:  # noqa: D102
+        speed, slip = math.hypot(motion.v_x, motion.v_y), math.atan2(motion.v_y, motion.v_x)
+        self.x = np.array([motion.X, motion.Y, 0.0, speed, motion.psi, motion.gamma, slip])
+
+    def derivative(self, x: Array, acting: Acting) -> Array:  # noqa: D102
+        state = x.tolist()
+        state[2] = acting.steer
+        drive = (acting.T_l + acting.T_r) / (self.p.m * self.p.R_w)
+        rate = np.array(self._law(state, [0.0, drive], self.p))
+        push, slip = acting.F_y / self.p.m, state[6]
+        rate[3] += push * math.sin(slip)
+        rate[5] += (yaw_moment(acting.T_l, acting.T_r, self.car) + acting.N_z) / self.p.I_z
+        rate[6] += push * math.cos(slip) / max(state[3], SLOWEST)
+        return rate
+
+    @property
+    def motion(self) -> Motion:  # noqa: D102
+        X, Y, _, v, psi, gamma, slip = self.x[:7].tolist()
+        return Motion(v * math.cos(slip), v * math.sin(slip), gamma, psi, X, Y, X, Y, 0.0)
+
+    @property
+    def specific_force(self) -> tuple[float, float]:  # noqa: D102
+        rate, slip = self.derivative(self.x, self.acting), self.x[6]
+        along, across = rate[3], self.x[3] * (rate[6] + self.x[5])  # of the path
+        sine, cosine = math.sin(slip), math.cos(slip)
+        return float(along * cosine - across * sine), float(along * sine + across * cosine)
+
+
+class Drift(SingleTrack):
+    """The single track with the Magic Formula and the speeds of the front and rear wheels."""
+
+    law = "vehicle_dynamics_std"
+    wheels = slice(7, 9)
+    loaded = 1.0
+
+    def start(self, motion: Motion) -> None:  # noqa: D102
+        super().start(motion)
+        self.x = np.append(self.x, np.full(2, motion.v_x / self.p.R_w))
+
+
+class MultiBody(OutsidePlant):
+    """29 states: the body, both axles, four wheels; v_y is that of the sprung mass."""
+
+    law = "vehicle_dynamics_mb"
+    wheels = slice(23, 27)
+    loaded = 0.5
+
+    def start(self, motion: Motion) -> None:  # noqa: D102
+        speed, slip = math.hypot(motion.v_x, motion.v_y), math.atan2(motion.v_y, motion.v_x)
+        core = [motion.X, motion.Y, 0.0, speed, motion.psi, motion.gamma, slip]
+        self.x = np.array(_module("init_mb").init_mb(core, self.p), float)
+        self.x[6], self.x[7] = -motion.phi, -motion.phi_dot
+
+    def derivative(self, x: Array, acting: Acting) -> Array:  # noqa: D102
+        state = x.tolist()
+        state[2] = acting.steer
+        rate = np.array(self._law(state, [0.0, 0.0], self.p))
+        rate[5] += acting.N_z / self.p.I_z
+        rate[7] -= acting.N_x / self.p.I_Phi_s
+        rate[10] += acting.F_y / self.p.m_s
+        rate[25] += acting.T_r / self.p.I_y_w  # called left rear
+        rate[26] += acting.T_l / self.p.I_y_w
+        return rate
+
+    @property
+    def motion(self) -> Motion:  # noqa: D102
+        x = self.x.tolist()
+        return Motion(x[3], x[10], x[5], x[4], x[0], x[1], x[0], x[1], 0.0, -x[6], -x[7])
+
+    @property
+    def specific_force(self) -> tuple[float, float]:  # noqa: D102
+        rate, x = self.derivative(self.x, self.acting), self.x
+        a_x = rate[3] - x[5] * x[10]
+        a_y = rate[10] + x[5] * x[3] - GRAVITY * math.sin(x[6])  # felt by the rolled body
+        return float(a_x), float(a_y)
+
+
+OUTSIDE_PLANTS: dict[str, type[OutsidePlant]] = {
+    "single-track": SingleTrack,
+    "drift": Drift,
+    "multi-body": MultiBody,
+}

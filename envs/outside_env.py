@@ -1,0 +1,270 @@
+"""OutsideEnv: our sensors, scenarios, references and cost around a plant that is not ours."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from .actuators import Lag, distribute, lagged, slewed, within_stop, yaw_moment
+from .backend import absolute
+from .delivery import sense, store
+from .dynamics import Motion, sideslip_angle
+from .layout import Disturbance, Drive, P, Task, Z
+from .manoeuvres import scenario_from
+from .noise import CHANNELS, normals
+from .outside import OUTSIDE_PLANTS, Acting, OutsidePlant, outside_vehicle
+from .programme import STEERING_WIDTH, Pace, Wind, acceleration_command, steering_at, wind_at
+from .record import FAST, TICK
+from .reference import COST_CAP, Target, cost_rate, reference
+from .scenario import Scenario
+from .stability import StabilityEnv
+from .summary import clip, observe, write_report
+from .switches import NOT_FINITE, OFF_ROAD, REPORT, RUNNING, SPIN
+
+# Fields of a scenario that change our own plant or its road: only their defaults will do.
+_OURS = (
+    "curvature",
+    "bank",
+    "grade",
+    "small_angle",
+    "linear_tyres",
+    "vehicle",
+)
+
+
+class OutsideEnv(StabilityEnv):
+    """`StabilityEnv` whose truth is a model of `sideslip.envs.outside.OUTSIDE_PLANTS`.
+
+    Action, observation, record, reward, info and options of reset are those of `StabilityEnv`; a
+    plant whose state is no longer finite ends the episode as "not-finite". Needs the extra
+    `outside`. A loop in Python: some fifty times slower than ours.
+
+    model: "single-track", "drift" or "multi-body". nominal: what estimators and controllers are
+    told (default: `outside_vehicle()`). The other arguments are those of `StabilityEnv`, but there
+    is no `vehicle`: the true one is the model's. The scenario's friction is the tyre's peak
+    lateral friction; one tyre serves both axles, so its stiffness is scaled by the mean of the
+    scenario's two factors. Motors and steering act for a tick with the mean that the record tells.
+
+    Raises ValueError for an unknown model, a scenario with a road or a plant that the model has
+    not (curvature, bank, grade, small_angle, linear_tyres, vehicle), the reset option "vehicle" or
+    a start off the road's own frame.
+    """
+
+    def __init__(
+        self,
+        model: str = "drift",
+        sensors: str = "fusion",
+        scenario: str | Mapping[str, Any] | Scenario = "random-steering",
+        reference: str = "model",
+        **options: Any,
+    ) -> None:
+        if model not in OUTSIDE_PLANTS:
+            raise ValueError(f"unknown model {model!r}; known: {', '.join(OUTSIDE_PLANTS)}")
+        if "vehicle" in options:
+            raise TypeError("an outside plant is its own vehicle; only nominal can be given")
+        self.model = model
+        _check(scenario_from(scenario))
+        super().__init__(sensors, scenario, outside_vehicle(), reference=reference, **options)
+        self.plant: OutsidePlant = OUTSIDE_PLANTS[model]()
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[npt.NDArray[np.float32], dict[str, Any]]:
+        """Start an episode; see `StabilityEnv`."""
+        asked = dict(options or {})
+        if "vehicle" in asked:
+            raise ValueError("reset option vehicle: an outside plant is its own vehicle")
+        _check(scenario_from(asked.get("scenario", self._base.scenario)))
+        if "state" in asked:
+            asked["state"] = self._on_the_road(asked["state"])
+        told = super().reset(seed=seed, options=asked)
+        p, base = self._params, self._now.vehicle
+        scale = 0.5 * (p[P.car + 4] / base.front_stiffness + p[P.car + 5] / base.rear_stiffness)
+        p[P.car + 4], p[P.car + 5] = scale * base.front_stiffness, scale * base.rear_stiffness
+        self.plant = OUTSIDE_PLANTS[self.model](float(p[P.car + 10]), float(scale))
+        self.plant.start(self.motion)
+        return told
+
+    def _on_the_road(self, state: Mapping[str, Any]) -> dict[str, Any]:
+        """The start with s and y, which are X and Y on the straight road of these plants."""
+        for name in ("s", "y", "theta"):
+            if name in state:
+                raise ValueError(f"reset option state: {name} follows from X and Y here")
+        if self.model != "multi-body" and (state.get("phi") or state.get("phi_dot")):
+            raise ValueError(f"reset option state: the {self.model} model has no roll")
+        return {**state, "s": state.get("X", 0.0), "y": state.get("Y", 0.0)}
+
+    def get_state(self) -> dict[str, Any]:
+        """A snapshot that `set_state` continues from, bit for bit."""
+        plant = (self.plant.p, self.plant.acting, self.plant.x.copy())
+        return super().get_state() | {"outside": plant, "model": self.model}
+
+    def set_state(self, snapshot: Mapping[str, Any]) -> None:
+        """Go back to a snapshot of this env or of one built with the same arguments."""
+        if snapshot.get("model") != self.model:
+            raise ValueError(f"the snapshot is of {snapshot.get('model')!r}, not {self.model!r}")
+        super().set_state(snapshot)
+        self.plant.p, self.plant.acting, x = snapshot["outside"]
+        self.plant.x = x.copy()
+
+    def _advance(self, force: npt.NDArray[np.float32], obs: npt.NDArray[np.float32]) -> int:
+        """One control period of the outside plant: the order of `kernel.step_vehicle`."""
+        if not np.isfinite(force).all():
+            return super()._advance(force, obs)  # refuses or fails before it moves anything
+        told = _Told(*(_part(self._params, kind, at) for kind, at in _TOLD))
+        shares = [float(clip(float(share), -1.0, 1.0)) for share in (*force, 0.0)[:2]]
+        z, cost, count, failure, done = self._state, 0.0, 0, RUNNING, 0
+        beta, refs, moment, steer = 0.0, (0.0, 0.0), 0.0, 0.0
+        while done < self.control_period and failure == RUNNING and not self._at_end:
+            before = self.motion
+            acted = self._command(told, before.v_x, shares)
+            steer = acted[0]
+            motion = self.plant.motion if self.plant.finite else before
+            store(z, Z.motion, motion)
+            count = self._sense(motion, acted[:5], done, count)
+            beta = sideslip_angle(motion.v_x, motion.v_y, 0)
+            row = self.rows[done]
+            v = 0.5 * (row[FAST.wheel_left] + row[FAST.wheel_right])
+            kind = int(self._now.switches[2])
+            programme = tuple(self._params[P.steering : P.steering + STEERING_WIDTH].tolist())
+            driver = steering_at(float(z[Z.clock + 2]), programme)
+            refs = reference(driver, float(v), told.target, kind)
+            moment = yaw_moment(acted[1], acted[2], self.plant.car)
+            share = moment / told.task.yaw_scale
+            cost += TICK * cost_rate(beta - refs[0], motion.gamma - refs[1], share, acted[5], kind)
+            done += 1
+            failure = self._failure(told.task, motion, beta)
+        z[Z.clock + 3] = failure
+        if failure != RUNNING:  # the rest of the episode is charged: failing never pays
+            cost += COST_CAP * (told.task.duration - z[Z.clock + 2]) * TICK
+        self._tell(done, count, refs, obs)
+        write_report(self._report, z, self.motion, beta, refs, steer, moment)
+        self._report[REPORT.cost], self._report[REPORT.reward] = cost, -cost
+        self._report[REPORT.packets], self._report[REPORT.ended] = count, float(self._at_end)
+        return done
+
+    @property
+    def _at_end(self) -> bool:
+        return bool(self._state[Z.clock + 2] >= self._params[P.task])
+
+    def _command(
+        self, told: "_Told", v_x: float, shares: list[float]
+    ) -> tuple[float, float, float, float, float, float]:
+        """Let the actuators follow and the plant move for a tick.
+
+        Returns what acted, as `Fast` has it from `steer` on, and the added steering.
+        """
+        z, task, car = self._state, told.task, self.plant.car
+        drive = Drive(*z[Z.drive : Z.drive + len(Drive._fields)].tolist())
+        tick = float(z[Z.clock + 2])
+        programme = tuple(self._params[P.steering : P.steering + STEERING_WIDTH].tolist())
+        driver = steering_at(tick, programme)
+        slewing = slewed(drive.slewing, shares[1] * task.authority, task.slew)
+        extra = within_stop(slewing, driver, task.stop)
+        limit = 2.0 * car.T_max / (car.m * car.r)
+        a_x, integral = acceleration_command(tick, v_x, drive.integral, told.pace, limit)
+        to_l, to_r = distribute(shares[0] * task.yaw_scale, a_x, car, task.yaw_first)
+        F_w, N_w, N_x = wind_at(tick, told.wind)
+        mean, end = (told.motor.mean, told.steer.mean), (told.motor.end, told.steer.end)
+        steer = lagged(driver + extra, drive.delta_f, mean[1])
+        left, right = lagged(to_l, drive.T_l, mean[0]), lagged(to_r, drive.T_r, mean[0])
+        added = lagged(extra, drive.added, mean[1])
+        self.plant.step(Acting(steer, left, right, drive.F_d + F_w, drive.N_d + N_w, N_x), TICK)
+        z[Z.clock + 2] = tick + 1.0
+        ou, wheels = told.disturbance, self._normals(CHANNELS.wheels)
+        after = Drive(
+            lagged(to_l, drive.T_l, end[0]),
+            lagged(to_r, drive.T_r, end[0]),
+            lagged(driver + extra, drive.delta_f, end[1]),
+            integral,
+            ou.keep * drive.F_d + ou.fresh * ou.force * wheels[2],
+            ou.keep * drive.N_d + ou.fresh * ou.moment * wheels[3],
+            slewing,
+            lagged(extra, drive.added, end[1]),
+        )
+        store(z, Z.drive, after)
+        return steer, left, right, driver, a_x, added
+
+    def _normals(self, channel: int) -> tuple[float, ...]:
+        key_low, key_high, tick = self._state[Z.clock : Z.clock + 3].tolist()
+        return tuple(normals(int(key_low), int(key_high), int(tick), channel))
+
+    def _sense(self, motion: Motion, acted: tuple[float, ...], row: int, count: int) -> int:
+        """The sensors at the tick just reached; returns how many packets there are now."""
+        force = self.plant.specific_force if self.plant.finite else (0.0, 0.0)
+        fast, wheels = self._normals(CHANNELS.inertial), self._normals(CHANNELS.wheels)
+        return int(
+            sense(
+                self._params,
+                self._state,
+                motion,
+                0,
+                force,
+                acted,
+                self.rows,
+                row,
+                self.packets,
+                count,
+                fast,
+                wheels,
+            )
+        )
+
+    def _failure(self, task: Task, motion: Motion, beta: float) -> int:
+        if not self.plant.finite:
+            return NOT_FINITE
+        if absolute(beta) > task.spin and motion.v_x > 0.0:  # backing up is no spin
+            return SPIN
+        return OFF_ROAD if absolute(motion.y) > task.half_width else RUNNING
+
+    def _tell(
+        self, done: int, count: int, refs: tuple[float, float], obs: npt.NDArray[np.float32]
+    ) -> None:
+        """The observation; where every sample is asked for, the last stands for missing ones."""
+        switches, n = self._now.switches, done
+        if switches[4]:
+            self.rows[done:] = self.rows[done - 1]
+            n = self.control_period
+        args = (self.rows, n, count, self.packets, refs, self._bounds, obs)
+        observe(self._params, self._state, switches, *args)
+
+
+class _Told(NamedTuple):
+    """The parts of the packed parameters that a tick reads."""
+
+    motor: Lag
+    steer: Lag
+    wind: Wind
+    pace: Pace
+    target: Target
+    disturbance: Disturbance
+    task: Task
+
+
+_TOLD: tuple[tuple[Any, int], ...] = (
+    (Lag, P.motor),
+    (Lag, P.steer),
+    (Wind, P.wind),
+    (Pace, P.pace),
+    (Target, P.target),
+    (Disturbance, P.disturbance),
+    (Task, P.task),
+)
+
+
+def _part(p: npt.NDArray[np.float64], kind: Any, at: int) -> Any:
+    return kind(*p[at : at + len(kind._fields)].tolist())
+
+
+def _check(scenario: Scenario) -> None:
+    """ValueError for a scenario that asks for what only our plant has."""
+    defaults = {entry.name: entry.default for entry in dataclasses.fields(Scenario)}
+    for name in _OURS:
+        value = getattr(scenario, name)
+        if value and value != defaults[name]:
+            raise ValueError(
+                f"scenario {scenario.name!r}: {name} {value!r} is of our own plant and road; an "
+                "outside plant is what it is, on a straight and level road"
+            )
