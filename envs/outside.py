@@ -67,12 +67,14 @@ def _parameters() -> Any:
 def outside_vehicle() -> Vehicle:
     """The BMW 320i as our `Vehicle`: what estimators and controllers are told of an outside plant.
 
-    Cornering stiffness is the Magic Formula's slope p_Ky1 F_z at the tyre's standing load; roll
-    stiffness and damping are those of the springs, the anti-roll bars and the dampers.
+    Cornering stiffness is the Magic Formula's slope p_Ky1 F_z at the tyre's standing load. Roll
+    stiffness is that of springs and anti-roll bars on top of the tyres' vertical springs.
     """
     p = _parameters()
     per_arm = 0.5 * p.m * GRAVITY / (p.a + p.b)  # standing load of a tyre over the other axle's arm
     arm = p.h_s - 0.5 * (p.h_raf + p.h_rar)
+    body = 0.5 * (p.T_f**2 * p.K_sf + p.T_r**2 * p.K_sr) - p.K_tsf - p.K_tsr  # N m/rad
+    tyres = 0.5 * (p.T_f**2 + p.T_r**2) * p.K_zt
     return Vehicle(
         name="bmw-320i",
         mass=p.m,
@@ -91,7 +93,7 @@ def outside_vehicle() -> Vehicle:
         sprung_mass=p.m_s,
         roll_arm=arm,
         roll_inertia=p.I_Phi_s + p.m_s * arm**2,
-        roll_stiffness=0.5 * (p.T_f**2 * p.K_sf + p.T_r**2 * p.K_sr) - p.K_tsf - p.K_tsr,
+        roll_stiffness=1.0 / (1.0 / body + 1.0 / tyres),
         roll_damping=0.5 * (p.T_f**2 * p.K_sdf + p.T_r**2 * p.K_sdr),
     )
 

@@ -50,14 +50,12 @@ def driven(model: str, acting: Acting, seconds: float = 1.0, **changes: Any) -> 
 
 def test_the_single_track_is_the_bicycle_of_the_vehicle_that_is_told() -> None:
     acting = Acting(0.01, -60.0, 60.0)
-    moment = 60.0 * 2.0 / outside_vehicle().motor_torque * outside_vehicle().yaw_moment_limit / 2.0
+    moment = 60.0 / outside_vehicle().motor_torque * outside_vehicle().yaw_moment_limit
     model = bicycle(outside_vehicle(), V)
-    G, H = model.discrete(0.2)
-    expected = H @ [0.01, moment]
+    expected = model.discrete(0.2)[1] @ [0.01, moment]
     motion = driven("single-track", acting, 0.2).motion
     found = [np.arctan2(motion.v_y, motion.v_x), motion.gamma]
-    np.testing.assert_allclose(found, expected, rtol=1e-10)
-    assert G.shape == (2, 2)
+    np.testing.assert_allclose(found, expected, rtol=1e-8)
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -84,13 +82,13 @@ def test_an_accelerometer_feels_the_rate_of_the_motion(model: str) -> None:
 
 
 def test_the_multi_body_car_leans_out_of_the_curve_as_ours_does() -> None:
-    """By M_s h_s a_y / (K_x - M_s g h_s) in steady state, within what its axles add."""
+    """By M_s h_s a_y / (K_x - M_s g h_s) in steady state."""
     plant = driven("multi-body", Acting(0.01), 2.0)
     car, motion = outside_vehicle(), plant.motion
     a_y = motion.gamma * motion.v_x
     expected = car.roll_moment_arm * a_y / (car.roll_stiffness - 9.81 * car.roll_moment_arm)
     assert motion.phi > 0.0
-    assert motion.phi == pytest.approx(expected, rel=0.2)
+    assert motion.phi == pytest.approx(expected, rel=0.03)
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -106,11 +104,11 @@ def test_a_derivative_leaves_the_state_alone(model: str) -> None:
 def test_friction_is_what_the_tyres_can_hold(model: str) -> None:
     plant = OUTSIDE_PLANTS[model](friction=0.3)
     plant.start(Motion(V, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
-    felt = []
+    pulled = []
     for _ in range(1500):
-        plant.step(Acting(0.1), 1e-3)
-        felt.append(plant.motion.gamma * plant.motion.v_x)
-    assert 0.24 * 9.81 < felt[-1] < 0.31 * 9.81
+        plant.step(Acting(0.04), 1e-3)
+        pulled.append(plant.specific_force[1] / 9.81 - plant.motion.phi)
+    assert 0.27 < max(pulled) < 0.31
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -122,17 +120,18 @@ def test_the_environment_keeps_gymnasiums_contract(model: str) -> None:
 @pytest.mark.parametrize("model", MODELS)
 def test_sensors_and_disturbances_draw_what_ours_draw(model: str) -> None:
     scenario = STEP | {"noise": {}, "duration": 0.2}
-    ours = gym.make("sideslip/YawFusion-v0", scenario=scenario, vehicle=outside_vehicle().to_dict())
-    env: Any = outside(model, scenario=scenario)
+    vehicle = outside_vehicle().to_dict()
+    ours: Any = gym.make("sideslip/YawFusion-v0", scenario=scenario, vehicle=vehicle).unwrapped
+    env = outside(model, scenario=scenario)
     errors = []
-    for each in (ours.unwrapped, env):
+    for each in (ours, env):
         each.reset(seed=5)
         for _ in range(10):
             each.step([0.0])
         errors.append(each.record.fast[-1, 0] - each.motion.gamma)
         assert each.ticks_done == 10
     assert errors[0] == errors[1]
-    assert ours.unwrapped.layout == env.layout  # type: ignore[attr-defined]
+    assert ours.layout == env.layout
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -170,8 +169,8 @@ def test_estimators_and_controllers_run_on_it(model: str) -> None:
 
 
 def test_a_spin_ends_the_episode_and_the_rest_is_charged() -> None:
-    env = outside("drift", scenario=CALM | {"steering": "step", "amplitude": 0.3})
-    env.reset(seed=0)
+    env = outside("drift", scenario=CALM)
+    env.reset(seed=0, options={"state": {"v_y": -0.45 * V, "gamma": 2.0}})
     over, cost = False, 0.0
     while not over:
         _, reward, terminated, truncated, info = env.step([0.0])
