@@ -1,0 +1,206 @@
+"""A drive: from a scenario's fields to the time series of what the car did."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import numpy.typing as npt
+
+from ...agents import make_agent
+from ...envs.dynamics import Motion
+from ...envs.outside import OUTSIDE_PLANTS, Acting, OutsidePlant
+from ...envs.programme import STEERING_KINDS, STEERING_WIDTH, Draws, steering_at, write_steering
+from ...envs.record import TICK
+from ...envs.scenario import Scenario
+from ...envs.vehicle import Vehicle
+from ...estimators import EstimateObservation
+
+Array = npt.NDArray[np.float64]
+Fields = Mapping[str, Any]
+
+CALM: dict[str, Any] = {
+    "name": "procedure",
+    "disturbance_force": 0.0,
+    "disturbance_moment": 0.0,
+}
+"""A proving ground without wind: what every procedure's scenario starts from."""
+
+
+@dataclass(frozen=True)
+class Series:
+    """What a car did, (n,) each, at even times, SI units.
+
+    steer: front wheels. v_x, v_y, gamma, psi, X, Y: of the centre of gravity. moment: the yaw
+    moment delivered, N m. failed: the episode ended by a failure.
+    """
+
+    t: Array
+    steer: Array
+    v_x: Array
+    v_y: Array
+    gamma: Array
+    psi: Array
+    X: Array
+    Y: Array
+    moment: Array
+    failed: bool = False
+
+    def __post_init__(self) -> None:
+        for name, values in vars(self).items():
+            if name != "failed" and values.shape != self.t.shape:
+                raise ValueError(f"{name} has shape {values.shape}, the times {self.t.shape}")
+
+    @property
+    def beta(self) -> Array:
+        """The sideslip angle in rad."""
+        return np.arctan2(self.v_y, self.v_x)
+
+    @property
+    def a_y(self) -> Array:
+        """The lateral acceleration in m/s2, v_y' + v_x gamma."""
+        return np.gradient(self.v_y, self.t) + self.v_x * self.gamma
+
+    def at(self, name: str, time: float) -> float:
+        """A signal at a time in s, between two samples on the line; NaN after the end."""
+        values = np.asarray(getattr(self, name))
+        return float(np.interp(time, self.t, values, right=np.nan))
+
+
+Drive = Callable[[Fields], Series]
+"""From fields of a `Scenario` to what the car did."""
+
+Law = Callable[[Motion, float], float]
+"""A yaw moment in N m from the true motion and the steering angle."""
+
+SPEED_GAIN = 10.0  # 1/s, of the speed that an outside plant's driver holds
+
+
+def of_env(
+    env_id: str,
+    agent: str = "none",
+    estimator: str = "",
+    seed: int = 0,
+    agent_options: Fields | None = None,
+    **options: Any,
+) -> Drive:
+    """Drives of an environment of ours with a controller and, if named, its estimator.
+
+    options: of the environment (vehicle, nominal, control_period, model of an outside plant).
+    """
+
+    def drive(fields: Fields) -> Series:
+        scenario = CALM | dict(fields)
+        env: gym.Env[Any, Any] = gym.make(
+            env_id, scenario=scenario, on_bad_action="fail", **options
+        )
+        if estimator:
+            env = EstimateObservation(env, estimator)
+        return _episode(env, make_agent(agent, env, **(agent_options or {})), seed)
+
+    return drive
+
+
+def _episode(env: gym.Env[Any, Any], agent: Any, seed: int) -> Series:
+    base: Any = env.unwrapped
+    obs, info = env.reset(seed=seed)
+    rows, state, start, over = [_row(base, info)], None, np.ones(1, bool), False
+    while not over:
+        action, state = agent.predict(obs, state, start, deterministic=True)
+        obs, _, terminated, truncated, info = env.step(action)
+        rows.append(_row(base, info))
+        start, over = np.zeros(1, bool), terminated or truncated
+    env.close()
+    return _series(rows, bool(info["failure"]))
+
+
+def _row(base: Any, info: Fields) -> list[float]:
+    return [info["t"], info["steer"], *_moving(base.motion), info["yaw_moment"]]
+
+
+def _series(rows: list[list[float]], failed: bool) -> Series:
+    t, steer, v_x, v_y, gamma, psi, X, Y, moment = np.array(rows).T
+    return Series(t, steer, v_x, v_y, gamma, psi, X, Y, moment, failed)
+
+
+def _moving(m: Motion) -> tuple[float, ...]:
+    return m.v_x, m.v_y, m.gamma, m.psi, m.X, m.Y
+
+
+def of_plant(model: str, law: Law | None = None, friction: float | None = None) -> Drive:
+    """Drives of an outside plant alone, its steering angle prescribed and no actuator's lag.
+
+    model: of `OUTSIDE_PLANTS`. law: a yaw moment every millisecond. friction: of its tyres. The
+    field `acceleration` None holds the speed, 0 lets the car coast.
+    """
+
+    def drive(fields: Fields) -> Series:
+        scenario = Scenario(**(CALM | dict(fields)))
+        programme = steering_programme(scenario)
+        return prescribed(
+            OUTSIDE_PLANTS[model](friction),
+            lambda t: float(steering_at(t / TICK, programme)),
+            scenario.range("speed")[0],
+            scenario.duration,
+            scenario.acceleration is None,
+            law,
+        )
+
+    return drive
+
+
+def prescribed(
+    plant: OutsidePlant,
+    steering: Callable[[float], float],
+    speed: float,
+    duration: float,
+    hold: bool = False,
+    law: Law | None = None,
+) -> Series:
+    """An outside plant from straight ahead under a steering angle (rad) over time (s).
+
+    hold: a force keeps the speed (m/s); otherwise the car coasts.
+    """
+    plant.start(Motion(speed, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+    rows = [[0.0, steering(0.0), *_moving(plant.motion), 0.0]]
+    for k in range(round(duration / TICK)):
+        steer, motion = steering(k * TICK), plant.motion
+        moment = 0.0 if law is None else law(motion, steer)
+        push = plant.p.m * plant.p.R_w * SPEED_GAIN * (speed - motion.v_x) if hold else 0.0
+        turn = plant.p.R_w / plant.p.T_r * moment
+        plant.step(Acting(steer, 0.5 * push - turn, 0.5 * push + turn), TICK)
+        if not plant.finite:
+            break
+        rows.append([(k + 1) * TICK, steer, *_moving(plant.motion), moment])
+    return _series(rows, not plant.finite)
+
+
+def steering_programme(scenario: Scenario) -> tuple[float, ...]:
+    """The numbers that `steering_at` reads, of a scenario that draws nothing.
+
+    Raises ValueError for a range: a procedure leaves nothing to the seed.
+    """
+    low, high = scenario.draws()
+    if (low != high).any():
+        raise ValueError(f"scenario {scenario.name!r} draws; a procedure gives numbers")
+    programme = np.zeros(STEERING_WIDTH)
+    write_steering(STEERING_KINDS.index(scenario.steering), Draws(*low.tolist()), programme)
+    return tuple(programme.tolist())
+
+
+@dataclass(frozen=True)
+class TestCar:
+    """A car on the proving ground. speed: m/s of the procedures that prescribe one.
+
+    ratio: of the steering wheel's angle to the front wheels'. length, front_overhang: m, of its
+    body, the overhang from the front axle forward.
+    """
+
+    vehicle: Vehicle
+    speed: float
+    ratio: float
+    length: float
+    front_overhang: float
+
+    __test__ = False  # pytest would take it for tests

@@ -1,0 +1,174 @@
+"""FMVSS 126: electronic stability control, sine with dwell (49 CFR 571.126, S5.2, S7.6, S7.9).
+
+Slowly increasing steer (13.5 deg/s at the steering wheel, constant speed) gives A, the steering
+wheel angle at 0.3 g, from a line through the lateral accelerations of 0.1 to 0.375 g. Then one
+period of a sine of 0.7 Hz with a dwell of 500 ms after its third quarter, coasting, 1.5 A up in
+steps of 0.5 A; the last amplitude is the larger of 6.5 A and 270 deg, at most 300 deg.
+
+A run passes where
+- the yaw rate 1.00 s and 1.75 s after completion of steer is at most 35 % and 20 % of its peak
+  after the steer reversal (S5.2.1, S5.2.2), and
+- from 5 A on, the centre of gravity has moved sideways by 1.83 m or more 1.07 s after the
+  beginning of steer (S5.2.3).
+The peak is that of the yaw rate towards the reversed steering, between the reversal and the
+completion of steer: a car that spins has no later one. Magnitudes are compared.
+
+The standard's speed is 80 km/h. A car that does not go as fast is tested at its own top speed. The
+0.3 g and the 1.83 m stay: on the same road the same lateral accelerations are within reach, and the
+way that a lateral acceleration makes in a second does not depend on the speed.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...envs.vehicle import GRAVITY
+from .drive import Array, Drive, Fields, Series, TestCar
+
+FREQUENCY, DWELL = 0.7, 0.5  # Hz, s
+ONSET = 0.5  # s, straight ahead before
+AFTER = 2.0  # s, recorded after completion of steer
+RAMP_RATE = math.radians(13.5)  # rad/s at the steering wheel
+A_AT, A_FROM, A_TO = 0.3 * GRAVITY, 0.1 * GRAVITY, 0.375 * GRAVITY
+FIRST, STEP, LAST = 1.5, 0.5, 6.5  # of A
+LEAST, MOST = math.radians(270.0), math.radians(300.0)  # at the steering wheel
+RATIOS = ((1.0, 0.35), (1.75, 0.20))  # s after completion of steer, share of the peak
+RESPONSIVE = 5.0  # of A
+SIDEWAYS, SIDEWAYS_AT = 1.83, 1.07  # m, s after the beginning of steer
+
+REVERSAL = ONSET + 0.5 / FREQUENCY
+COMPLETION = ONSET + 1.0 / FREQUENCY + DWELL
+
+
+@dataclass(frozen=True)
+class Run:
+    """A sine with dwell: its amplitude at the steering wheel in rad, with its sign, and in A.
+
+    ratio_1, ratio_2: the yaw rate at the two times over its peak. sideways: m. All NaN from where
+    the car's drive ended.
+    """
+
+    amplitude: float
+    multiple: float
+    ratio_1: float
+    ratio_2: float
+    sideways: float
+
+    @property
+    def stable(self) -> bool:
+        """S5.2.1 and S5.2.2; NaN is not."""
+        return self.ratio_1 <= RATIOS[0][1] and self.ratio_2 <= RATIOS[1][1]
+
+    @property
+    def responsive(self) -> bool:
+        """S5.2.3, where it asks."""
+        return self.multiple < RESPONSIVE or self.sideways >= SIDEWAYS
+
+    @property
+    def passed(self) -> bool:
+        """Both."""
+        return self.stable and self.responsive
+
+
+def slow_steer(car: TestCar, side: float, most: float = 0.5 * GRAVITY) -> Fields:
+    """The slowly increasing steer: until a linear car reaches `most` (m/s2), at least 2 s long."""
+    seconds = 30.0
+    return {
+        "steering": "ramp",
+        "onset": ONSET,
+        "amplitude": side * RAMP_RATE / car.ratio * seconds,
+        "hold": seconds,
+        "speed": car.speed,
+        "duration": ONSET + seconds * min(1.0, most / (2.0 * GRAVITY)),
+    }
+
+
+def angle_at(series: Series, ratio: float) -> float:
+    """|A| in rad at the steering wheel: where the line through 0.1 to 0.375 g crosses 0.3 g.
+
+    Raises ValueError where the car never gets there.
+    """
+    a_y = np.abs(series.a_y)
+    beyond = np.flatnonzero(a_y > A_TO)
+    if not len(beyond):
+        raise ValueError(f"slowly increasing steer reached {a_y.max():.2f} m/s2, not {A_TO:.2f}")
+    there = np.flatnonzero(a_y[: beyond[0]] >= A_FROM)
+    slope, start = np.polyfit(a_y[there], ratio * np.abs(series.steer[there]), 1)
+    return float(start + slope * A_AT)
+
+
+def amplitudes(A: float) -> Array:
+    """Steering wheel angles in rad of a series, from 1.5 A on."""
+    last = MOST if LAST * A > MOST else max(LAST * A, LEAST)
+    count = math.ceil(round((last / A - FIRST) / STEP, 9))
+    return np.append(A * (FIRST + STEP * np.arange(count)), last)
+
+
+def sine_with_dwell(car: TestCar, amplitude: float) -> Fields:
+    """A run; amplitude: rad at the steering wheel, its sign the side of the first half."""
+    return {
+        "steering": "sine-with-dwell",
+        "onset": ONSET,
+        "amplitude": amplitude / car.ratio,
+        "frequency": FREQUENCY,
+        "hold": DWELL,
+        "speed": car.speed,
+        "acceleration": 0.0,
+        "duration": COMPLETION + AFTER,
+    }
+
+
+def judge(series: Series, amplitude: float, A: float) -> Run:
+    """What a run gave; amplitude and A: rad at the steering wheel."""
+    towards = -math.copysign(1.0, amplitude)
+    steered = (series.t >= REVERSAL) & (series.t <= COMPLETION)
+    peak = float(np.max(towards * series.gamma[steered], initial=0.0))
+    later = [abs(series.at("gamma", COMPLETION + time)) for time, _ in RATIOS]
+    ratio_1, ratio_2 = (rate / peak if peak > 0.0 else math.nan for rate in later)
+    return Run(amplitude, abs(amplitude) / A, ratio_1, ratio_2, _sideways(series))
+
+
+def _sideways(series: Series) -> float:
+    """m across the heading at the beginning of steer."""
+    end = ONSET + SIDEWAYS_AT
+    dX, dY = (series.at(name, end) - series.at(name, ONSET) for name in ("X", "Y"))
+    psi = series.at("psi", ONSET)
+    return abs(dY * math.cos(psi) - dX * math.sin(psi))
+
+
+@dataclass(frozen=True)
+class Result:
+    """A: rad at the steering wheel, the mean of both sides'. runs: as they were driven."""
+
+    A: float
+    runs: tuple[Run, ...]
+
+    @property
+    def passed(self) -> bool:
+        """Whether every run passes."""
+        return all(run.passed for run in self.runs)
+
+    @property
+    def highest(self) -> float:
+        """The amplitude in A up to which every run passes, on both sides; 0 if none does."""
+        failed = min((run.multiple for run in self.runs if not run.passed), default=math.inf)
+        return max((run.multiple for run in self.runs if run.multiple < failed), default=0.0)
+
+
+def steering_for(drive: Drive, car: TestCar) -> float:
+    """A in rad at the steering wheel, the mean of a turn to the left and one to the right."""
+    found = [angle_at(drive(slow_steer(car, side)), car.ratio) for side in (1.0, -1.0)]
+    return float(np.mean(found))
+
+
+def run(
+    drive: Drive, car: TestCar, A: float | None = None, multiples: Sequence[float] | None = None
+) -> Result:
+    """The whole procedure. A: where it is known. multiples: of A, in place of the series."""
+    A = steering_for(drive, car) if A is None else A
+    angles = amplitudes(A) if multiples is None else A * np.asarray(multiples)
+    signed = [side * angle for angle in angles.tolist() for side in (1.0, -1.0)]
+    runs = [judge(drive(sine_with_dwell(car, angle)), angle, A) for angle in signed]
+    return Result(A, tuple(runs))

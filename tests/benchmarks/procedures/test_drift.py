@@ -1,0 +1,69 @@
+"""The outside check: sine with dwell on CommonRoad's drift model at 80 km/h."""
+
+import math
+
+import numpy as np
+import pytest
+
+pytest.importorskip("vehiclemodels")
+from sideslip.benchmarks.procedures import fmvss126
+from sideslip.benchmarks.procedures.drive import Drive, Fields, Law, Series, TestCar, prescribed
+from sideslip.envs.dynamics import Motion
+from sideslip.envs.outside import Drift, outside_vehicle
+from sideslip.envs.vehicle import GRAVITY
+
+V = 80.0 / 3.6
+BMW = TestCar(outside_vehicle(), V, 16.0, 4.508, 0.8)
+MOST = 500.0  # N m
+
+
+def steering(fields: Fields, t: float) -> float:
+    """Slowly increasing steer and sine with dwell, written out once more."""
+    since, amplitude = t - fields["onset"], fields["amplitude"]
+    if since < 0.0:
+        return 0.0
+    if fields["steering"] == "ramp":
+        return float(amplitude * min(1.0, since / fields["hold"]))
+    phase, dwell = 0.7 * since, 0.7 * 0.5
+    if phase > 0.75:
+        phase = max(0.75, phase - dwell)
+    return float(amplitude * math.sin(math.tau * phase)) if phase < 1.0 else 0.0
+
+
+def drive_with(law: Law | None) -> Drive:
+    def drive(fields: Fields) -> Series:
+        hold = fields["steering"] == "ramp"
+        return prescribed(Drift(), lambda t: steering(fields, t), V, fields["duration"], hold, law)
+
+    return drive
+
+
+def within_500(motion: Motion, steer: float) -> float:
+    """Yaw rate error against what neutral steering and friction allow, saturated."""
+    most = 0.85 * GRAVITY / motion.v_x
+    wanted = np.clip(motion.v_x * steer / outside_vehicle().wheelbase, -most, most)
+    return float(np.clip(2e4 * (wanted - motion.gamma), -MOST, MOST))
+
+
+@pytest.fixture(scope="module")
+def A() -> float:
+    return fmvss126.steering_for(drive_with(None), BMW)
+
+
+def test_without_control_the_car_fails_at_5_a(A: float) -> None:
+    result = fmvss126.run(drive_with(None), BMW, A, [1.5, 3.0, 5.0])
+    assert result.highest == pytest.approx(3.0)
+    assert not any(run.stable for run in result.runs if run.multiple > 4.9)
+
+
+def test_a_yaw_moment_of_500_n_m_passes_at_6_5_a(A: float) -> None:
+    result = fmvss126.run(drive_with(within_500), BMW, A, [5.0, 6.5])
+    assert result.passed
+    assert min(run.sideways for run in result.runs) >= 1.83
+
+
+def test_a_belongs_to_0_3_g_of_the_steady_car(A: float) -> None:
+    """Within the lag of a slow ramp and what the Magic Formula loses by 0.3 g."""
+    car = outside_vehicle()
+    steady = 0.3 * GRAVITY * car.wheelbase / V**2  # of a neutral car
+    assert A / BMW.ratio == pytest.approx(steady, rel=0.2)
