@@ -14,7 +14,7 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 from gymnasium.vector.utils import batch_space
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
-from sideslip.envs import StabilityVectorEnv
+from sideslip.envs import SCENARIOS, StabilityVectorEnv
 
 from .batches import MODES, SHORT, actions, batch, drive, pair, plain, same, same_cars, sync
 from .helpers import IDS, bits, unwrapped
@@ -105,6 +105,16 @@ def test_the_arguments_are_those_of_the_environment_alone(
     assert drive(alone, together, 120) > 0
     assert together.control_period == arguments.get("control_period", 10)
     assert together.reference == arguments.get("reference", "model")
+
+
+@pytest.mark.parametrize("scenario", SCENARIOS)
+def test_every_scenario_is_the_same_in_a_row(scenario: str) -> None:
+    alone, together = pair(FUSION, 2, "SameStep")
+    options = {"scenario": scenario, "duration": 1.0}
+    one = alone.reset(seed=0, options=dict(options))
+    same(one, together.reset(seed=0, options=options))
+    same_cars(alone, together)
+    assert drive(alone, together, 50) > 0
 
 
 @pytest.mark.smoke
