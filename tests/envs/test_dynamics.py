@@ -202,7 +202,7 @@ def test_integrator_is_of_fourth_order(car: Car, law: int) -> None:
 @pytest.mark.parametrize("speed", [0.0, 0.3, -2.0, 5.0])
 @pytest.mark.parametrize("mu", [1e-9, 0.9])
 def test_any_speed_and_hardly_any_friction_stay_finite(speed: float, mu: float) -> None:
-    car = CAR._replace(mu=mu)
+    car = CAR._replace(mu=mu, mu_r=mu)
     load = load_of(Inputs(0.4, -100.0, 100.0), car, 0)
     state = motion(v_x=speed)
     for _ in range(3000):
