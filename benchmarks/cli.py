@@ -14,8 +14,9 @@ from rich.console import Console
 from rich.markup import escape
 
 from .. import __version__
-from .rows import Row, Suite, check_writable, write_json, write_parquet
+from .rows import Row, Suite, check_writable, write_json, write_parquet, write_whole
 from .screen import print_suite
+from .suites import SUITES, Wish
 from .tune_command import tune_app
 
 app = typer.Typer(
@@ -95,6 +96,7 @@ def run(
     control_period: Annotated[int, typer.Option(help="Ticks of 1 ms.")] = 10,
     plot: Annotated[Path | None, typer.Option(help="Write a PNG.")] = None,
     parquet: Annotated[Path | None, typer.Option(help="Write every signal.")] = None,
+    kml: Annotated[Path | None, typer.Option(help="Write the track for a map.")] = None,
 ) -> None:
     """Drive one episode, print its score, draw it."""
     import gymnasium as gym
@@ -103,8 +105,9 @@ def run(
     from ..agents import make_agent
     from ..agents.rollout import rollout
     from ..estimators import EstimateObservation
+    from .kml import track_kml
 
-    check_writable(plot, parquet)
+    check_writable(plot, parquet, kml)
     options: dict[str, Any] = {} if scenario is None else {"scenario": scenario}
     env: gym.Env[Any, Any] = gym.make(env_id, control_period=control_period, **options)
     if estimator is not None:
@@ -121,35 +124,8 @@ def run(
         drive.plot().savefig(plot, dpi=120)
     if parquet is not None:
         drive.to_parquet(parquet)
-
-
-def _estimation(quick: bool, jobs: int | None) -> Suite:
-    from . import estimation
-
-    return estimation.run(
-        estimation.QUICK_SEEDS if quick else estimation.SEEDS, jobs, console=console
-    )
-
-
-def _control(quick: bool, jobs: int | None) -> Suite:
-    from . import control
-
-    return control.run(control.QUICK_SEEDS if quick else control.SEEDS, jobs, console=console)
-
-
-def _papers(quick: bool, jobs: int | None) -> Suite:
-    from . import papers
-
-    return papers.run(papers.QUICK_SEEDS if quick else papers.SEEDS, jobs, console=console)
-
-
-def _speed(quick: bool, jobs: int | None) -> Suite:
-    from . import speed
-
-    return speed.run()
-
-
-SUITES = {"estimation": _estimation, "control": _control, "papers": _papers, "speed": _speed}
+    if kml is not None:
+        write_whole(kml, track_kml(drive.log.name, {agent: (drive["X"], drive["Y"])}))
 
 
 @app.command()
@@ -164,6 +140,12 @@ def bench(
     parquet: Parquet = None,
     picture: Annotated[Path | None, typer.Option(help="Write the summary as a PNG.")] = None,
     jobs: Jobs = None,
+    episodes: Annotated[
+        int | None, typer.Option(min=4, help="Episodes a cell of the suite control (1000).")
+    ] = None,
+    keep: Annotated[
+        Path | None, typer.Option(help="A folder for finished cases: a stopped run goes on.")
+    ] = None,
 ) -> None:
     """Compare estimators and controllers, and a recorded drive if one is given."""
     names = suites or list(SUITES)
@@ -176,7 +158,8 @@ def bench(
         from .replay import replay_file
 
         done.append(replay_file(log, vehicle, mapping=mapping))
-    done += [SUITES[name](quick, jobs) for name in names]
+    wish = Wish(quick, jobs, console, episodes, keep)
+    done += [SUITES[name](wish) for name in names]
     order = [*names, "replay"]
     done.sort(key=lambda suite: order.index(suite.name))
     _give(done, html, json, parquet)

@@ -36,7 +36,7 @@ class Explorer:
 
     title: str
     menus: Sequence[str]
-    cells: Mapping[tuple[str, ...], Mapping[str, Array]]
+    cells: Mapping[Any, Mapping[str, Array]]
     panels: Sequence[Panel]
     caption: str = ""
 

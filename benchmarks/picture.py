@@ -5,11 +5,12 @@ from pathlib import Path
 from typing import Any
 
 from .colours import INK, colour
-from .rows import Row, Suite
+from .matrix.contestants import REFERENCE_FILTER, YAW
+from .rows import METRICS, Row, Suite
 
 
 def write_picture(path: str | Path, suites: Sequence[Suite]) -> None:
-    """Bars of every estimator's error and every controller's slip, with their intervals.
+    """Bars of every estimator's error and the controllers' scores, with their intervals.
 
     Needs the extra `report`. Raises ValueError if no suite has a row to draw.
     """
@@ -30,9 +31,10 @@ def write_picture(path: str | Path, suites: Sequence[Suite]) -> None:
                 "error of sideslip / mrad",
             ),
             ("dakf-fig6", "rmse", "Estimating with GPS, wind, outage", "error of sideslip / mrad"),
-            ("tie-vision-fig8", "rms_slip", "Controlling a lane change", "RMS sideslip / mrad"),
         )
     ]
+    scores = [r for r in rows if r.scenario == "all" and r.metric == "score" and _main(r)]
+    panels.append(("Controlling ten manoeuvres", scores, "score (1: clairvoyant)"))
     panels = [panel for panel in panels if panel[1]]
     if not panels:
         raise ValueError("nothing to draw: the picture needs the suites estimation or control")
@@ -63,15 +65,22 @@ def write_picture(path: str | Path, suites: Sequence[Suite]) -> None:
         part.unlink(missing_ok=True)
 
 
+def _main(row: Row) -> bool:
+    """Whether a controller stands in the picture: with the best filter, yaw moment alone."""
+    return row.env_version.startswith(YAW) and row.estimator in ("", REFERENCE_FILTER)
+
+
 def _bars(axis: Any, rows: Sequence[Row], title: str, label: str) -> None:
-    """Horizontal bars, the best on top and darker."""
-    ordered = sorted(rows, key=lambda row: -row.value)
+    """Horizontal bars, the best on top: the smallest error or the highest score."""
+    sign = 1.0 if rows[0].metric == "score" else -1.0
+    ordered = sorted(rows, key=lambda row: sign * row.value)
     names = [row.estimator if row.metric == "rmse" else _contestant(row) for row in ordered]
-    values = [1e3 * row.value for row in ordered]
+    scale = 1e3 if METRICS[rows[0].metric] == "rad" else 1.0
+    values = [scale * row.value for row in ordered]
     colours = [colour(name) for name in names]
     errors = [
-        [1e3 * (row.value - row.low) for row in ordered],
-        [1e3 * (row.high - row.value) for row in ordered],
+        [scale * (row.value - row.low) for row in ordered],
+        [scale * (row.high - row.value) for row in ordered],
     ]
     bars = axis.barh(names, values, color=colours, xerr=errors, ecolor="0.3", capsize=2)
     for bar, name in zip(bars, names, strict=True):

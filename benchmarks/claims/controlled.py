@@ -8,7 +8,8 @@ import numpy as np
 
 from ...agents import make_agent
 from ...agents.rollout import rollout
-from .. import control, tracking
+from .. import tracking
+from . import lane_change
 from .claim import Array, Example, Measured
 from .simulations import FIRST, Numbers, chunked, rms, stacked
 
@@ -17,9 +18,9 @@ SIGNALS = ("beta", "gamma", "steer", "yaw_moment")
 
 @dataclass(frozen=True)
 class Slip:
-    """Contestants of the suite `control` on the same seeds of a scenario.
+    """Contestants of `lane_change` on the same seeds of a scenario.
 
-    contestants: of `control.CONTESTANTS`. options: more options of the agent, by contestant.
+    contestants: of `lane_change.CONTESTANTS`. options: more options of the agent, by contestant.
     Numbers of each: RMS and peak of the slip, the largest change of the yaw moment in a
     millisecond, the sum of all its changes and the share of time at its limit.
     """
@@ -50,9 +51,9 @@ class Slip:
 
     def _drive(self, label: str, seed: int) -> tuple[Array, dict[str, Array], float]:
         """Times, signals, and the yaw moment's limit in N m."""
-        known = {contestant.label: contestant for contestant in control.CONTESTANTS}
+        known = {contestant.label: contestant for contestant in lane_change.CONTESTANTS}
         contestant = known[label.partition(",")[0]]
-        env = control.make_env(self.scenario, contestant)
+        env = lane_change.make_env(self.scenario, contestant)
         options: dict[str, Any] = dict(self.options.get(label, {}))
         if contestant.rate:
             options["rate"] = contestant.rate

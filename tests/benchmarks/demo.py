@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sideslip.benchmarks.explorer import Explorer, Panel
 from sideslip.benchmarks.rows import Suite, Table
 
 HOSTILE = "</script><b>1 & 2</b>"
@@ -87,3 +88,34 @@ def drawn() -> list[tuple[str, Any, str]]:
         ),
         ("The track", figures.track(paths), "Dead reckoning with each estimate."),
     ]
+
+
+def matrix() -> Suite:
+    """What only the matrix has: a heat map, a figure with menus, cars in motion, a file."""
+    pictures = pytest.importorskip("sideslip.benchmarks.matrix.pictures")
+    t = np.linspace(0.0, 8.0, 801)
+    cells = {
+        (manoeuvre, who): {"t": t, "beta": k * np.sin(t + k)}
+        for k, (manoeuvre, who) in enumerate(
+            [("gust", "none"), ("gust", "lqr"), ("step-steer", "none"), ("step-steer", HOSTILE)], 1
+        )
+    }
+    panels = [Panel("slip / mrad", [("beta", "true", "#0072B2")])] * 2
+    values = np.array([[0.0, 0.0, np.nan], [0.91, 0.72, 1.2]])
+    run = (10.0 * t, np.sin(t), 0.1 * np.cos(t))
+    short = tuple(each[:400] for each in run)
+    cars = pictures.animation(t, {"none": short, "lqr on exact-kf": run}, (1.3, 0.84))
+    delays = np.array([0.0, 100.0, 300.0])
+    line = (np.array([0.9, 0.8, 0.5]), np.array([0.88, 0.78, 0.4]), np.array([0.92, 0.82, 0.6]))
+    return Suite(
+        "control",
+        "Which controller and estimator hold the car",
+        "Made up.",
+        figures=[
+            ("Scores", pictures.heat_map(["none", "lqr"], ["gust", HOSTILE, "x"], values, "s"), ""),
+            ("Delay", pictures.curves(delays, {"lqr": line}, "delay / ms", "score"), ""),
+            ("In motion", cars, ""),
+        ],
+        explorers=[Explorer("Any cell", ("manoeuvre", "controller"), cells, panels, "One seed.")],
+        files=[("run.kml", "application/vnd.google-earth.kml+xml", HOSTILE)],
+    )

@@ -1,16 +1,18 @@
 """The report in a browser: every figure is drawn, nothing complains, a click sorts."""
 
+import base64
 import re
 import shutil
 import subprocess
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from sideslip.benchmarks.report import write_report
 from sideslip.benchmarks.rows import Suite
 
-from .demo import COMMAND, VERSIONS, control, drawn, estimation
+from .demo import COMMAND, HOSTILE, VERSIONS, control, drawn, estimation, matrix
 
 pytestmark = pytest.mark.long
 
@@ -34,6 +36,33 @@ OPTIONS = (
     "--virtual-time-budget=20000",
 )
 
+MENUS = """<script>
+setTimeout(() => {
+  const [first, second] = document.querySelectorAll(".explorer select");
+  const said = [[...second.options].map((option) => option.value).join("|")];
+  first.value = "step-steer";
+  first.dispatchEvent(new Event("change"));
+  said.push([...second.options].map((option) => option.value).join("|"));
+  second.value = second.options[1].value;
+  second.dispatchEvent(new Event("change"));
+  const plot = document.querySelector(".explorer .plot");
+  said.push(plot.data.length, plot.data[0].y[0].toFixed(3));
+  document.body.dataset.menus = said.join("; ");
+}, 3000);
+</script></body>"""
+FRAMES = """<script>
+setTimeout(() => {
+  const plot = [...document.querySelectorAll("figure:not(.explorer) .plot")].at(-1);
+  const front = () => plot._fullData.at(-1).x[0];
+  const before = front();
+  Plotly.animate(plot, ["8.00"], {
+    mode: "immediate", transition: { duration: 0 }, frame: { duration: 0, redraw: false },
+  });
+  setTimeout(() => {
+    document.body.dataset.moved = `${before.toFixed(2)} to ${front().toFixed(2)}`;
+  }, 2000);
+}, 3000);
+</script></body>"""
 CLICKS = """<script>
 const button = document.querySelectorAll("#summary th button")[%d];
 for (let i = 0; i < %d; i++) button.click();
@@ -109,3 +138,30 @@ def test_browser_sorts_tables(tmp_path: Path, column: int, clicks: int, order: s
     dom, messages = browse(page, "--dump-dom")
     assert messages == []
     assert f'data-order="{order}"' in dom
+
+
+def test_browser_shows_any_cell(tmp_path: Path) -> None:
+    page = written(tmp_path, [matrix()])
+    text = page.read_text(encoding="utf-8").replace("</body>", MENUS)
+    page.write_text(text, encoding="utf-8")
+    dom, messages = browse(page, "--dump-dom")
+    assert messages == []
+    hostile = HOSTILE.replace("&", "&amp;")
+    said = f'data-menus="none|lqr; none|{hostile}; 2; {4 * np.sin(4.0):.3f}"'
+    assert said in dom.replace("&lt;", "<").replace("&gt;", ">")
+
+
+def test_browser_moves_the_cars_and_offers_the_track(tmp_path: Path) -> None:
+    page = written(tmp_path, [matrix()])
+    text = page.read_text(encoding="utf-8").replace("</body>", FRAMES)
+    page.write_text(text, encoding="utf-8")
+    dom, messages = browse(page, "--dump-dom")
+    assert messages == []
+    moved = re.search(r'data-moved="([-.\d]+) to ([-.\d]+)"', dom)
+    assert moved is not None and float(moved[2]) - float(moved[1]) == pytest.approx(80.0, abs=0.1)
+    link = re.search(r'<a download="run.kml" href="data:[^;]+;base64,([^"]+)"', dom)
+    assert link is not None and base64.b64decode(link[1]).decode() == HOSTILE
+    picture = tmp_path / "matrix.png"
+    _, messages = browse(page, f"--screenshot={picture}", "--window-size=1280,3600")
+    assert messages == []
+    assert picture.stat().st_size > 50_000

@@ -1,0 +1,106 @@
+"""Question: which estimator with which controller keeps the car where it should be, and how far is
+that from the best possible? The matrix of both on ten manoeuvres."""
+
+from pathlib import Path
+
+from rich.console import Console
+
+from .. import __version__
+from .calibration import ceilings
+from .matrix.ceiling import failures_of, tops_of
+from .matrix.contestants import EPISODES, STEERING, YAW, cells
+from .matrix.illustrate import illustrate
+from .matrix.price import DELAYS, SCENARIO, Price, price_of_delay
+from .matrix.results import Results, measure
+from .matrix.seeds import salt_of, salted_seeds
+from .matrix.tables import Standing, main_table, rows_of, standings, yardsticks
+from .matrix.timing import decision_time
+from .rows import Row, Suite, Table
+
+PRICE_SHARE = 0.2  # of the matrix's episodes
+TITLES = {YAW: "Yaw moment by two motors", STEERING: "Yaw moment and added steering"}
+_TEXT = """\
+Ten manoeuvres with drawn tyres, friction, speed and steering; camera (33 ms, 30 ms late), GPS and \
+gyro; everybody, the uncontrolled car included, drives the same salted seeds. score: 0 is the \
+uncontrolled car, 1 the clairvoyant optimum, which knows the truth and the disturbances ahead; \
+IQM is the interquartile mean of the episodes' scores. `informed` is the LQG of the true car with \
+the same sensors: cost / informed is 1 where nothing better can be made of them on a linear plant. \
+Intervals are 95 % bootstraps, stratified by manoeuvre.
+
+An estimator uses its own sensors only: dakf the GPS, the others the camera, bicycle-kf neither; \
+"truth" is an estimator without error. Controllers know the nominal car alone."""
+
+
+def run(
+    episodes: int = EPISODES,
+    jobs: int | None = None,
+    console: Console | None = None,
+    keep: Path | None = None,
+) -> Suite:
+    """Both tables, the price of delay, and pictures.
+
+    episodes: a cell (slow controllers have at most 64). keep: a folder in which finished cases
+    stay, so that a run that was stopped goes on.
+    """
+    salt = salt_of()
+    suite = Suite("control", "Which controller and estimator hold the car", _TEXT)
+    results = measure(list(cells()), episodes, salt=salt, jobs=jobs, console=console, keep=keep)
+    found, yard = {}, []
+    for env_id, title in TITLES.items():
+        tops, log = tops_of(results, env_id)
+        found[env_id] = standings(results, env_id, tops)
+        for each in found[env_id]:
+            each.us = decision_time(each.cell)
+            suite.rows += rows_of(each, salt)
+        note = " ".join([_note(found[env_id], episodes), *log])
+        suite.tables.append(main_table(f"{title} ({env_id})", found[env_id], note))
+        yard.append(yardsticks(results, env_id, tops))
+    suite.tables += [*yard, _failures(results)]
+    share = max(4, round(PRICE_SHARE * episodes))
+    top = ceilings(YAW).get(SCENARIO)
+    prices = price_of_delay(top, share, salt=salt, jobs=jobs, console=console, keep=keep)
+    suite.rows += _price_rows(prices, share, salt)
+    illustrate(suite, found, results, prices, salted_seeds(salt, 1)[0])
+    return suite
+
+
+def _failures(results: Results) -> Table:
+    return Table(
+        "Episodes that failed",
+        ("env", "manoeuvre", "controller and estimator", "what happened"),
+        failures_of(results),
+        "The share of a cell's episodes; the rest of a failed episode is charged at the highest "
+        "cost.",
+        keyed=False,
+    )
+
+
+def _price_rows(prices: list[Price], n: int, salt: str) -> list[Row]:
+    """Rows of the price of delay; the scenario names the delay."""
+    return [
+        Row(
+            "control",
+            f"{SCENARIO}, sensors {1e3 * delay:.0f} ms late",
+            metric,
+            each.value,
+            controller=price.label,
+            low=each.low,
+            high=each.high,
+            n=n,
+            salt=salt,
+            env_version=f"{YAW} {__version__}",
+        )
+        for price in prices
+        for metric, series in (("score", price.score), ("cost_over_informed", price.over))
+        for delay, each in zip(DELAYS[: len(series)], series, strict=True)
+    ]
+
+
+def _note(found: list[Standing], episodes: int) -> str:
+    widest = max((s.overall["score"].half_width for s in found if "score" in s.overall), default=0)
+    return (
+        f"{episodes} episodes a manoeuvre, mpc at most 64. The widest interval of a score is "
+        f"+-{widest:.3f}. Effort is the mean square share of the full yaw moment; the largest step "
+        "that of the asked moment between two decisions; a decision is the estimator's step and "
+        "the controller's, for a single car."
+    )

@@ -1,0 +1,1 @@
+"""The matrix: estimators with controllers on manoeuvres, everyone on the same seeds."""

@@ -1,0 +1,49 @@
+"""The ceiling of every manoeuvre: the clairvoyant's mean cost, unless a method beats it."""
+
+from ...envs import FAILURES
+from ..calibration import ceilings
+from .results import Results
+from .scores import Ceiling
+
+_ERRORS = 3.0  # standard errors by which a method must win to become the ceiling
+
+
+def tops_of(results: Results, env_id: str) -> tuple[dict[str, Ceiling], list[str]]:
+    """({manoeuvre: ceiling}, what to log): a method that wins by three errors is the ceiling.
+
+    The clairvoyant is a local optimum and is calibrated on seeds of its own, so both means err.
+    """
+    tops, log = dict(ceilings(env_id)), []
+    for cell, result in results.found.items():
+        if cell.env_id != env_id or cell.scenario not in tops or result.error:
+            continue
+        top = tops[cell.scenario]
+        mean = float(result.costs.mean())
+        error = float(result.costs.std(ddof=1) / len(result.costs) ** 0.5)
+        if top.mean - mean > _ERRORS * (top.error**2 + error**2) ** 0.5:
+            tops[cell.scenario] = Ceiling(mean, error)
+            log.append(
+                f"{cell.label} costs {mean:.4g} on {cell.scenario}, below the clairvoyant's "
+                f"{top.mean:.4g}: it is the ceiling."
+            )
+    return tops, log
+
+
+def failures_of(results: Results) -> list[list[str]]:
+    """A line for every cell with an episode that ended by a failure, or that could not be driven:
+    env, manoeuvre, contestant, what happened."""
+    lines = []
+    for cell, result in results.found.items():
+        where = [cell.env_id, cell.scenario, cell.label]
+        if result.error:
+            lines.append([*where, f"not driven: {result.error}"])
+            continue
+        codes = result.numbers[:, -1].astype(int)
+        told = [
+            f"{name} {100.0 * (codes == code).mean():.1f} %"
+            for code, name in enumerate(FAILURES)
+            if code and (codes == code).any()
+        ]
+        if told:
+            lines.append([*where, ", ".join(told)])
+    return lines

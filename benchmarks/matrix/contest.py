@@ -1,0 +1,76 @@
+"""A cell's cars: the vector env with its estimator, and the controller that drives them all."""
+
+import warnings
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import numpy.typing as npt
+from gymnasium.vector import VectorEnv, VectorWrapper
+from gymnasium.vector.utils import batch_space
+
+from ...agents import make_agent
+from ...envs import Entry
+from ...estimators import FILTERS, UnobservableWarning
+from ...estimators.vector import EstimateObservation
+from .contestants import INFORMED, TRUTH, Cell
+
+_DISTURBANCES = {"forces": ("F_d", "N_d"), "walk": ("d1", "d2"), "walk-all": ("d1", "d2")}
+
+
+class TrueState(VectorWrapper[Any, Any, Any, Any, Any]):
+    """The true beta and gamma as `beta_hat` and `gamma_hat`: an estimator without error."""
+
+    def __init__(self, env: VectorEnv[Any, Any, Any]) -> None:
+        super().__init__(env)
+        inner: tuple[Entry, ...] = env.layout  # type: ignore[attr-defined]
+        self.layout = (
+            *inner,
+            Entry("beta_hat", "rad", -np.pi, np.pi),
+            Entry("gamma_hat", "rad/s", -20.0, 20.0),
+        )
+        low, high = np.array([entry[2:] for entry in self.layout]).T.astype(np.float32)
+        self.single_observation_space = gym.spaces.Box(low, high, dtype=np.float32)
+        self.observation_space = batch_space(self.single_observation_space, env.num_envs)
+
+    def _told(self, obs: Any, infos: Mapping[str, Any]) -> npt.NDArray[np.float32]:
+        truth = np.stack([infos["beta"], infos["gamma"]], axis=1)
+        return np.hstack([obs, np.clip(truth, [-np.pi, -20.0], [np.pi, 20.0])]).astype(np.float32)
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        """Reset the rows and append their truth."""
+        obs, infos = self.env.reset(seed=seed, options=options)
+        return self._told(obs, infos), infos
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """One step of all rows, with their truth."""
+        obs, rewards, terminated, truncated, infos = self.env.step(actions)
+        return self._told(obs, infos), rewards, terminated, truncated, infos
+
+
+def outputs_for(estimator: str) -> tuple[str, ...]:
+    """What controllers are told of an estimate: beta, gamma, and disturbances if it has them."""
+    return ("beta", "gamma", *_DISTURBANCES.get(FILTERS[estimator].disturbances, ()))
+
+
+def make_contest(cell: Cell, cars: int) -> tuple[VectorEnv[Any, Any, Any], Any]:
+    """(vector env of `cars` rows with the cell's estimator, its agent)."""
+    options = {"scenario": cell.scenario, "on_bad_action": "fail"} | cell.options
+    if cell.controller == INFORMED:
+        from ...agents.informed import make_informed
+
+        return make_informed(cell.env_id, num_envs=cars, **options)
+    env: Any = gym.make_vec(cell.env_id, num_envs=cars, **options)
+    agent_options: dict[str, Any] = {}
+    if cell.controller == "model-following":
+        agent_options["rejection"] = cell.estimator == "dakf"
+    if cell.estimator == TRUTH:
+        env = TrueState(env)
+    elif cell.estimator:
+        with warnings.catch_warnings():  # what dakf cannot see is told elsewhere
+            warnings.simplefilter("ignore", UnobservableWarning)
+            env = EstimateObservation(
+                env, cell.estimator, outputs=outputs_for(cell.estimator), std=False
+            )
+    return env, make_agent(cell.controller, env, **agent_options)

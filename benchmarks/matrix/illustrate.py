@@ -1,0 +1,138 @@
+"""The matrix's figures: heat maps, any cell's time series, price of delay, runs in motion."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import numpy.typing as npt
+
+from ...agents import make_agent
+from ...agents.rollout import Rollout, rollout
+from ...envs import VEHICLES
+from ...estimators import EstimateObservation
+from ..colours import INK, colour
+from ..explorer import Explorer, Panel
+from ..kml import track_kml
+from ..rows import Suite
+from .contestants import STEERING, YAW, Cell
+from .drive import SIGNALS
+from .price import DELAYS, Price, lines
+from .results import Results
+from .tables import Standing
+
+Array = npt.NDArray[np.float64]
+
+_SHOWN = (  # in motion
+    Cell(YAW, "", "", "none"),
+    Cell(YAW, "", "multirate-residual-kf", "two-dof"),
+    Cell(YAW, "", "exact-kf", "lqr"),
+)
+_MOVING = ("sine-with-dwell", "double-lane-change")
+_PANELS = (
+    Panel("sideslip angle / mrad", (("beta", "true", "#0072B2"), ("beta_ref", "reference", INK))),
+    Panel("yaw rate / (rad/s)", (("gamma", "true", "#0072B2"), ("gamma_ref", "reference", INK))),
+    Panel("yaw moment / (N m)", (("yaw_moment", "delivered", "#D55E00"),)),
+    Panel("front steering / mrad", (("steer", "delivered", "#D55E00"),)),
+)
+_SCALES = {"beta": 1e3, "beta_ref": 1e3, "steer": 1e3}
+
+
+def illustrate(
+    suite: Suite,
+    found: Mapping[str, Sequence[Standing]],
+    results: Results,
+    prices: Sequence[Price],
+    seed: int,
+) -> None:
+    """Add the figures to the suite; without plotly only the time series and the track.
+
+    seed: of the runs in motion.
+    """
+    suite.explorers.append(_time_series(results))
+    drives = {m: {cell.label: _run(cell, m, seed) for cell in _SHOWN} for m in _MOVING}
+    for manoeuvre, runs in drives.items():
+        tracks = {name: (run["X"], run["Y"]) for name, run in runs.items()}
+        text = track_kml(manoeuvre, tracks, {name: colour(name) for name in tracks})
+        suite.files.append((f"{manoeuvre}.kml", "application/vnd.google-earth.kml+xml", text))
+    try:
+        from .pictures import animation, curves
+    except ModuleNotFoundError:
+        return
+    for env_id, standings in found.items():
+        suite.figures += _maps(env_id, standings)
+    for what, label in (("score", "score"), ("over", "cost / cost of informed")):
+        shown = lines(prices, what)
+        if shown:
+            ms = 1e3 * np.array(DELAYS)
+            suite.figures.append(
+                (
+                    f"The price of delay: {label}",
+                    curves(ms, shown, "delay of camera and GPS / ms", label),
+                    "Random steering. informed is designed for each delay; dividing by its cost "
+                    "leaves what a method loses, not what the sensors do.",
+                )
+            )
+    size = (VEHICLES["coms"].wheelbase, VEHICLES["coms"].front_track)
+    for manoeuvre, runs in drives.items():
+        t = max((run["t"] for run in runs.values()), key=len)
+        paths = {name: (run["X"], run["Y"], run["psi"]) for name, run in runs.items()}
+        suite.figures.append(
+            (
+                f"In motion: {manoeuvre}, first test seed",
+                animation(t, paths, size),
+                "A rectangle has the wheelbase and track of the car, drawn at its centre of "
+                "gravity. A car whose episode ended stays where it was.",
+            )
+        )
+
+
+def _maps(env_id: str, standings: Sequence[Standing]) -> list[tuple[str, Any, str]]:
+    from .pictures import heat_map
+
+    names = [each.label for each in standings]
+    scenarios = list(standings[0].by_scenario)
+    figures = []
+    for metric, good, text in (
+        ("score", "high", "0: the uncontrolled car, 1: the clairvoyant optimum."),
+        ("cost_over_informed", "low", "1: the LQG of the true car with the same sensors."),
+    ):
+        values = np.array(
+            [
+                [e.by_scenario[s][metric].value if metric in e.by_scenario[s] else np.nan
+                 for s in scenarios]
+                for e in standings
+            ]
+        )  # fmt: skip
+        if np.isfinite(values).any():
+            title = f"{env_id}: {metric.replace('_', ' ')} on every manoeuvre"
+            figures.append((title, heat_map(names, scenarios, values, metric, good), text))
+    return figures
+
+
+def _time_series(results: Results) -> Explorer:
+    """Every cell's first test seed."""
+    tables = {YAW: "yaw moment", STEERING: "yaw moment and steering"}
+    cells = {}
+    for cell, result in results.found.items():
+        if result.series is None:
+            continue
+        signals = dict(zip(("t", *SIGNALS), result.series.T, strict=True))
+        scaled = {name: _SCALES.get(name, 1.0) * values for name, values in signals.items()}
+        key = (tables[cell.env_id], cell.scenario, cell.controller, cell.estimator)
+        cells[key] = scaled
+    return Explorer(
+        "Any cell over time (its first test seed)",
+        ("action", "manoeuvre", "controller", "estimator"),
+        cells,
+        _PANELS,
+        "The same seed in every cell; thinned to 250 samples.",
+    )
+
+
+def _run(cell: Cell, manoeuvre: str, seed: int) -> Rollout:
+    """One episode of a contestant in a single env."""
+    env: gym.Env[Any, Any] = gym.make(cell.env_id, scenario=manoeuvre, on_bad_action="fail")
+    if cell.estimator:
+        env = EstimateObservation(env, cell.estimator, std=False)
+    return rollout(env, make_agent(cell.controller, env), seed)

@@ -1,0 +1,88 @@
+"""The price of delay: score and cost over informed against how late the sensors are."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from rich.console import Console
+
+from .contestants import INFORMED, YAW, Cell
+from .results import Results, measure
+from .scores import Ceiling, Estimate, Resampled
+
+Array = npt.NDArray[np.float64]
+
+DELAYS = (0.0, 0.03, 0.06, 0.1, 0.15, 0.2, 0.25, 0.3)  # s, of camera and GPS alike
+SCENARIO = "random-steering"
+CONTESTANTS = (
+    ("none", ""),
+    (INFORMED, ""),
+    ("two-dof", "multirate-kf"),
+    ("two-dof", "exact-kf"),
+    ("lqr", "single-rate-kf"),
+    ("lqr", "multirate-residual-kf"),
+    ("lqr", "exact-kf"),
+)
+
+
+@dataclass
+class Price:
+    """A contestant's score and cost over informed at each delay."""
+
+    label: str
+    score: list[Estimate]
+    over: list[Estimate]
+
+
+def late_cells(delay: float) -> list[Cell]:
+    """The contestants with camera and GPS a delay (s) late."""
+    late = {"delays": [delay], "jitter": 0.0}
+    options = {"camera": late, "gps": late}
+    return [Cell(YAW, SCENARIO, estimator, who, options) for who, estimator in CONTESTANTS]
+
+
+def price_of_delay(
+    top: Ceiling | None,
+    episodes: int,
+    *,
+    salt: str,
+    jobs: int | None = None,
+    console: Console | None = None,
+    keep: Path | None = None,
+    delays: Sequence[float] = DELAYS,
+) -> list[Price]:
+    """Every contestant at every delay, all on the same seeds; informed designed for each delay.
+
+    top: the ceiling of SCENARIO, which needs no sensor; None leaves the scores out.
+    """
+    found: list[Results] = [
+        measure(late_cells(d), episodes, salt=salt, jobs=jobs, console=console, keep=keep)
+        for d in delays
+    ]
+    draw = Resampled(episodes, 1)
+    prices = []
+    for controller, estimator in CONTESTANTS:
+        price = Price(Cell(YAW, SCENARIO, estimator, controller).label, [], [])
+        for results in found:
+            costs = results.of(YAW, SCENARIO, controller, estimator).costs
+            none = results.of(YAW, SCENARIO, "none").costs
+            informed = results.of(YAW, SCENARIO, INFORMED).costs
+            price.over.append(draw.over(costs, informed, 0))
+            if top is not None:
+                price.score.append(draw.score(none, costs, top, 0))
+        if controller != "none":
+            prices.append(price)
+    return prices
+
+
+def lines(prices: Sequence[Price], what: str) -> dict[str, tuple[Array, Array, Array]]:
+    """name to (value, low, high) over the delays, of "score" or "over"."""
+    found = {}
+    for price in prices:
+        each: list[Estimate] = getattr(price, what)
+        if each:
+            value, low, high = np.array([(e.value, e.low, e.high) for e in each]).T
+            found[price.label] = value, low, high
+    return found

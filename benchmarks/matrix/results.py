@@ -1,0 +1,92 @@
+"""All cells driven, put together: per cell the episodes, per manoeuvre the yardsticks."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from rich.console import Console
+
+from ..cases import run_cases
+from .contestants import EPISODES, INFORMED, SLOW_EPISODES, Cell
+from .drive import NUMBERS, Chunk, Driven
+from .kept import Kept
+from .seeds import salted_seeds
+
+Array = npt.NDArray[np.float64]
+
+CHUNK = 250
+COST = NUMBERS.index("cost")
+NOTEWORTHY = 2.0  # a manoeuvre is scored where the uncontrolled car costs this often informed
+
+
+@dataclass
+class Result:
+    """A cell's episodes in the order of the seeds; error where it could not be driven."""
+
+    cell: Cell
+    numbers: Array
+    us: float
+    series: Array | None = None
+    error: str = ""
+
+    @property
+    def costs(self) -> Array:
+        """(seeds,)."""
+        return self.numbers[:, COST]
+
+
+@dataclass
+class Results:
+    """Every cell's result and the salt of the seeds."""
+
+    salt: str
+    episodes: int
+    found: dict[Cell, Result] = field(default_factory=dict)
+
+    def of(self, env_id: str, scenario: str, controller: str, estimator: str = "") -> Result:
+        """One cell; KeyError if it was not asked for."""
+        return self.found[Cell(env_id, scenario, estimator, controller)]
+
+    def scored(self, env_id: str, scenario: str) -> bool:
+        """Whether the uncontrolled car costs more than twice what informed does."""
+        none, informed = (self.of(env_id, scenario, who).costs for who in ("none", INFORMED))
+        return bool(none.mean() > NOTEWORTHY * informed.mean())
+
+
+def measure(
+    cells: Sequence[Cell],
+    episodes: int = EPISODES,
+    *,
+    salt: str,
+    jobs: int | None = None,
+    console: Console | None = None,
+    keep: Path | None = None,
+) -> Results:
+    """Drive every cell on the first `episodes` test seeds of the salt (slow ones on fewer)."""
+    seeds = salted_seeds(salt, episodes)
+    chunks = []
+    for cell in cells:
+        mine = seeds[:SLOW_EPISODES] if cell.slow else seeds
+        chunks += [
+            Chunk(cell, tuple(mine[first : first + CHUNK]), keep=first == 0)
+            for first in range(0, len(mine), CHUNK)
+        ]
+    driven = run_cases(Kept(keep, salt), chunks, "control", jobs, console)
+    results = Results(salt, episodes)
+    for cell in cells:
+        mine_driven = [d for c, d in zip(chunks, driven, strict=True) if c.cell is cell]
+        results.found[cell] = _joined(cell, mine_driven)
+    return results
+
+
+def _joined(cell: Cell, parts: list[Driven]) -> Result:
+    errors = [part.error for part in parts if part.error]
+    return Result(
+        cell,
+        np.concatenate([part.numbers for part in parts]),
+        float(np.mean([part.us for part in parts])),
+        parts[0].series,
+        errors[0] if errors else "",
+    )

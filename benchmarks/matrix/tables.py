@@ -1,0 +1,219 @@
+"""The matrix as rows for machines and tables for people."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from ... import __version__
+from ...envs import FAILURES
+from ..rows import Row, Table
+from .contestants import INFORMED, Cell
+from .drive import NUMBERS, control_period, rate_of
+from .results import Result, Results
+from .scores import Ceiling, Estimate, Resampled
+
+RATES = {"spin": "spin_rate", "off-road": "departure_rate"}
+_FAILED = {"not-finite": "not_finite_rate", "bad-action": "bad_action_rate"}
+_MEANS = tuple(name for name in NUMBERS if name not in ("cost", "failure"))
+
+
+@dataclass
+class Standing:
+    """A contestant over all manoeuvres of a table.
+
+    by_scenario: {scenario: {metric: Estimate}}. overall: {"score", "iqm",
+    "cost_over_informed"} over the scored manoeuvres and all of them.
+    """
+
+    cell: Cell
+    results: dict[str, Result]
+    by_scenario: dict[str, dict[str, Estimate]]
+    overall: dict[str, Estimate]
+    us: float = float("nan")
+
+    @property
+    def label(self) -> str:
+        """As in tables and figures."""
+        return self.cell.label
+
+    def mean(self, name: str) -> float:
+        """A number of NUMBERS over all episodes of all manoeuvres."""
+        column = NUMBERS.index(name)
+        return float(np.mean([r.numbers[:, column].mean() for r in self.results.values()]))
+
+    def rate(self, failure: str) -> float:
+        """The share of episodes of all manoeuvres that ended so."""
+        return float(np.mean([rate_of(r.numbers, failure) for r in self.results.values()]))
+
+
+def standings(results: Results, env_id: str, tops: dict[str, Ceiling]) -> list[Standing]:
+    """Every contestant of a table, the best first; tops: the ceilings by manoeuvre."""
+    cells = [cell for cell in results.found if cell.env_id == env_id]
+    names = list(dict.fromkeys((cell.controller, cell.estimator) for cell in cells))
+    scenarios = list(dict.fromkeys(cell.scenario for cell in cells))
+    scored = [s for s in scenarios if s in tops and results.scored(env_id, s)]
+    draws: dict[int, Resampled] = {}
+    found = []
+    for controller, estimator in names:
+        mine = {s: results.of(env_id, s, controller, estimator) for s in scenarios}
+        n = len(mine[scenarios[0]].costs)
+        draw = draws.setdefault(n, Resampled(n, len(scenarios)))
+        yard = {s: results.of(env_id, s, "none").costs[:n] for s in scenarios}
+        informed = {s: results.of(env_id, s, INFORMED).costs[:n] for s in scenarios}
+        by = {
+            s: _metrics(draw, i, mine[s], yard[s], informed[s], tops[s] if s in scored else None)
+            for i, s in enumerate(scenarios)
+        }
+        overall = _overall(draw, [mine[s].costs for s in scored], [yard[s] for s in scored],
+                           [tops[s] for s in scored])  # fmt: skip
+        ratios = [by[s]["cost_over_informed"] for s in scenarios]
+        overall["cost_over_informed"] = _geometric(ratios)
+        found.append(Standing(mine[scenarios[0]].cell, mine, by, overall))
+    return sorted(found, key=lambda each: -_rank(each))
+
+
+def _rank(standing: Standing) -> float:
+    score = standing.overall["score"].value if "score" in standing.overall else np.nan
+    if np.isnan(score):
+        score = -standing.overall["cost_over_informed"].value
+    return -np.inf if np.isnan(score) else score
+
+
+def _metrics(
+    draw: Resampled, which: int, mine: Result, none: Any, informed: Any, top: Ceiling | None
+) -> dict[str, Estimate]:
+    found = {
+        "cost": draw.mean(mine.costs, which),
+        "cost_over_informed": draw.over(mine.costs, informed, which),
+    }
+    if top is not None:
+        found["score"] = draw.score(none, mine.costs, top, which)
+    for name in _MEANS:
+        found[name] = draw.mean(mine.numbers[:, NUMBERS.index(name)], which)
+    for failure, metric in (RATES | _FAILED).items():
+        hit = mine.numbers[:, NUMBERS.index("failure")] == FAILURES.index(failure)
+        found[metric] = draw.mean(hit.astype(float), which)
+    return found
+
+
+def _overall(draw: Resampled, costs: Any, none: Any, tops: list[Ceiling]) -> dict[str, Estimate]:
+    return draw.aggregate(np.array(none), np.array(costs), tops) if tops else {}
+
+
+def _geometric(ratios: list[Estimate]) -> Estimate:
+    """The geometric mean of ratios; its interval as if the manoeuvres' were independent."""
+    logs = np.log([each.value for each in ratios])
+    errors = np.log([[each.low, each.high] for each in ratios]) - logs[:, None]
+    low, high = np.sqrt((errors**2).sum(axis=0)) / len(logs)
+    middle = logs.mean()
+    return Estimate(*np.exp([middle, middle - low, middle + high]).tolist())
+
+
+def rows_of(standing: Standing, salt: str) -> list[Row]:
+    """One row a metric and manoeuvre, and the aggregates under the scenario "all"."""
+    cell = standing.cell
+    common: dict[str, Any] = {
+        "suite": "control",
+        "estimator": cell.estimator,
+        "controller": cell.controller,
+        "salt": salt,
+        "env_version": f"{cell.env_id} {__version__}",
+    }
+    rows = []
+    for scenario, metrics in standing.by_scenario.items():
+        result = standing.results[scenario]
+        rest = common | {"n": len(result.costs), "spec": spec_of(result.cell)}
+        rows += [_row(scenario, name, each, rest) for name, each in metrics.items()]
+    total = common | {"n": sum(len(r.costs) for r in standing.results.values())}
+    rows += [_row("all", name, each, total) for name, each in standing.overall.items()]
+    if np.isfinite(standing.us):
+        rows.append(Row(scenario="all", metric="us_per_decision", value=standing.us, **total))
+    return rows
+
+
+def _row(scenario: str, metric: str, each: Estimate, common: dict[str, Any]) -> Row:
+    return Row(
+        scenario=scenario, metric=metric, value=each.value, low=each.low, high=each.high, **common
+    )
+
+
+def spec_of(cell: Cell) -> str:
+    """The env as JSON: what `gym.make` needs to build it again."""
+    spec = gym.spec(cell.env_id)
+    env = gym.make(spec, scenario=cell.scenario, on_bad_action="fail", **cell.options)
+    return env.spec.to_json() if env.spec is not None else ""
+
+
+def main_table(title: str, found: list[Standing], note: str) -> Table:
+    """The contestants, the best first."""
+    header = (
+        "controller and estimator",
+        "score",
+        "95 % interval",
+        "IQM",
+        "cost / informed",
+        "RMS slip / mrad",
+        "peak / mrad",
+        "yaw error / (mrad/s)",
+        "effort",
+        "largest step / N m",
+        "saturated / %",
+        "spin / %",
+        "left road / %",
+        "us a decision",
+        "of the period / %",
+    )
+    return Table(title, header, [_cells(each) for each in found], note)
+
+
+def _cells(each: Standing) -> list[str]:
+    score = each.overall.get("score")
+    iqm = each.overall.get("iqm")
+    return [
+        each.label,
+        f"{score.value:.3f}" if score else "",
+        f"{score.low:.3f} .. {score.high:.3f}" if score else "",
+        f"{iqm.value:.3f}" if iqm else "",
+        f"{each.overall['cost_over_informed'].value:.2f}",
+        f"{1e3 * each.mean('rms_slip'):.1f}",
+        f"{1e3 * each.mean('peak_slip'):.1f}",
+        f"{1e3 * each.mean('rms_yaw_error'):.1f}",
+        f"{each.mean('effort'):.3f}",
+        f"{each.mean('largest_step'):.0f}",
+        f"{100 * each.mean('saturation'):.1f}",
+        f"{100 * each.rate('spin'):.1f}",
+        f"{100 * each.rate('off-road'):.1f}",
+        f"{each.us:.0f}" if np.isfinite(each.us) else "",
+        f"{1e-4 * each.us / control_period(each.cell):.2f}" if np.isfinite(each.us) else "",
+    ]
+
+
+def yardsticks(results: Results, env_id: str, tops: dict[str, Ceiling]) -> Table:
+    """What 0 and 1 mean on every manoeuvre, and where a score is given."""
+    cells = []
+    for scenario in dict.fromkeys(c.scenario for c in results.found if c.env_id == env_id):
+        none = results.of(env_id, scenario, "none")
+        informed = results.of(env_id, scenario, INFORMED)
+        top = tops.get(scenario)
+        failed = 100.0 * np.mean(none.numbers[:, NUMBERS.index("failure")] != 0.0)
+        cells.append(
+            [
+                scenario,
+                f"{none.costs.mean():.3f}",
+                f"{failed:.1f}",
+                f"{informed.costs.mean():.3f}",
+                f"{top.mean:.3f}" if top else "",
+                f"{top.error:.3f}" if top else "",
+                "yes" if top and results.scored(env_id, scenario) else "no",
+            ]
+        )
+    return Table(
+        f"{env_id}: what 0 and 1 mean (mean cost an episode)",
+        ("manoeuvre", "none", "fails / %", "informed", "clairvoyant", "+-", "scored"),
+        cells,
+        "A manoeuvre is scored where the uncontrolled car costs more than twice what `informed` "
+        "does and the ceiling is known.",
+        keyed=False,
+    )

@@ -1,0 +1,60 @@
+"""The suites by name, each loaded when it is asked for."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.console import Console
+
+from .rows import Suite
+
+
+@dataclass(frozen=True)
+class Wish:
+    """How a suite shall be run.
+
+    quick: few seeds. jobs: processes, None for all processors. episodes: of a cell of the matrix,
+    None for the suite's own number. keep: a folder for finished cases.
+    """
+
+    quick: bool = False
+    jobs: int | None = None
+    console: Console | None = None
+    episodes: int | None = None
+    keep: Path | None = None
+
+
+def _estimation(wish: Wish) -> Suite:
+    from . import estimation
+
+    seeds = estimation.QUICK_SEEDS if wish.quick else estimation.SEEDS
+    return estimation.run(seeds, wish.jobs, console=wish.console)
+
+
+def _control(wish: Wish) -> Suite:
+    from . import control
+    from .matrix.contestants import EPISODES, QUICK_EPISODES
+
+    usual = QUICK_EPISODES if wish.quick else EPISODES
+    return control.run(wish.episodes or usual, wish.jobs, wish.console, wish.keep)
+
+
+def _papers(wish: Wish) -> Suite:
+    from . import papers
+
+    seeds = papers.QUICK_SEEDS if wish.quick else papers.SEEDS
+    return papers.run(seeds, wish.jobs, console=wish.console)
+
+
+def _speed(wish: Wish) -> Suite:
+    from . import speed
+
+    return speed.run()
+
+
+SUITES: dict[str, Callable[[Wish], Suite]] = {
+    "estimation": _estimation,
+    "control": _control,
+    "papers": _papers,
+    "speed": _speed,
+}

@@ -1,0 +1,185 @@
+"""The matrix: one cell is what single episodes are, failures are told, a stopped run goes on."""
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from sideslip.agents import make_agent
+from sideslip.agents.rollout import rollout
+from sideslip.benchmarks.matrix import contest, drive, results
+from sideslip.benchmarks.matrix.ceiling import failures_of, tops_of
+from sideslip.benchmarks.matrix.contestants import MANOEUVRES, YAW, Cell, cells
+from sideslip.benchmarks.matrix.drive import NUMBERS, Chunk
+from sideslip.benchmarks.matrix.kept import Kept
+from sideslip.benchmarks.matrix.results import measure
+from sideslip.benchmarks.matrix.scores import Ceiling
+from sideslip.benchmarks.matrix.seeds import salted_seeds
+from sideslip.benchmarks.matrix.tables import rows_of, standings
+from sideslip.envs import FAILURES, SCENARIOS
+from sideslip.estimators import EstimateObservation
+
+SEEDS = (3, 4, 2**32 - 1)
+PAIRS = (("", "none"), ("multirate-residual-kf", "two-dof"), ("exact-kf", "lqr"))
+
+
+def number(driven: Any, name: str) -> np.ndarray:
+    return np.asarray(driven.numbers[:, NUMBERS.index(name)])
+
+
+@pytest.mark.parametrize(("estimator", "controller"), PAIRS)
+def test_a_cell_is_its_single_episodes(estimator: str, controller: str) -> None:
+    cell = Cell(YAW, "sine-with-dwell", estimator, controller)
+    driven = drive.drive(Chunk(cell, SEEDS, keep=True))
+    assert driven.error == ""
+    env: gym.Env[Any, Any] = gym.make(YAW, scenario=cell.scenario)
+    if estimator:
+        outputs = contest.outputs_for(estimator)
+        env = EstimateObservation(env, estimator, outputs=outputs, std=False)
+    agent = make_agent(controller, env)
+    for i, seed in enumerate(SEEDS):
+        alone = rollout(env, agent, seed)
+        assert number(driven, "cost")[i] == pytest.approx(alone.cost, rel=1e-12)
+        assert number(driven, "peak_slip")[i] == np.abs(alone["beta"][1:]).max()
+        assert number(driven, "failure")[i] == alone["failure"][-1]
+        error = alone["gamma"][1:] - alone["gamma_ref"][1:]
+        rms = np.sqrt(np.mean(error**2))
+        assert number(driven, "rms_yaw_error")[i] == pytest.approx(rms, rel=1e-12)
+        if i == 0:
+            assert driven.series is not None
+            assert np.array_equal(driven.series[:, 1], alone["beta"])
+
+
+def test_every_manoeuvre_exists_and_is_scored() -> None:
+    assert len(MANOEUVRES) == 10
+    for name in MANOEUVRES:
+        assert SCENARIOS[name].scored
+    assert len(set(cells())) == len(list(cells()))
+
+
+def test_truth_is_told_without_error() -> None:
+    env, _ = contest.make_contest(Cell(YAW, "gust", "truth", "two-dof"), 2)
+    obs, infos = env.reset(seed=[1, 2])  # type: ignore[arg-type]
+    names = [entry.name for entry in env.layout]  # type: ignore[attr-defined]
+    for _ in range(30):
+        obs, *_, infos = env.step(np.full((2, 1), 0.3, np.float32))
+    assert np.array_equal(obs[:, names.index("beta_hat")], infos["beta"].astype(np.float32))
+    assert np.array_equal(obs[:, names.index("gamma_hat")], infos["gamma"].astype(np.float32))
+
+
+class Broken:
+    """An agent whose first car gets NaN after some steps."""
+
+    def __init__(self, shape: str = "right") -> None:
+        self.shape, self.calls = shape, 0
+
+    def predict(self, obs: Any, *_: Any, **__: Any) -> tuple[Any, None]:
+        self.calls += 1
+        actions = np.zeros((len(obs), 1 if self.shape == "right" else 3), np.float32)
+        if self.calls > 5:
+            actions[0] = np.nan
+        return actions, None
+
+
+def broken(monkeypatch: pytest.MonkeyPatch, agent: Any) -> None:
+    make = contest.make_contest
+    monkeypatch.setattr(drive, "make_contest", lambda cell, n: (make(cell, n)[0], agent))
+
+
+def test_nan_ends_its_car_and_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    cell = Cell(YAW, "gust", "", "none")
+    whole = drive.drive(Chunk(cell, SEEDS))
+    broken(monkeypatch, Broken())
+    driven = drive.drive(Chunk(cell, SEEDS))
+    assert FAILURES[int(number(driven, "failure")[0])] == "bad-action"
+    assert number(driven, "cost")[0] > 90.0 * (SCENARIOS["gust"].duration - 0.1)
+    assert np.array_equal(driven.numbers[1:], whole.numbers[1:])
+
+
+def test_actions_of_the_wrong_shape_are_failures_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    broken(monkeypatch, Broken("wrong"))
+    driven = drive.drive(Chunk(Cell(YAW, "gust", "", "none"), SEEDS))
+    assert driven.error == ""
+    assert {FAILURES[int(code)] for code in number(driven, "failure")} == {"bad-action"}
+
+
+def test_a_cell_that_cannot_be_built_says_why_and_the_rest_goes_on() -> None:
+    asked = [Cell(YAW, "gust", "", "none"), Cell(YAW, "gust", "nobody-kf", "two-dof")]
+    found = measure(asked, 4, salt="ab" * 8, jobs=1)
+    assert np.isfinite(found.of(YAW, "gust", "none").costs).all()
+    assert "nobody-kf" in found.of(YAW, "gust", "two-dof", "nobody-kf").error
+    assert any("not driven" in line[-1] and "nobody-kf" in line[-1] for line in failures_of(found))
+
+
+def test_standing_car_and_diverging_plant_end_finite() -> None:
+    still = {"base": "gust", "speed": 0.0}
+    thrown = {"base": "random-steering", "speed": 60.0, "amplitude": 0.5}
+    for scenario, name in ((still, "none"), (thrown, "spin")):
+        cell = Cell(YAW, "gust", "exact-kf", "lqr", {"scenario": scenario})
+        driven = drive.drive(Chunk(cell, SEEDS))
+        assert driven.error == "" and np.isfinite(driven.numbers).all()
+        assert FAILURES[int(number(driven, "failure")[0])] == name
+
+
+def test_a_stopped_run_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    chunk = Chunk(Cell(YAW, "gust", "", "none"), SEEDS, keep=True)
+    kept = Kept(tmp_path, "salt")
+    first = kept(chunk)
+    monkeypatch.setattr("sideslip.benchmarks.matrix.kept.drive", None)
+    again = kept(chunk)
+    assert np.array_equal(first.numbers, again.numbers)
+    assert first.series is not None and again.series is not None
+    assert np.array_equal(first.series, again.series)
+    with pytest.raises(TypeError):  # another salt or chunk is driven
+        Kept(tmp_path, "other")(chunk)
+    (found,) = tmp_path.iterdir()
+    found.write_bytes(found.read_bytes()[:100])  # cut short by a kill or a full disk
+    with pytest.raises(TypeError):
+        kept(chunk)
+
+
+def ready(asked: list[Cell]) -> results.Results:
+    """Made-up costs: none 10, informed 2, lqr 3, the rest 5."""
+    found = results.Results("ab" * 8, 8)
+    rng = np.random.default_rng(0)
+    for cell in asked:
+        level = {"none": 10.0, "informed": 2.0, "lqr": 3.0}.get(cell.controller, 5.0)
+        numbers = np.abs(rng.normal(1.0, 0.01, (8, len(NUMBERS)))) * level
+        numbers[:, NUMBERS.index("failure")] = 0.0
+        found.found[cell] = results.Result(cell, numbers, 1.0)
+    return found
+
+
+def test_standings_put_the_best_first_and_rows_hold_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = [cell for cell in cells(MANOEUVRES[:3]) if cell.env_id == YAW]
+    found = ready(asked)
+    tops = {name: Ceiling(1.0, 0.0) for name in MANOEUVRES[:2]}  # the third is not calibrated
+    standing = standings(found, YAW, tops)
+    assert [each.cell.controller for each in standing[:2]] == ["informed", "lqr"]
+    assert standing[-1].label == "none"
+    assert standing[0].overall["score"].value == pytest.approx(8.0 / 9.0, abs=0.01)
+    assert standing[1].overall["cost_over_informed"].value == pytest.approx(1.5, abs=0.02)
+    assert "score" not in standing[0].by_scenario[MANOEUVRES[2]]
+    rows = rows_of(standing[0], found.salt)
+    assert {row.scenario for row in rows} == {*MANOEUVRES[:3], "all"}
+    monkeypatch.setattr(
+        "sideslip.benchmarks.matrix.ceiling.ceilings", lambda _: {MANOEUVRES[0]: Ceiling(4.0, 0.01)}
+    )
+    raised, log = tops_of(found, YAW)
+    assert raised[MANOEUVRES[0]].mean == pytest.approx(2.0, abs=0.02)
+    assert len(log) >= 1 and "informed" in log[0]
+
+
+def test_a_manoeuvre_that_informed_hardly_improves_is_not_scored() -> None:
+    asked = [cell for cell in cells(MANOEUVRES[:1]) if cell.env_id == YAW]
+    found = ready(asked)
+    assert found.scored(YAW, MANOEUVRES[0])
+    found.of(YAW, MANOEUVRES[0], "informed").numbers[:, 0] = 5.5
+    assert not found.scored(YAW, MANOEUVRES[0])
+    assert "score" not in standings(found, YAW, {MANOEUVRES[0]: Ceiling(1.0, 0.0)})[0].overall
+
+
+def test_seeds_of_a_run_are_the_salts() -> None:
+    assert salted_seeds("ab" * 8, 3) == salted_seeds("ab" * 8, 5)[:3]
