@@ -117,7 +117,8 @@ def _drive(chunk: Chunk) -> Driven:
     env, agent = make_contest(chunk.cell, len(chunk.seeds))
     base: Any = env.unwrapped
     sums = _Sums(len(chunk.seeds), base.vehicle[0].yaw_moment_limit)
-    obs, infos = env.reset(seed=list(chunk.seeds))
+    seeds: Any = list(chunk.seeds)
+    obs, infos = env.reset(seed=seeds)
     state, start = None, np.ones(len(chunk.seeds), bool)
     series = [_signals(infos)]
     begun, steps = time.process_time(), 0

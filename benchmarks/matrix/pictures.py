@@ -6,8 +6,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..colours import INK
-from ..figures import go, line_styles
+from ..colours import INK, line_styles
+
+try:
+    from plotly import graph_objects as go
+except ModuleNotFoundError as error:
+    raise ModuleNotFoundError(
+        "figures need plotly: pip install 'sideslip[report]'", name=error.name
+    ) from error
 
 Array = npt.NDArray[np.float64]
 
