@@ -7,8 +7,10 @@ from .controller import Controller, NoControl
 from .esc import Esc
 from .given import AnyEnv
 from .informed import Informed
+from .lane_keeping import LaneKeeping
 from .lqr import Lqr
 from .model_following import ModelFollowing
+from .mpc import Mpc
 from .sliding_mode import SlidingMode
 from .two_dof import Feedforward, TwoDof
 
@@ -20,6 +22,8 @@ AGENTS: dict[str, Callable[..., Controller]] = {
     "esc": Esc,
     "sliding-mode": SlidingMode,
     "lqr": Lqr,
+    "mpc": Mpc,
+    "lane-keeping": LaneKeeping,
     "informed": Informed,
 }
 
@@ -29,8 +33,10 @@ __all__ = [
     "Esc",
     "Feedforward",
     "Informed",
+    "LaneKeeping",
     "Lqr",
     "ModelFollowing",
+    "Mpc",
     "NoControl",
     "SlidingMode",
     "TwoDof",

@@ -2,7 +2,8 @@
 
 Every tick of a period counts in the cost, so both the motion and the cost are summed tick by tick:
 what is minimised is the episode's cost J itself, but for its cap, of the linear car at a held
-speed, with the driver's command and the references held as they are now.
+speed, with the driver's command and the references held as they are now. Where a linear law may
+steer, `haste` is added, without which it would ask for what the steering's rate cannot give.
 """
 
 import math
@@ -43,7 +44,8 @@ class Purpose:
 
     period: ticks. full_scale: N m of the first input. steers: whether steering is the second.
     kind: of `envs.reference.REFERENCES` by number. disturbances: of `DISTURBANCES`.
-    disturbance_time: s, in which forces decay.
+    disturbance_time: s, in which forces decay. haste: what it costs per second to ask for steering
+    that the actuator's rate cannot follow, by the square of how much further than it can.
     """
 
     period: int
@@ -52,6 +54,7 @@ class Purpose:
     kind: int
     disturbances: str = "none"
     disturbance_time: float = 0.3
+    haste: float = 0.0
 
     @property
     def states(self) -> tuple[str, ...]:
@@ -100,7 +103,8 @@ def one_tick(vehicle: Vehicle, speed: float, purpose: Purpose) -> tuple[Array, A
     """(G, H) of a tick, and (C, D) from state and input at its start to what the cost judges.
 
     Judged at the tick's end: e_beta, e_gamma, and the means over the tick of the delivered share
-    of the yaw moment and of the added steering, which is the applied less the driver's.
+    of the yaw moment and of the added steering, which is the applied less the driver's; and how
+    far the steering asked for is ahead of that, in what its rate covers in a period and a lag.
     """
     lags = [lag_of(tau, TICK) for tau in (vehicle.motor_lag, vehicle.steering_lag)]
     plane, push = _tick_of_the_plane(vehicle, speed, purpose)
@@ -110,7 +114,7 @@ def one_tick(vehicle: Vehicle, speed: float, purpose: Purpose) -> tuple[Array, A
     G[:2, :4], H[:2, :1], G[:2, 4:5] = plane[:, :4], plane[:, 4:5], plane[:, 5:6]
     if purpose.steers:
         H[:2, 1:] = plane[:, 5:6]
-    C, D = np.zeros((4, n)), np.zeros((4, m))
+    C, D = np.zeros((5, n)), np.zeros((5, m))
     C[2, 2], C[3, 3], C[3, 4] = lags[0].mean, lags[1].mean, -lags[1].mean
     for i, lag in enumerate(lags):
         G[2 + i, 2 + i] = lag.end
@@ -121,6 +125,9 @@ def one_tick(vehicle: Vehicle, speed: float, purpose: Purpose) -> tuple[Array, A
         G[:2, 7:] = push
         if purpose.disturbances == "forces":
             G[7:, 7:] *= math.exp(-TICK / purpose.disturbance_time)
+    if purpose.steers:
+        reach = vehicle.steering_rate * (purpose.period * TICK + vehicle.steering_lag)
+        C[4, 3], C[4, 4], D[4, 1] = -1.0 / reach, 1.0 / reach, 1.0 / reach
     C[:2], D[:2] = G[:2], H[:2]
     C[0, 5], C[1, 6] = -1.0, -1.0
     return G, H, C, D
@@ -148,21 +155,35 @@ def _tick_of_the_plane(vehicle: Vehicle, speed: float, purpose: Purpose) -> tupl
 
 
 def _weights(purpose: Purpose) -> Sequence[float]:
-    """Of the four that the cost judges, DESIGN section 4."""
+    """Of the four that the cost judges, DESIGN section 4, and of haste."""
     return (
         1.0 / BETA_SCALE**2,
         0.0 if purpose.kind == ZERO_SLIP else 1.0 / GAMMA_SCALE**2,
         EFFORT_WEIGHT,
         EFFORT_WEIGHT / STEER_SCALE**2 if purpose.steers else 0.0,
+        purpose.haste,
     )
 
 
 def regulator(model: DesignModel) -> Array:
-    """K (m, n) of u = -K x, which minimises the sum of the model's cost; by python-control.
+    """K (m, n) of u = -K x, which minimises the sum of the model's cost; see `cost_to_go`."""
+    return cost_to_go(model)[0]
 
-    The states that inputs move are regulated by `control.dlqr`; to the others, which move by
-    themselves and need not decay, the optimal answer follows from a linear equation for their part
-    of the cost to go.
+
+def cost_to_go(model: DesignModel) -> tuple[Array, Array]:
+    """K (m, n) of u = -K x, which minimises the sum of the model's cost, and V (n, n): what is
+    to come costs x'Vx, but for a part that no input changes. By python-control.
+
+    See `optimal`, which raises too.
+    """
+    return optimal(model.G, model.H, model.Q, model.R, model.N, len(DYNAMIC))
+
+
+def optimal(G: Array, H: Array, Q: Array, R: Array, N: Array, moved: int) -> tuple[Array, Array]:
+    """`cost_to_go` of any model whose inputs move its first `moved` states alone.
+
+    These are regulated by `control.dlqr`; to the others, which move by themselves and need not
+    decay, the optimal answer follows from a linear equation for their part of the cost to go.
 
     Raises ModuleNotFoundError, naming the extra, without python-control.
     """
@@ -172,17 +193,18 @@ def regulator(model: DesignModel) -> Array:
         raise ModuleNotFoundError(
             "designing this controller needs python-control: pip install 'sideslip[design]'"
         ) from None
-    d = len(DYNAMIC)
-    A, B, W = model.G[:d, :d], model.H[:d], model.G[d:, d:]
-    K, P, _ = control.dlqr(A, B, model.Q[:d, :d], model.R, model.N[:d])
-    A12, N2 = model.G[:d, d:], model.N[d:]
+    d = moved
+    A, B, W = G[:d, :d], H[:d], G[d:, d:]
+    K, P, _ = control.dlqr(A, B, Q[:d, :d], R, N[:d])
+    A12, N2 = G[:d, d:], N[d:]
     closed = A - B @ K
     # P12 = Q12 - K'N2' + (A - BK)'(P A12 + P12 W), stacked by columns
-    right = model.Q[:d, d:] - K.T @ N2.T + closed.T @ P @ A12
+    right = Q[:d, d:] - K.T @ N2.T + closed.T @ P @ A12
     lhs = np.eye(right.size) - np.kron(W.T, closed.T)
     P12 = np.linalg.solve(lhs, right.ravel(order="F")).reshape(right.shape, order="F")
-    answer = np.linalg.solve(model.R + B.T @ P @ B, B.T @ (P @ A12 + P12 @ W) + N2.T)
-    return np.asarray(np.hstack([K, answer]), np.float64)
+    answer = np.linalg.solve(R + B.T @ P @ B, B.T @ (P @ A12 + P12 @ W) + N2.T)
+    V = np.block([[P, P12], [P12.T, np.zeros_like(W)]])
+    return np.asarray(np.hstack([K, answer]), np.float64), V
 
 
 def closed_loop(model: DesignModel, K: Any) -> Array:

@@ -88,9 +88,9 @@ class Esc(Controller):
 
     The yaw rate follows that of the nominal car within what friction holds,
     |gamma| <= 0.85 mu g / v (Rajamani, Vehicle Dynamics and Control, 8.2), whatever the env's own
-    reference is, by a PI that starts outside +-`band` (rad/s) and lets its integral go within. Beyond
-    +-`slip` (rad) a moment of `stiffness` (N m/rad; default: the full moment at twice the bound)
-    drives beta back. It reads beta_hat where the observation has it; without, it does without.
+    reference is, by a PI that starts outside +-`band` (rad/s) and lets its integral go within.
+    Beyond +-`slip` (rad) a moment of `stiffness` (N m/rad; default: the full moment at twice the
+    bound) drives beta back, where the observation has beta_hat; without, it does without.
 
     bandwidth: rad/s, of `yaw_gains`. Memory: the integral. Raises ValueError for an option out of
     range.

@@ -19,6 +19,8 @@ from .given import AnyEnv, given
 SPEEDS = tuple(np.geomspace(2.0, 60.0, 48).tolist())
 """m/s: gains are designed at these, interpolated between and held beyond."""
 
+HASTE = 3.0
+
 STATES = ("steer", "steer_command", "beta_ref", "gamma_ref")
 
 
@@ -49,6 +51,19 @@ def interpolated(table: Any, axes: Any, v: Any, front: Any, rear: Any, K: Any) -
 
 
 @jit
+def predicted_state(x: Any, share: Any, z: Any) -> None:
+    """Fill z, the states of the design model, from a row of inputs, which `_lqr_law` names.
+
+    share: what 1 N m of difference between the motors is of the full yaw moment.
+    """
+    n = len(z)
+    z[0], z[1] = x[8], x[9]
+    z[2] = share * (x[3] - x[2])
+    z[3:7] = x[4:8]
+    z[7:] = x[10 : 3 + n]
+
+
+@jit
 def _lqr_law(
     x: Any, table: Any, axes: Any, scheduled: int, share: Any, authority: Any, action: Any
 ) -> None:
@@ -60,10 +75,7 @@ def _lqr_law(
         front = x[row, 1 + n + 2] if scheduled else 0.0
         rear = x[row, 1 + n + 3] if scheduled else 0.0
         interpolated(table, axes, v, front, rear, K)
-        z[0], z[1] = x[row, 8], x[row, 9]
-        z[2] = share * (x[row, 3] - x[row, 2])
-        z[3:7] = x[row, 4:8]
-        z[7:] = x[row, 10 : 3 + n]
+        predicted_state(x[row], share, z)
         for i in range(m):
             u = 0.0
             for j in range(n):
@@ -104,7 +116,7 @@ class Lqr(Controller):
     disturbance_time: s, in which F_d and N_d decay. vehicle: designed for this instead of the
     env's nominal. stiffness: two entries of the observation with the front and the rear cornering
     stiffness, on which the gains are then scheduled too, within `span` times the vehicle's, on
-    `knots` knots each; the table is designed once.
+    `knots` knots each; the table is designed once. haste: of `Purpose`, where the env steers.
 
     Raises ValueError for a missing entry or an option out of range, ModuleNotFoundError without
     python-control.
@@ -118,6 +130,7 @@ class Lqr(Controller):
         stiffness: Sequence[str] = (),
         span: tuple[float, float] = (0.5, 1.6),
         knots: int = 7,
+        haste: float = HASTE,
     ) -> None:
         if not 0.0 < disturbance_time < math.inf:
             raise ValueError(f"disturbance_time is positive, in s, got {disturbance_time!r}")
@@ -125,6 +138,8 @@ class Lqr(Controller):
             raise ValueError(f"stiffness names two entries or none, got {list(stiffness)}")
         if not (0.0 < span[0] < span[1] < math.inf and knots >= 2):
             raise ValueError(f"span rises from above zero, with 2 knots or more: {span}, {knots}")
+        if not 0.0 <= haste < math.inf:
+            raise ValueError(f"haste is zero or more, got {haste!r}")
         names = {entry.name for entry in given(env).layout}
         pairs = {"forces": ("F_d_hat", "N_d_hat"), "rates": ("d1_hat", "d2_hat")}
         kind = next((kind for kind, pair in pairs.items() if names.issuperset(pair)), "none")
@@ -144,11 +159,13 @@ class Lqr(Controller):
             REFERENCES.index(self.reference),
             kind,
             float(disturbance_time),
+            float(haste),
         )
         fronts, rears = (
             tuple((own * np.geomspace(*span, knots)).tolist()) if stiffness else ()
             for own in (car.front_stiffness, car.rear_stiffness)
         )
+        self.share = 0.5 * car.rear_track / car.wheel_radius / self.full_scale
         self.vehicle, self.scheduled = car, len(stiffness) == 2
         speeds = SPEEDS[::2] if stiffness else SPEEDS
         self.table = gain_table(car, self.purpose, speeds, fronts, rears)
@@ -161,5 +178,6 @@ class Lqr(Controller):
         return K
 
     def _law(self, inputs: Array, state: Array, action: npt.NDArray[np.float64]) -> None:
-        share = 0.5 * self.vehicle.rear_track / self.vehicle.wheel_radius / self.full_scale
-        _lqr_law(inputs, self.table, self.axes, int(self.scheduled), share, self.authority, action)
+        _lqr_law(
+            inputs, self.table, self.axes, int(self.scheduled), self.share, self.authority, action
+        )

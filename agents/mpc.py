@@ -1,0 +1,175 @@
+"""Linear model predictive control: the LQR's cost under the actuators' limits, solved by OSQP."""
+
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.sparse import csc_matrix
+
+from ..envs.record import TICK
+from ..envs.vehicle import Vehicle
+from .controller import Array
+from .design_model import Purpose, design_model
+from .given import AnyEnv
+from .lqr import SPEEDS, Lqr, predicted_state
+from .quadratic import Quadratic, quadratic
+
+STEP = 10  # ticks, the shortest of the prediction
+NOT_FINITE = "the observation is not finite"
+_SETTINGS = {
+    "verbose": False,
+    "adaptive_rho": False,  # else the answer would depend on earlier calls
+    "rho": 0.3,
+    "eps_abs": 1e-4,  # of full scale
+    "eps_rel": 1e-4,
+    "check_termination": 10,
+    "polishing": False,
+}
+
+
+@lru_cache(maxsize=4 * len(SPEEDS))
+def _program(
+    vehicle: Vehicle, speed: float, purpose: Purpose, horizon: int, authority: float
+) -> Quadratic:
+    limits = np.array([1.0, authority])[: len(purpose.inputs)]
+    return quadratic(design_model(vehicle, speed, purpose), horizon, limits)
+
+
+class Mpc(Lqr):
+    """What `lqr` minimises, over a horizon with limits, then as if there were none.
+
+    Limits are those of the yaw moment and, where the env steers, of the added angle and its rate.
+    Where none is met this is the LQR. The program is that of the nearest speed of `SPEEDS`.
+
+    horizon: steps of a control period, or of 10 ms where that is shorter. iterations: the solver's
+    most. disturbance_time, haste: of `lqr`. `status` says for each row of the last call "solved", "solved
+    inaccurate" (ten times the tolerance of 1e-4 of full scale) or why there is no solution: then the row's action is NaN. `solve_time` is how long the solver took for
+    each, s. Memory: the last share of added steering, and the last solution, which the next one
+    starts from.
+
+    Raises ModuleNotFoundError without the extras `mpc` and `design`, ValueError for a missing entry
+    or an option out of range.
+    """
+
+    def __init__(
+        self,
+        env: AnyEnv,
+        horizon: int = 30,
+        iterations: int = 20000,
+        disturbance_time: float = 0.3,
+        haste: float = 0.0,
+    ) -> None:
+        try:
+            import osqp
+        except ModuleNotFoundError:
+            raise ModuleNotFoundError(
+                "predictive control needs OSQP: pip install 'sideslip[mpc]'"
+            ) from None
+        for name, value in (("horizon", horizon), ("iterations", iterations)):
+            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+                raise ValueError(f"{name} is a positive whole number, got {value!r}")
+        super().__init__(env, disturbance_time=disturbance_time, haste=haste)
+        self._osqp: Any = osqp
+        known = osqp.SolverStatus
+        self._good = (int(known.OSQP_SOLVED), int(known.OSQP_SOLVED_INACCURATE))
+        self.horizon, self.iterations = horizon, iterations
+        period = max(self.control_period, STEP)
+        self.prediction = Purpose(
+            period, self.full_scale, self.purpose.steers, self.purpose.kind,
+            self.purpose.disturbances, self.purpose.disturbance_time, float(haste),
+        )  # fmt: skip
+        self._shift = period == self.control_period
+        self._change = self.nominal.steering_rate * period * TICK / self.authority
+        inputs = horizon * self.width
+        self._rows = inputs + (horizon if self.width > 1 else 0)
+        self.memory = 1 + inputs + self._rows
+        self._ready_for: dict[float, tuple[Quadratic, Any]] = {}
+        self.status: list[str] = []
+        self.solve_time: list[float] = []
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without the solvers, which cannot be copied; they are set up anew."""
+        return self.__dict__ | {"_ready_for": {}, "_osqp": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """With the solver's module, which cannot be copied either."""
+        import osqp
+
+        self.__dict__.update(state | {"_osqp": osqp})
+
+    def program(self, speed: float) -> Quadratic:
+        """The quadratic program for a speed in m/s, that of the nearest of `SPEEDS`."""
+        nearest = _nearest(speed)
+        return _program(self.nominal, nearest, self.prediction, self.horizon, self.authority)
+
+    def predict(
+        self,
+        observation: npt.NDArray[np.float32],
+        state: Array | None = None,
+        episode_start: npt.NDArray[np.bool_] | None = None,
+        deterministic: bool = True,
+    ) -> tuple[npt.NDArray[np.float32], Array]:
+        """As every controller's; rows without a solution have NaN, and `status` says why."""
+        shares, memory = super().predict(observation, state, episode_start, deterministic)
+        for i, row in enumerate(shares.reshape(-1, self.width)):
+            if np.isnan(row).any() and self.status[i].startswith("solved"):
+                self.status[i] = NOT_FINITE
+        return shares, memory
+
+    def _law(self, inputs: Array, state: Array, action: npt.NDArray[np.float64]) -> None:
+        self.status, self.solve_time = [], []
+        z = np.empty(len(self.purpose.states))
+        for x, memory, chosen in zip(inputs, state, action, strict=True):
+            predicted_state(x, self.share, z)
+            said, seconds = self._solve(0.5 * (x[0] + x[1]), z, memory, chosen)
+            self.status.append(said)
+            self.solve_time.append(seconds)
+
+    def _solve(self, speed: float, z: Array, memory: Array, chosen: Array) -> tuple[str, float]:
+        """Fill the action `chosen` (m,) and the memory of a row; what the solver said and took."""
+        m, count = self.width, self.horizon * self.width
+        low, high = -np.ones(self._rows), np.ones(self._rows)
+        if m > 1:
+            low[count:], high[count:] = -self._change, self._change
+            low[count] += memory[0]
+            high[count] += memory[0]
+        program, solver = self._ready(_nearest(speed))
+        solver.update(q=program.F @ z, l=low, u=high)
+        solver.warm_start(x=memory[1 : 1 + count], y=memory[1 + count :])
+        found = solver.solve(raise_error=False)
+        if found.info.status_val not in self._good:
+            chosen[:] = np.nan
+            return str(found.info.status), float(found.info.run_time)
+        chosen[:] = found.x[:m]
+        memory[0] = found.x[1] if m > 1 else 0.0
+        memory[1 : 1 + count] = self._moved_on(found.x, m)
+        memory[1 + count : 1 + 2 * count] = self._moved_on(found.y[:count], m)
+        memory[1 + 2 * count :] = self._moved_on(found.y[count:], 1)
+        return str(found.info.status), float(found.info.run_time)
+
+    def _moved_on(self, values: Array, width: int) -> Array:
+        """A solution a step later, the last step repeated."""
+        if not self._shift or len(values) == 0:
+            return values
+        return np.concatenate([values[width:], values[-width:]])
+
+    def _ready(self, speed: float) -> tuple[Quadratic, Any]:
+        """The program of a speed of `SPEEDS` and its solver, set up when first needed."""
+        if speed not in self._ready_for:
+            program, solver = self.program(speed), self._osqp.OSQP()
+            solver.setup(
+                csc_matrix(np.triu(program.P)),
+                np.zeros(len(program.P)),
+                csc_matrix(program.A),
+                -np.ones(self._rows),
+                np.ones(self._rows),
+                max_iter=self.iterations,
+                **_SETTINGS,
+            )
+            self._ready_for[speed] = program, solver
+        return self._ready_for[speed]
+
+
+def _nearest(speed: float) -> float:
+    return min(SPEEDS, key=lambda each: abs(each - speed))

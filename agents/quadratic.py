@@ -1,0 +1,51 @@
+"""The quadratic program of a linear predictive controller, states eliminated."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.linalg import block_diag
+
+from .design_model import DesignModel, cost_to_go
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Quadratic:
+    """Minimise a'P a / 2 + (F x)'a over the inputs a (h m,) of h steps from the state x (n,).
+
+    Inputs stand step by step, as shares of their limits. The cost is scaled, so that the mean of
+    P's diagonal is 1. A (rows, h m) are the inputs themselves, then, where the car steers, the
+    change of the steering share in each step.
+    """
+
+    P: Array
+    F: Array
+    A: Array
+
+
+def quadratic(model: DesignModel, horizon: int, limits: Array) -> Quadratic:
+    """The program over `horizon` steps of a model, with the regulator's cost of what follows.
+
+    limits: (m,), the inputs at a share of 1.
+    """
+    n, m = model.H.shape
+    Sx, Su = np.zeros(((horizon + 1) * n, n)), np.zeros(((horizon + 1) * n, horizon * m))
+    Sx[:n] = np.eye(n)
+    for i in range(horizon):  # x = Sx x_0 + Su u, row by row of steps
+        now, then = slice(i * n, (i + 1) * n), slice((i + 1) * n, (i + 2) * n)
+        Sx[then], Su[then] = model.G @ Sx[now], model.G @ Su[now]
+        Su[then, i * m : (i + 1) * m] += model.H
+    Q = block_diag(*[model.Q] * horizon, cost_to_go(model)[1])
+    R = block_diag(*[model.R] * horizon)
+    N = np.vstack([block_diag(*[model.N] * horizon), np.zeros((n, horizon * m))])
+    scale = np.tile(limits, horizon)
+    P = scale[:, None] * (Su.T @ Q @ Su + Su.T @ N + N.T @ Su + R) * scale
+    F = scale[:, None] * ((Su.T @ Q + N.T) @ Sx)
+    size = float(np.diag(P).mean())
+    A = np.eye(horizon * m)
+    if m > 1:
+        changes = np.eye(horizon) - np.eye(horizon, k=-1)
+        A = np.vstack([A, np.kron(changes, [[0.0, 1.0]])])
+    return Quadratic(0.5 * (P + P.T) / size, F / size, A)
