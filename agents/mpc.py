@@ -43,10 +43,12 @@ class Mpc(Lqr):
     Where none is met this is the LQR. The program is that of the nearest speed of `SPEEDS`.
 
     horizon: steps of a control period, or of 10 ms where that is shorter. iterations: the solver's
-    most. disturbance_time, haste: of `lqr`. `status` says for each row of the last call "solved", "solved
-    inaccurate" (ten times the tolerance of 1e-4 of full scale) or why there is no solution: then the row's action is NaN. `solve_time` is how long the solver took for
-    each, s. Memory: the last share of added steering, and the last solution, which the next one
-    starts from.
+    most. disturbance_time, haste: of `lqr`.
+
+    `status` says for each row of the last call "solved", "solved inaccurate" (ten times the
+    tolerance of 1e-4 of full scale) or why there is no solution: then the row's action is NaN.
+    `solve_time` is how long the solver took for each, s. Memory: the last share of added steering,
+    and the last solution, which the next one starts from.
 
     Raises ModuleNotFoundError without the extras `mpc` and `design`, ValueError for a missing entry
     or an option out of range.

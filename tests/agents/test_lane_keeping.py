@@ -1,0 +1,116 @@
+"""Lane keeping: stable, at rest on a curve only where it should be, and better with the moment."""
+
+from typing import Any
+
+import control
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from sideslip.agents import make_agent
+from sideslip.agents.design_model import optimal
+from sideslip.agents.lane_keeping import MOVED, LaneKeeping, lane_model
+from sideslip.agents.lqr import HASTE, SPEEDS
+from sideslip.envs import COMS
+from sideslip.estimators import EstimateObservation
+
+OUTPUTS = ["beta", "gamma", "psi", "y_l"]
+LIMIT = COMS.yaw_moment_limit
+
+
+def env_of(kappa: float, **changes: Any) -> Any:
+    scenario = {
+        "name": "curve",
+        "curvature": kappa,
+        "curve_start": 10.0,
+        "curve_ramp": 10.0,
+        "half_width": 2.0,
+        "front_stiffness": (0.7, 1.3),
+        "rear_stiffness": (0.7, 1.3),
+    } | changes
+    env = gym.make("sideslip/YawVisionUneven-v0", steering=True, scenario=scenario)
+    return EstimateObservation(env, "uneven-delay-kf", outputs=OUTPUTS)
+
+
+def drive(env: Any, agent: Any, seed: int) -> tuple[float, int]:
+    """(the largest offset from the road's centre line in m, the failure code)."""
+    obs, _ = env.reset(seed=seed)
+    state, most, over, info = None, 0.0, False, {"failure": 0}
+    while not over:
+        action, state = agent.predict(obs, state)
+        obs, _, terminated, truncated, info = env.step(action)
+        most, over = max(most, abs(env.unwrapped.motion.y)), terminated or truncated
+    return most, int(info["failure"])
+
+
+@pytest.mark.parametrize("inputs", [slice(0, 2), slice(1, 2)], ids=["both", "steering"])
+def test_stable_over_the_speeds_with_python_controls_gains(inputs: slice) -> None:
+    d = len(MOVED)
+    for speed in SPEEDS[::6]:
+        G, H, Q, R, N = lane_model(COMS, speed, 10, LIMIT, HASTE)
+        B = H[:, inputs]
+        K, _ = optimal(G, B, Q, R[inputs, inputs], N[:, inputs], d)
+        wanted = control.dlqr(G[:d, :d], B[:d], Q[:d, :d], R[inputs, inputs], N[:d, inputs])[0]
+        assert K[:, :d] == pytest.approx(np.asarray(wanted), rel=1e-9)
+        assert np.abs(np.linalg.eigvals(G[:d, :d] - B[:d] @ K[:, :d])).max() < 1.0
+
+
+def test_at_rest_on_a_curve_the_car_is_in_its_lane() -> None:
+    """The integral leaves no offset; the car turns with the road."""
+    d, speed, kappa = len(MOVED), 7.0, 0.02
+    G, H, Q, R, N = lane_model(COMS, speed, 10, LIMIT, HASTE)
+    K, _ = optimal(G, H, Q, R, N, d)
+    closed = G - H @ K
+    rest = np.linalg.solve(np.eye(d) - closed[:d, :d], closed[:d, d + 1] * kappa)
+    assert rest[3] == pytest.approx(0.0, abs=1e-9)
+    assert rest[1] == pytest.approx(speed * kappa)
+    assert rest[0] + rest[2] == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("kappa", [0.02, -0.04])
+def test_it_stays_where_the_uncontrolled_car_leaves_and_the_moment_helps(kappa: float) -> None:
+    env = env_of(kappa)
+    both, alone = make_agent("lane-keeping", env), make_agent("lane-keeping", env, moment=False)
+    for seed in range(5):
+        most, failure = drive(env, both, seed)
+        assert drive(env, make_agent("none", env), seed)[1] != 0
+        assert failure == 0 and most < 0.4
+        assert most < 0.7 * drive(env, alone, seed)[0]
+
+
+def test_the_integral_holds_while_an_input_is_at_its_limit() -> None:
+    env = env_of(0.02)
+    agent = make_agent("lane-keeping", env)
+    assert isinstance(agent, LaneKeeping)
+    names = [entry.name for entry in env.get_wrapper_attr("layout")]
+    obs = np.zeros(len(names), np.float32)
+    obs[names.index("wheel_left")] = obs[names.index("wheel_right")] = 7.0
+    for offset, grows in ((0.001, True), (1.9, False)):
+        obs[names.index("y_l_hat")] = offset
+        _, state = agent.predict(obs)
+        assert (state[0, 0] > 0.0) == grows
+
+
+def test_without_the_moment_it_only_steers() -> None:
+    env = env_of(0.02)
+    obs, _ = env.reset(seed=0)
+    obs[:] += 0.01
+    both = make_agent("lane-keeping", env).predict(obs)[0]
+    alone = make_agent("lane-keeping", env, moment=False).predict(obs)[0]
+    assert both[0] != 0.0 and alone[0] == 0.0 and alone[1] != 0.0
+
+
+def test_bad_input() -> None:
+    env = env_of(0.02)
+    with pytest.raises(ValueError, match="curvature_time is positive"):
+        make_agent("lane-keeping", env, curvature_time=0.0)
+    with pytest.raises(ValueError, match="haste is zero or more"):
+        make_agent("lane-keeping", env, haste=-1.0)
+    fixed = EstimateObservation(gym.make("sideslip/YawVision-v0"), "multirate-kf", outputs=OUTPUTS)
+    with pytest.raises(ValueError, match="action steers"):
+        make_agent("lane-keeping", fixed)
+    with pytest.raises(ValueError, match=r"psi_hat, y_l_hat.*EstimateObservation"):
+        make_agent(
+            "lane-keeping", EstimateObservation(gym.make("sideslip/YawVision-v0"), "bicycle-kf")
+        )
