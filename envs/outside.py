@@ -89,6 +89,7 @@ def outside_vehicle() -> Vehicle:
         gravity_height=p.h_cg,
         motor_torque=MOTOR_TORQUE,
         preview=12.0,
+        width=p.w,
         friction=p.tire.p_dy1,
         sprung_mass=p.m_s,
         roll_arm=arm,

@@ -10,7 +10,8 @@ import numpy.typing as npt
 from .actuators import Lag, distribute, lagged, slewed, within_stop, yaw_moment
 from .backend import absolute
 from .delivery import sense, store
-from .dynamics import Motion, sideslip_angle
+from .driver import Driver, steered
+from .dynamics import Motion, Road, sideslip_angle
 from .layout import Disturbance, Drive, P, Task, Z
 from .manoeuvres import scenario_from
 from .noise import CHANNELS, normals
@@ -22,6 +23,7 @@ from .scenario import Scenario
 from .stability import StabilityEnv
 from .summary import clip, observe, write_report
 from .switches import NOT_FINITE, OFF_ROAD, REPORT, RUNNING, SPIN
+from .tracks import Path, path_offset
 
 # Fields of a scenario that change our own plant or its road: only their defaults will do.
 _OURS = (
@@ -31,6 +33,8 @@ _OURS = (
     "small_angle",
     "linear_tyres",
     "vehicle",
+    "friction_right",
+    "tyre_change_time",
 )
 
 
@@ -48,8 +52,8 @@ class OutsideEnv(StabilityEnv):
     scenario's two factors. Motors and steering act for a tick with the mean that the record tells.
 
     Raises ValueError for an unknown model, a scenario with a road or a plant that the model has
-    not (curvature, bank, grade, small_angle, linear_tyres, vehicle), the reset option "vehicle" or
-    a start off the road's own frame.
+    not (curvature, bank, grade, small_angle, linear_tyres, vehicle, friction_right,
+    tyre_change_time), the reset option "vehicle" or a start off the road's own frame.
     """
 
     def __init__(
@@ -128,14 +132,13 @@ class OutsideEnv(StabilityEnv):
             row = self.rows[done]
             v = 0.5 * (row[FAST.wheel_left] + row[FAST.wheel_right])
             kind = int(self._now.switches[2])
-            programme = tuple(self._params[P.steering : P.steering + STEERING_WIDTH].tolist())
-            driver = steering_at(float(z[Z.clock + 2]), programme)
-            refs = reference(driver, float(v), told.target, kind)
+            z[Z.driver] = self._driver(told, motion)
+            refs = reference(float(z[Z.driver]), float(v), told.target, kind)
             moment = yaw_moment(acted[1], acted[2], self.plant.car)
             share = moment / told.task.yaw_scale
             cost += TICK * cost_rate(beta - refs[0], motion.gamma - refs[1], share, acted[5], kind)
             done += 1
-            failure = self._failure(told.task, motion, beta)
+            failure = self._failure(told, motion, beta)
         z[Z.clock + 3] = failure
         if failure != RUNNING:  # the rest of the episode is charged: failing never pays
             cost += COST_CAP * (told.task.duration - z[Z.clock + 2]) * TICK
@@ -159,8 +162,7 @@ class OutsideEnv(StabilityEnv):
         z, task, car = self._state, told.task, self.plant.car
         drive = Drive(*z[Z.drive : Z.drive + len(Drive._fields)].tolist())
         tick = float(z[Z.clock + 2])
-        programme = tuple(self._params[P.steering : P.steering + STEERING_WIDTH].tolist())
-        driver = steering_at(tick, programme)
+        driver = float(z[Z.driver])
         slewing = slewed(drive.slewing, shares[1] * task.authority, task.slew)
         extra = within_stop(slewing, driver, task.stop)
         limit = 2.0 * car.T_max / (car.m * car.r)
@@ -187,6 +189,15 @@ class OutsideEnv(StabilityEnv):
         store(z, Z.drive, after)
         return steer, left, right, driver, a_x, added
 
+    def _driver(self, told: "_Told", motion: Motion) -> float:
+        """The driver's steering command at the tick just reached."""
+        z, task = self._state, told.task
+        if self._now.switches[3] == DRIVER:
+            angle, person, path = float(z[Z.driver]), told.driver, told.path
+            return float(steered(angle, motion, path, _FLAT, told.target, person, task.stop))
+        programme = tuple(self._params[P.steering : P.steering + STEERING_WIDTH].tolist())
+        return float(steering_at(float(z[Z.clock + 2]), programme))
+
     def _normals(self, channel: int) -> tuple[float, ...]:
         key_low, key_high, tick = self._state[Z.clock : Z.clock + 3].tolist()
         return tuple(normals(int(key_low), int(key_high), int(tick), channel))
@@ -212,12 +223,14 @@ class OutsideEnv(StabilityEnv):
             )
         )
 
-    def _failure(self, task: Task, motion: Motion, beta: float) -> int:
+    def _failure(self, told: "_Told", motion: Motion, beta: float) -> int:
         if not self.plant.finite:
             return NOT_FINITE
-        if absolute(beta) > task.spin and motion.v_x > 0.0:  # backing up is no spin
+        if absolute(beta) > told.task.spin and motion.v_x > 0.0:  # backing up is no spin
             return SPIN
-        return OFF_ROAD if absolute(motion.y) > task.half_width else RUNNING
+        follows = self._now.switches[3] == DRIVER
+        way = path_offset(told.path, motion.s) if follows else 0.0
+        return OFF_ROAD if absolute(motion.y - way) > told.task.half_width else RUNNING
 
     def _tell(
         self, done: int, count: int, refs: tuple[float, float], obs: npt.NDArray[np.float32]
@@ -241,6 +254,8 @@ class _Told(NamedTuple):
     target: Target
     disturbance: Disturbance
     task: Task
+    driver: Driver
+    path: Path
 
 
 _TOLD: tuple[tuple[Any, int], ...] = (
@@ -251,7 +266,10 @@ _TOLD: tuple[tuple[Any, int], ...] = (
     (Target, P.target),
     (Disturbance, P.disturbance),
     (Task, P.task),
+    (Driver, P.driver),
+    (Path, P.path),
 )
+_FLAT = Road(0.0, 0.0, 1.0)
 
 
 def _part(p: npt.NDArray[np.float64], kind: Any, at: int) -> Any:

@@ -168,6 +168,20 @@ def test_estimators_and_controllers_run_on_it(model: str) -> None:
     assert np.sqrt(np.mean(error**2)) < 0.01
 
 
+@pytest.mark.parametrize("model", MODELS)
+def test_our_driver_keeps_it_on_a_track(model: str) -> None:
+    track = CALM | {"steering": "driver", "path": "iso-3888-1", "speed": 12.0, "duration": 12.0}
+    env = outside(model, scenario=track | {"half_width": 1.0})
+    env.reset(seed=0)
+    over, left = False, 0.0
+    while not over:
+        *_, terminated, over, _ = env.step([0.0])
+        left = max(left, env.motion.Y)
+        assert not terminated
+    assert left > 3.0
+    assert env.motion.X > 130.0
+
+
 def test_a_spin_ends_the_episode_and_the_rest_is_charged() -> None:
     env = outside("drift", scenario=CALM)
     env.reset(seed=0, options={"state": {"v_y": -0.45 * V, "gamma": 2.0}})
@@ -208,6 +222,8 @@ def test_a_wheel_at_rest_in_a_spin_makes_the_state_no_number() -> None:
         ("small_angle", True),
         ("linear_tyres", True),
         ("vehicle", {"mass": 1500.0}),
+        ("friction_right", 0.3),
+        ("tyre_change_time", 1.0),
     ],
 )
 def test_a_scenario_of_our_own_plant_is_refused(field: str, value: Any) -> None:

@@ -1,0 +1,123 @@
+"""ISO 3888: double lane change (part 1) and obstacle avoidance (part 2), with a check for cones.
+
+The lanes are `envs.tracks.sections`; a driver model steers. A car hits a cone where any part of
+its body, a rectangle, is outside a lane while within its length. The result is the highest speed
+at which, and below which, no cone is hit. Part 1 is driven at a held speed, part 2 coasting.
+
+A car built for lower speeds drives tracks shortened by a fixed share of their lengths: that of its
+own speed to the standards' 80 km/h. Lane widths go by the car's width as the standards have it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...envs.tracks import Section, sections
+from .drive import Array, Drive, Fields, Series, TestCar
+
+TRACKS = ("iso-3888-1", "iso-3888-2")
+STANDARD_SPEED = 80.0 / 3.6  # m/s
+ONSET = 1.0  # s, before the first lane
+RUN_OUT = 10.0  # m, after the last lane
+
+
+@dataclass(frozen=True)
+class Pass:
+    """One run through a track. speed: m/s.
+
+    margins: m, by lane the least distance between the body and the lane's edge, negative where
+    a cone falls; NaN of a lane that the car did not drive through.
+    """
+
+    speed: float
+    margins: tuple[float, ...]
+    series: Series
+
+    @property
+    def passed(self) -> bool:
+        """Without a cone, and not failed."""
+        return not self.series.failed and all(margin >= 0.0 for margin in self.margins)
+
+
+def corners(series: Series, car: TestCar) -> Array:
+    """(n, 4, 2) of the body's corners on the ground in m, going round it."""
+    front = car.vehicle.front_arm + car.front_overhang
+    half = 0.5 * car.vehicle.width
+    rear = front - car.length
+    body = np.array([[front, half], [front, -half], [rear, -half], [rear, half]])
+    sine, cosine = np.sin(series.psi), np.cos(series.psi)
+    turned = np.array([[cosine, -sine], [sine, cosine]])
+    place = np.stack([series.X, series.Y], axis=1)
+    return np.asarray(place[:, None, :] + np.einsum("ijn,kj->nki", turned, body))
+
+
+def margin(body: Array, lane: Section) -> float:
+    """The least distance in m between a body (n, 4, 2) and the edges of a lane that it crosses.
+
+    The body's sides are cut where the lane begins and ends: a side may touch the first or the
+    last cone with all corners outside. NaN where the body does not reach the lane's end.
+    """
+    start, end = lane.start, lane.start + lane.length
+    if body[:, :, 0].max() < end:
+        return float("nan")
+    here, there = body, np.roll(body, -1, axis=1)
+    along = there[..., 0] - here[..., 0]
+    safe = np.where(along == 0.0, 1.0, along)
+    cuts = np.sort([(start - here[..., 0]) / safe, (end - here[..., 0]) / safe], axis=0)
+    inside = (here[..., 0] >= start) & (here[..., 0] <= end)
+    first = np.where(along == 0.0, np.where(inside, 0.0, 2.0), np.maximum(cuts[0], 0.0))
+    last = np.where(along == 0.0, np.where(inside, 1.0, -1.0), np.minimum(cuts[1], 1.0))
+    across = there[..., 1] - here[..., 1]
+    most = -np.inf
+    for part in (first, last):
+        y = here[..., 1] + part * across - lane.offset
+        most = max(most, float(np.max(np.abs(y), where=first <= last, initial=-np.inf)))
+    return 0.5 * lane.width - most
+
+
+def lanes_of(car: TestCar, track: str, speed: float) -> tuple[Section, ...]:
+    """The lanes where the car drives them at a speed in m/s."""
+    return sections(track, car.vehicle.width, speed * ONSET, shortened(car))
+
+
+def shortened(car: TestCar) -> float:
+    """The share of the standards' lengths that the car drives."""
+    return min(1.0, car.speed / STANDARD_SPEED)
+
+
+def lane_change(car: TestCar, track: str, speed: float) -> Fields:
+    """A run through a track at a speed in m/s."""
+    last = sections(track, car.vehicle.width, 0.0, shortened(car))[-1]
+    way = last.start + last.length + RUN_OUT
+    return {
+        "steering": "driver",
+        "path": track,
+        "path_speed": speed / shortened(car),
+        "onset": ONSET,
+        "speed": speed,
+        "acceleration": None if track == TRACKS[0] else 0.0,
+        "duration": ONSET + 1.3 * way / speed,  # a coasting car is slower
+    }
+
+
+def check(series: Series, car: TestCar, track: str, speed: float) -> Pass:
+    """A run's margins."""
+    body = corners(series, car)
+    lanes = lanes_of(car, track, speed)
+    return Pass(speed, tuple(margin(body, lane) for lane in lanes), series)
+
+
+def run(drive: Drive, car: TestCar, track: str, speeds: Sequence[float]) -> list[Pass]:
+    """Faster and faster, up to the first run that fails (or all of the speeds, m/s, rising)."""
+    runs = []
+    for speed in speeds:
+        runs.append(check(drive(lane_change(car, track, speed)), car, track, speed))
+        if not runs[-1].passed:
+            break
+    return runs
+
+
+def highest(runs: Sequence[Pass]) -> float:
+    """The highest speed in m/s without a cone; 0 where the slowest run fails."""
+    return max((each.speed for each in runs if each.passed), default=0.0)
