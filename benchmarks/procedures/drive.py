@@ -24,6 +24,7 @@ CALM: dict[str, Any] = {
     "name": "procedure",
     "disturbance_force": 0.0,
     "disturbance_moment": 0.0,
+    "half_width": 1e6,  # m
 }
 """A proving ground without wind: what every procedure's scenario starts from."""
 

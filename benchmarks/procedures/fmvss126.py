@@ -127,7 +127,8 @@ def judge(series: Series, amplitude: float, A: float) -> Run:
     peak = float(np.max(towards * series.gamma[steered], initial=0.0))
     later = [abs(series.at("gamma", COMPLETION + time)) for time, _ in RATIOS]
     ratio_1, ratio_2 = (rate / peak if peak > 0.0 else math.nan for rate in later)
-    return Run(amplitude, abs(amplitude) / A, ratio_1, ratio_2, _sideways(series))
+    multiple = round(abs(amplitude) / A, 6)  # 5 A is no less than 5 A
+    return Run(amplitude, multiple, ratio_1, ratio_2, _sideways(series))
 
 
 def _sideways(series: Series) -> float:

@@ -1,13 +1,16 @@
 """ISO 3888: double lane change (part 1) and obstacle avoidance (part 2), with a check for cones.
 
 The lanes are `envs.tracks.sections`; a driver model steers. A car hits a cone where any part of
-its body, a rectangle, is outside a lane while within its length. The result is the highest speed
-at which, and below which, no cone is hit. Part 1 is driven at a held speed, part 2 coasting.
+its body, a rectangle, is outside a lane while within its length. Part 1 is driven at a held speed,
+part 2 coasting. A driver may try again: at every speed each driver of `TRIES` goes until one hits
+no cone. The result is the highest speed of a clean run, which tells the car and our drivers
+together: they do not reach what test drivers do.
 
 A car built for lower speeds drives tracks shortened by a fixed share of their lengths: that of its
 own speed to the standards' 80 km/h. Lane widths go by the car's width as the standards have it.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -20,6 +23,10 @@ TRACKS = ("iso-3888-1", "iso-3888-2")
 STANDARD_SPEED = 80.0 / 3.6  # m/s
 ONSET = 1.0  # s, before the first lane
 RUN_OUT = 10.0  # m, after the last lane
+TRIES: tuple[Fields, ...] = tuple(
+    {"driver_preview": preview, "driver_gain": gain, "driver_lag": 0.05}
+    for preview, gain in ((0.3, 0.6), (0.3, 0.8), (0.3, 1.0), (0.5, 1.0), (0.3, 1.2))
+)
 
 
 @dataclass(frozen=True)
@@ -35,9 +42,15 @@ class Pass:
     series: Series
 
     @property
+    def least(self) -> float:
+        """The least margin in m; minus infinity where the track was not driven to its end."""
+        whole = not self.series.failed and all(margin == margin for margin in self.margins)
+        return min(self.margins) if whole else -math.inf
+
+    @property
     def passed(self) -> bool:
         """Without a cone, and not failed."""
-        return not self.series.failed and all(margin >= 0.0 for margin in self.margins)
+        return self.least >= 0.0
 
 
 def corners(series: Series, car: TestCar) -> Array:
@@ -108,16 +121,24 @@ def check(series: Series, car: TestCar, track: str, speed: float) -> Pass:
     return Pass(speed, tuple(margin(body, lane) for lane in lanes), series)
 
 
+def attempt(drive: Drive, car: TestCar, track: str, speed: float) -> Pass:
+    """The first clean run of a driver at a speed in m/s, or the one that came closest to it."""
+    best: Pass | None = None
+    for driver in TRIES:
+        tried = check(drive({**lane_change(car, track, speed), **driver}), car, track, speed)
+        if tried.passed:
+            return tried
+        if best is None or tried.least > best.least:
+            best = tried
+    assert best is not None
+    return best
+
+
 def run(drive: Drive, car: TestCar, track: str, speeds: Sequence[float]) -> list[Pass]:
-    """Faster and faster, up to the first run that fails (or all of the speeds, m/s, rising)."""
-    runs = []
-    for speed in speeds:
-        runs.append(check(drive(lane_change(car, track, speed)), car, track, speed))
-        if not runs[-1].passed:
-            break
-    return runs
+    """One attempt at each of the speeds, m/s."""
+    return [attempt(drive, car, track, speed) for speed in speeds]
 
 
 def highest(runs: Sequence[Pass]) -> float:
-    """The highest speed in m/s without a cone; 0 where the slowest run fails."""
+    """The highest speed in m/s of a clean run; 0 where there is none."""
     return max((each.speed for each in runs if each.passed), default=0.0)

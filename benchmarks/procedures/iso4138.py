@@ -43,7 +43,6 @@ def circle(car: TestCar, steer: float, first: float, last: float, seconds: float
         "change_start": SETTLE,
         "change_length": seconds,
         "duration": SETTLE + seconds,
-        "half_width": 500.0,
     }
 
 

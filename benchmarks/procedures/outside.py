@@ -1,0 +1,94 @@
+"""Outside plants: the check with CommonRoad's drift model, and episodes of our controllers.
+
+The check (FMVSS 126 at 80 km/h, steering angle prescribed): without control the car fails at 5 A;
+with a yaw moment of at most 500 N m it passes at 6.5 A. The law is a saturating feedback of the
+true yaw rate's error against a neutral car's within the friction.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+
+from ...agents import make_agent
+from ...agents.rollout import rollout
+from ...envs.dynamics import Motion
+from ...envs.outside import outside_vehicle
+from ...envs.vehicle import GRAVITY
+from ...estimators import EstimateObservation
+from . import fmvss126
+from .cars import OUTSIDE_ID, Contestant, outside_car
+from .drive import Law, of_plant
+
+MODEL = "drift"
+LIMIT = 500.0  # N m
+GAIN = 2e4  # N m s/rad
+FAILS_AT, PASSES_AT = 5.0, 6.5  # of A
+
+SCENARIO: dict[str, Any] = {
+    "name": "outside-lane-change",
+    "steering": "lane-change",
+    "duration": 5.0,
+    "mirror": True,
+    "onset": (0.5, 1.0),
+    "amplitude": (0.03, 0.08),
+    "frequency": (0.4, 0.7),
+    "speed": (60.0 / 3.6, 90.0 / 3.6),
+    "front_stiffness": (0.8, 1.2),
+    "rear_stiffness": (0.8, 1.2),
+    "friction": (0.7, 1.0),
+}
+"""A lane change within what the outside car was made for, drawn by the seed."""
+
+
+def within_limit(motion: Motion, steer: float) -> float:
+    """The check's yaw moment in N m."""
+    most = 0.85 * GRAVITY * outside_vehicle().friction / motion.v_x
+    wanted = min(max(motion.v_x * steer / outside_vehicle().wheelbase, -most), most)
+    return min(max(GAIN * (wanted - motion.gamma), -LIMIT), LIMIT)
+
+
+@dataclass(frozen=True)
+class Check:
+    """Both halves of the check, each steered to both sides."""
+
+    none: fmvss126.Result
+    law: fmvss126.Result
+
+    @property
+    def reproduced(self) -> bool:
+        """No control fails at 5 A, the law passes at 6.5 A."""
+        return not any(run.passed for run in self.none.runs) and self.law.passed
+
+
+def check(model: str = MODEL) -> Check:
+    """Drive it; A is the uncontrolled car's."""
+    car = outside_car()
+    A = fmvss126.steering_for(of_plant(model), car)
+
+    def at(multiple: float, law: Law | None) -> fmvss126.Result:
+        return fmvss126.run(of_plant(model, law), car, A, [multiple])
+
+    return Check(at(FAILS_AT, None), at(PASSES_AT, within_limit))
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One seed: the cost, whether it failed, RMS and peak of the slip in rad."""
+
+    cost: float
+    failed: bool
+    peak: float
+
+
+def episodes(model: str, contestant: Contestant, seeds: Sequence[int]) -> list[Episode]:
+    """A contestant on an outside plant."""
+    env: gym.Env[Any, Any] = gym.make(
+        OUTSIDE_ID, model=model, scenario=SCENARIO, reference="limited", on_bad_action="fail"
+    )
+    if contestant.estimator:
+        env = EstimateObservation(env, contestant.estimator)
+    agent = make_agent(contestant.agent, env)
+    driven = [rollout(env, agent, seed) for seed in seeds]
+    return [Episode(d.cost, d.failed, float(abs(d["beta"]).max())) for d in driven]
