@@ -42,6 +42,11 @@ METRICS = {
     "decibels": "dB",
     "hertz": "Hz",
     "count": "-",
+    "amplitude": "-",
+    "speed": "m/s",
+    "understeer_gradient": "rad s2/m",
+    "response_time": "s",
+    "overshoot": "-",
 }
 """The vocabulary of metrics with their units; a new one is added here first."""
 

@@ -46,6 +46,12 @@ def _papers(wish: Wish) -> Suite:
     return papers.run(seeds, wish.jobs, console=wish.console)
 
 
+def _procedures(wish: Wish) -> Suite:
+    from .procedures import suite
+
+    return suite.run(wish.quick, wish.jobs, console=wish.console)
+
+
 def _speed(wish: Wish) -> Suite:
     from . import speed
 
@@ -56,5 +62,6 @@ SUITES: dict[str, Callable[[Wish], Suite]] = {
     "estimation": _estimation,
     "control": _control,
     "papers": _papers,
+    "procedures": _procedures,
     "speed": _speed,
 }

@@ -149,9 +149,8 @@ def linear_step(vehicle: Vehicle, speed: float, series: Series) -> dict[str, Ste
     }
 
 
-def run_step(drive: Drive, car: TestCar, steer: float) -> dict[str, StepResponse]:
-    """The numbers of yaw rate and lateral acceleration after a step of the steering angle."""
-    series = drive(step(car, steer))
+def responses(series: Series) -> dict[str, StepResponse]:
+    """The numbers of yaw rate and lateral acceleration after a step."""
     return {name: step_response(series.t, series.steer, getattr(series, name)) for name in OUTPUTS}
 
 

@@ -1,0 +1,110 @@
+"""The suite's figures: yaw rate with its criteria, tracks with cones, frequency responses."""
+
+from typing import Any
+
+import numpy as np
+from plotly import graph_objects as go
+from plotly.subplots import make_subplots
+
+from ..colours import GREY, INK
+from ..figures import colour, time_series, track
+from ..rows import Suite
+from . import fmvss126, iso3888, iso7401
+from .cars import CARS, CONTESTANTS
+from .drive import Array
+from .found import Case, Done, Sine, Transient, of
+
+
+def add(suite: Suite, done: Done) -> None:
+    """Every figure of what was found."""
+    for car in CARS:
+        mine = {case: found for case, found in done.items() if case.car == car}
+        suite.figures.append(
+            (
+                f"FMVSS 126, {car}: yaw rate at 5 A over its own peak",
+                yaw_rates(of(mine, "fmvss-126")),
+                "Bars: at most 35 % and 20 % of the peak after the steer reversal may be left.",
+            )
+        )
+        for name in iso3888.TRACKS:
+            text = "Each controller's fastest clean run, or the slowest run where none is clean."
+            suite.figures.append((f"{name}, {car}: way and cones", cones(of(mine, name)), text))
+        for found in of(mine, "iso-7401").values():
+            text = "Dots: measured by a swept sine, no control. Line: the linear model."
+            title = f"ISO 7401, {car}: frequency response to steering"
+            suite.figures.append((title, bode(found), text))
+
+
+def yaw_rates(done: dict[Case, Sine]) -> Any:
+    """Yaw rate at 5 A as a share of its peak after the reversal, with the two limits."""
+    t = max((found.shown.t for found in done.values()), key=len)
+    series = {_label(case): _shares(found, t) for case, found in done.items()}
+    figure = time_series("", t, series, "yaw rate / its peak after the reversal")
+    for time, most in fmvss126.RATIOS:
+        at = fmvss126.COMPLETION + time
+        for level in (most, -most):
+            line = {"color": INK, "width": 3}
+            figure.add_shape(type="line", x0=at - 0.1, x1=at + 0.1, y0=level, y1=level, line=line)
+    figure.update_yaxes(range=[-1.5, 1.5])
+    return figure
+
+
+def _shares(found: Sine, t: Array) -> Array:
+    """The yaw rate over its peak at the times t; NaN after the drive's end."""
+    shown = found.shown
+    steered = (shown.t >= fmvss126.REVERSAL) & (shown.t <= fmvss126.COMPLETION)
+    peak = np.max(-shown.gamma[steered], initial=1e-9)  # the first half steers to the left
+    return np.interp(t, shown.t, -shown.gamma / peak, right=np.nan)
+
+
+def cones(done: dict[Case, list[iso3888.Pass]]) -> Any:
+    """The ways of the centre of gravity, from where the first lane begins, and the cones."""
+    ways, lanes, speed = {}, (), 0.0
+    for case, runs in done.items():
+        best = max((run for run in runs if run.passed), key=lambda run: run.speed, default=runs[0])
+        start = best.speed * iso3888.ONSET
+        ways[f"{_label(case)}, {3.6 * best.speed:.0f} km/h"] = best.series.X - start, best.series.Y
+        lanes, speed = iso3888.lanes_of(CARS[case.car], case.procedure, best.speed), best.speed
+    figure = track(ways)
+    places = [
+        (x - speed * iso3888.ONSET, lane.offset + side * 0.5 * lane.width)
+        for lane in lanes
+        for x in np.linspace(lane.start, lane.start + lane.length, 5)
+        for side in (-1.0, 1.0)
+    ]
+    x, y = np.array(places).T
+    marker = {"color": "#D55E00", "symbol": "triangle-up", "size": 7}
+    figure.add_trace(go.Scatter(x=x, y=y, mode="markers", marker=marker, name="cones"))
+    reach = float(x.max()) + iso3888.RUN_OUT
+    figure.update_xaxes(range=[float(x.min()) - iso3888.RUN_OUT, reach])
+    return figure
+
+
+def bode(found: Transient) -> Any:
+    """Magnitude and phase of both outputs over the frequency."""
+    titles = ("yaw rate / (1/s)", "lateral acceleration / (m/s2/rad)")
+    figure = make_subplots(rows=2, cols=2, shared_xaxes=True, subplot_titles=titles)
+    for column, name in enumerate(iso7401.OUTPUTS, 1):
+        measured, linear = found.sweep[name], found.linear_sweep[name]
+        for H, mode, who in ((measured.H, "markers", "measured"), (linear, "lines", "linear")):
+            for row, values in ((1, np.abs(H)), (2, np.degrees(np.unwrap(np.angle(H))))):
+                trace = go.Scatter(
+                    x=measured.frequency,
+                    y=values,
+                    mode=mode,
+                    name=f"{who} model" if who == "linear" else who,
+                    legendgroup=who,
+                    showlegend=row == column == 1,
+                    marker={"color": colour("two-dof")},
+                    line={"color": GREY},
+                )
+                figure.add_trace(trace, row=row, col=column)
+    figure.update_xaxes(title_text="frequency / Hz", row=2)
+    figure.update_yaxes(title_text="gain", row=1, col=1)
+    figure.update_yaxes(title_text="phase / deg", row=2, col=1)
+    figure.update_layout(height=520)
+    return figure
+
+
+def _label(case: Case) -> str:
+    return CONTESTANTS[case.contestant].label

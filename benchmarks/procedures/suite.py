@@ -1,0 +1,91 @@
+"""Question: do the cars pass the standard test procedures, and on equations that are not ours?"""
+
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from ...envs.outside import OUTSIDE_PLANTS
+from ...envs.vehicle import GRAVITY
+from ..cases import run_cases
+from ..rows import Suite
+from . import fmvss126, iso3888, iso4138, iso7401, outside, tables
+from .cars import CARS, CONTESTANTS
+from .found import NAME, Case, Sine, Transient
+
+SHOWN = 5.0  # of A: the sine with dwell in the figures
+QUICK_MULTIPLES = (1.5, 3.0, 5.0, 6.5)  # of A
+EPISODES, QUICK_EPISODES = 20, 2
+STEP_AT = 0.2 * GRAVITY  # steady lateral acceleration of the step, in the linear range
+SWEEP_AT = 0.1 * GRAVITY  # of the sweep, where it is slow
+
+_TEXT = (
+    "Standard manoeuvres driven by the book. FMVSS 126: sine with dwell, amplitudes in units of A, "
+    "the steering wheel angle at 0.3 g; A is the uncontrolled car's, so that all are steered alike "
+    "(steering ratio 16). ISO 3888: lane change and obstacle avoidance by a driver model, with a "
+    "check of the car's body against the cones. ISO 4138: understeer gradient of a circle driven "
+    "slowly faster. ISO 7401: step and swept sine. The COMS is tested at 40 km/h, on tracks of "
+    "half the length: it oversteers and is unstable above 63 km/h. The 0.3 g and the 1.83 m stay. "
+    "The passenger car is tested at 80 km/h. References are limited by friction. Outside plants "
+    "are CommonRoad's models of a BMW 320i, whose equations and tyres are not ours."
+)
+
+
+def measure(case: Case) -> Any:
+    """Drive a case: what its procedure gives."""
+    if case.procedure == "outside":
+        return outside.episodes(case.car, CONTESTANTS[case.contestant], case.seeds)
+    if case.procedure == "check":
+        return outside.check()
+    car, drive = CARS[case.car], CONTESTANTS[case.contestant].drive(case.car)
+    if case.procedure == "fmvss-126":
+        A = fmvss126.steering_for(CONTESTANTS[0].drive(case.car), car)
+        result = fmvss126.run(drive, car, A, QUICK_MULTIPLES if case.quick else None)
+        return Sine(result, drive(fmvss126.sine_with_dwell(car, SHOWN * A)))
+    if case.procedure in iso3888.TRACKS:
+        shares = np.arange(0.5, 1.25, 0.15 if case.quick else 0.05)
+        return iso3888.run(drive, car, case.procedure, (car.speed * shares).tolist())
+    if case.procedure == "iso-4138":
+        return iso4138.run(drive, car)
+    return _transient(case)
+
+
+def _transient(case: Case) -> Transient:
+    car, drive = CARS[case.car], CONTESTANTS[case.contestant].drive(case.car)
+    per = car.vehicle.wheelbase / car.speed**2 + iso4138.gradient_of(car.vehicle)  # rad s2/m
+    stepped = drive(iso7401.step(car, per * STEP_AT))
+    sweep = iso7401.run_sweep(drive, car, per * SWEEP_AT)
+    frequency = sweep[iso7401.OUTPUTS[0]].frequency
+    return Transient(
+        iso7401.responses(stepped),
+        iso7401.linear_step(car.vehicle, car.speed, stepped),
+        sweep,
+        iso7401.linear_response(car.vehicle, car.speed, frequency),
+    )
+
+
+def cases_of(quick: bool) -> list[Case]:
+    """Everything that is driven."""
+    contestants = range(len(CONTESTANTS))
+    driven = ("fmvss-126", *iso3888.TRACKS)
+    cases = [Case("check", outside.MODEL)]
+    cases += [Case(p, car, k, (), quick) for p in driven for car in CARS for k in contestants]
+    cases += [Case(p, car) for p in ("iso-4138", "iso-7401") for car in CARS]
+    seeds = tuple(range(QUICK_EPISODES if quick else EPISODES))
+    known = [k for k in contestants if CONTESTANTS[k].agent != "feedforward"]
+    cases += [Case("outside", model, k, seeds) for model in OUTSIDE_PLANTS for k in known]
+    return cases
+
+
+def run(quick: bool = False, jobs: int | None = None, console: Console | None = None) -> Suite:
+    """Every procedure for both cars and every contestant, and the outside plants."""
+    cases = cases_of(quick)
+    done = dict(zip(cases, run_cases(measure, cases, NAME, jobs, console), strict=True))
+    suite = Suite(NAME, "Standard test procedures", _TEXT)
+    tables.add(suite, done)
+    try:
+        from . import draw
+    except ModuleNotFoundError:
+        return suite
+    draw.add(suite, done)
+    return suite
