@@ -16,7 +16,8 @@ from .layout import Disturbance, Drive, P, Task, Z
 from .manoeuvres import scenario_from
 from .noise import CHANNELS, normals
 from .outside import OUTSIDE_PLANTS, Acting, OutsidePlant, outside_vehicle
-from .programme import STEERING_WIDTH, Pace, Wind, acceleration_command, steering_at, wind_at
+from .pace import Pace, acceleration_command
+from .programme import DRIVER, STEERING_WIDTH, Wind, steering_at, wind_at
 from .record import FAST, TICK
 from .reference import COST_CAP, Target, cost_rate, reference
 from .scenario import Scenario
@@ -80,7 +81,7 @@ class OutsideEnv(StabilityEnv):
         asked = dict(options or {})
         if "vehicle" in asked:
             raise ValueError("reset option vehicle: an outside plant is its own vehicle")
-        _check(scenario_from(asked.get("scenario", self._base.scenario)))
+        _check(scenario_from(asked.get("scenario", self.setting.base.scenario)))
         if "state" in asked:
             asked["state"] = self._on_the_road(asked["state"])
         told = super().reset(seed=seed, options=asked)
