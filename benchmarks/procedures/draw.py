@@ -6,6 +6,7 @@ import numpy as np
 from plotly import graph_objects as go
 from plotly.subplots import make_subplots
 
+from ...envs.tracks import Section
 from ..colours import GREY, INK
 from ..figures import colour, time_series, track
 from ..rows import Suite
@@ -59,7 +60,9 @@ def _shares(found: Sine, t: Array) -> Array:
 
 def cones(done: dict[Case, list[iso3888.Pass]]) -> Any:
     """The ways of the centre of gravity, from where the first lane begins, and the cones."""
-    ways, lanes, speed = {}, (), 0.0
+    ways: dict[str, tuple[Array, Array]] = {}
+    lanes: tuple[Section, ...] = ()
+    speed = 0.0
     for case, runs in done.items():
         best = max((run for run in runs if run.passed), key=lambda run: run.speed, default=runs[0])
         start = best.speed * iso3888.ONSET

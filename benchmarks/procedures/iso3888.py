@@ -25,7 +25,7 @@ ONSET = 1.0  # s, before the first lane
 RUN_OUT = 10.0  # m, after the last lane
 TRIES: tuple[Fields, ...] = tuple(
     {"driver_preview": preview, "driver_gain": gain, "driver_lag": 0.05}
-    for preview, gain in ((0.3, 0.6), (0.3, 0.8), (0.3, 1.0), (0.5, 1.0), (0.3, 1.2))
+    for preview, gain in ((0.3, 0.6), (0.4, 0.8), (0.5, 1.0), (0.6, 1.0), (0.6, 1.2))
 )
 
 

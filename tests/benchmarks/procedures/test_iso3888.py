@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sideslip.benchmarks.procedures import iso3888
-from sideslip.benchmarks.procedures.drive import Fields, Series, TestCar
+from sideslip.benchmarks.procedures.drive import Array, Fields, Series, TestCar
 from sideslip.envs import PASSENGER_CAR
 from sideslip.envs.tracks import Section
 
@@ -12,12 +12,13 @@ CAR = TestCar(PASSENGER_CAR, 80.0 / 3.6, 16.0, 4.2, 0.8)
 WIDTH = PASSENGER_CAR.width
 
 
-def series(X: np.ndarray, Y: np.ndarray, psi: np.ndarray) -> Series:
-    zero = np.zeros_like(X)
-    return Series(np.arange(len(X)) * 0.01, zero, zero + 20.0, zero, zero, psi, X, Y, zero)
+def series(X: Array, Y: Array, psi: Array) -> Series:
+    t = np.linspace(0.0, 0.01 * (len(X) - 1), len(X))
+    zero = 0.0 * t
+    return Series(t, zero, zero + 20.0, zero, zero, psi, X, Y, zero)
 
 
-def straight(y: float = 0.0, psi: float = 0.0, end: float = 60.0) -> np.ndarray:
+def straight(y: float = 0.0, psi: float = 0.0, end: float = 60.0) -> Array:
     X = np.arange(-10.0, end, 0.05)
     return iso3888.corners(series(X, np.full_like(X, y), np.full_like(X, psi)), CAR)
 

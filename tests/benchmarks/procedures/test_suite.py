@@ -1,0 +1,48 @@
+"""The suite of procedures: its cases, and its tables and figures of the uncontrolled cars."""
+
+import pytest
+
+pytest.importorskip("vehiclemodels")
+from sideslip.benchmarks.cli import SUITES
+from sideslip.benchmarks.procedures import outside, suite
+from sideslip.benchmarks.procedures.cars import CARS, CONTESTANTS
+from sideslip.benchmarks.procedures.found import Case
+from sideslip.envs.outside import OUTSIDE_PLANTS
+
+
+def test_every_contestant_drives_every_procedure_that_has_a_verdict() -> None:
+    assert "procedures" in SUITES
+    cases = suite.cases_of(quick=False)
+    assert len(set(cases)) == len(cases)
+    for procedure in ("fmvss-126", "iso-3888-1", "iso-3888-2"):
+        mine = {(case.car, case.contestant) for case in cases if case.procedure == procedure}
+        assert mine == {(car, k) for car in CARS for k in range(len(CONTESTANTS))}
+    told = {case.car: case.seeds for case in cases if case.procedure == "outside"}
+    assert set(told) == set(OUTSIDE_PLANTS)
+    assert {len(seeds) for seeds in told.values()} == {20}
+
+
+@pytest.mark.long
+def test_the_check_on_the_drift_model_is_reproduced() -> None:
+    """FMVSS 126 at 80 km/h: no control fails at 5 A, 500 N m pass at 6.5 A, on both sides."""
+    found = outside.check()
+    assert found.reproduced
+    assert not any(run.stable for run in found.none.runs)
+    assert len(found.law.runs) == 2
+
+
+@pytest.mark.long
+def test_tables_rows_and_figures_of_the_uncontrolled_cars(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("plotly")
+    known = [case for case in suite.cases_of(quick=True) if case.contestant == 0]
+    cases = [case for case in known if case.car != "multi-body"]
+    monkeypatch.setattr(suite, "cases_of", lambda quick: cases)
+    found = suite.run(quick=True, jobs=1)
+    assert [table.title.split(",")[0] for table in found.tables[:2]] == ["FMVSS 126", "ISO 3888"]
+    for table in found.tables:
+        assert {len(cells) for cells in table.cells} == {len(table.header)}
+    metrics = {row.metric for row in found.rows}
+    assert metrics >= {"amplitude", "speed", "understeer_gradient", "overshoot", "cost", "share"}
+    assert [row.verdict for row in found.rows if row.verdict] == ["reproduced", "reproduced"]
+    assert len(found.figures) == 4 * len(CARS)
+    assert Case("check", outside.MODEL) in cases
