@@ -7,13 +7,20 @@ from rich.console import Console
 
 from .. import __version__
 from .calibration import ceilings
-from .matrix.ceiling import failures_of, tops_of
+from .matrix.ceiling import refusals_of, tops_of
 from .matrix.contestants import EPISODES, STEERING, YAW, cells
 from .matrix.illustrate import illustrate
 from .matrix.price import DELAYS, SCENARIO, Price, price_of_delay
 from .matrix.results import Results, measure
 from .matrix.seeds import salt_of, salted_seeds
-from .matrix.tables import Standing, main_table, rows_of, standings, yardsticks
+from .matrix.tables import (
+    Standing,
+    main_table,
+    motion_table,
+    rows_of,
+    standings,
+    yardsticks,
+)
 from .matrix.timing import decision_time
 from .rows import Row, Suite, Table
 
@@ -45,7 +52,7 @@ def run(
     salt = salt_of()
     suite = Suite("control", "Which controller and estimator hold the car", _TEXT)
     results = measure(list(cells()), episodes, salt=salt, jobs=jobs, console=console, keep=keep)
-    found, yard = {}, []
+    found, yard, more = {}, [], []
     for env_id, title in TITLES.items():
         tops, log = tops_of(results, env_id)
         found[env_id] = standings(results, env_id, tops)
@@ -54,8 +61,9 @@ def run(
             suite.rows += rows_of(each, salt)
         note = " ".join([_note(found[env_id], episodes), *log])
         suite.tables.append(main_table(f"{title} ({env_id})", found[env_id], note))
+        more.append(motion_table(f"{title}: the motion", found[env_id]))
         yard.append(yardsticks(results, env_id, tops))
-    suite.tables += [*yard, _failures(results)]
+    suite.tables += [*yard, *more, *_refusals(results)]
     share = max(4, round(PRICE_SHARE * episodes))
     top = ceilings(YAW).get(SCENARIO)
     prices = price_of_delay(top, share, salt=salt, jobs=jobs, console=console, keep=keep)
@@ -64,15 +72,15 @@ def run(
     return suite
 
 
-def _failures(results: Results) -> Table:
-    return Table(
-        "Episodes that failed",
-        ("env", "manoeuvre", "controller and estimator", "what happened"),
-        failures_of(results),
-        "The share of a cell's episodes; the rest of a failed episode is charged at the highest "
-        "cost.",
-        keyed=False,
+def _refusals(results: Results) -> list[Table]:
+    lines = refusals_of(results)
+    if not lines:
+        return []
+    header = ("env", "manoeuvre", "controller and estimator", "what happened")
+    note = (
+        "The share of a cell's episodes; the rest of a failed one is charged at the highest cost."
     )
+    return [Table("Cells that went wrong", header, lines, note, keyed=False)]
 
 
 def _price_rows(prices: list[Price], n: int, salt: str) -> list[Row]:
@@ -100,7 +108,5 @@ def _note(found: list[Standing], episodes: int) -> str:
     widest = max((s.overall["score"].half_width for s in found if "score" in s.overall), default=0)
     return (
         f"{episodes} episodes a manoeuvre, mpc at most 64. The widest interval of a score is "
-        f"+-{widest:.3f}. Effort is the mean square share of the full yaw moment; the largest step "
-        "that of the asked moment between two decisions; a decision is the estimator's step and "
-        "the controller's, for a single car."
+        f"+-{widest:.3f}. A decision is the estimator's step and the controller's, of one car."
     )

@@ -72,7 +72,7 @@ _MANOEUVRES = (
     Scenario(
         name="random-steering",
         **_RANDOM,
-        **_DRAWN,
+        **_HARSH,
     ),
     Scenario(
         name="gust",

@@ -2,9 +2,10 @@
 
 from ...envs import FAILURES
 from ..calibration import ceilings
-from .results import Results
+from .results import FAILURE, Results
 from .scores import Ceiling
 
+_OF_THE_CAR = ("none", "spin", "off-road")
 _ERRORS = 3.0  # standard errors by which a method must win to become the ceiling
 
 
@@ -29,20 +30,20 @@ def tops_of(results: Results, env_id: str) -> tuple[dict[str, Ceiling], list[str
     return tops, log
 
 
-def failures_of(results: Results) -> list[list[str]]:
-    """A line for every cell with an episode that ended by a failure, or that could not be driven:
-    env, manoeuvre, contestant, what happened."""
+def refusals_of(results: Results) -> list[list[str]]:
+    """A line for every cell that could not be driven, or whose episodes ended by a failure that is
+    not the car's (a NaN, an action that is none): env, manoeuvre, contestant, what happened."""
     lines = []
     for cell, result in results.found.items():
         where = [cell.env_id, cell.scenario, cell.label]
         if result.error:
             lines.append([*where, f"not driven: {result.error}"])
             continue
-        codes = result.numbers[:, -1].astype(int)
+        codes = result.numbers[:, FAILURE].astype(int)
         told = [
             f"{name} {100.0 * (codes == code).mean():.1f} %"
             for code, name in enumerate(FAILURES)
-            if code and (codes == code).any()
+            if name not in _OF_THE_CAR and (codes == code).any()
         ]
         if told:
             lines.append([*where, ", ".join(told)])

@@ -96,6 +96,7 @@ def _maps(env_id: str, standings: Sequence[Standing]) -> list[tuple[str, Any, st
     for metric, good, text in (
         ("score", "high", "0: the uncontrolled car, 1: the clairvoyant optimum."),
         ("cost_over_informed", "low", "1: the LQG of the true car with the same sensors."),
+        ("spin_rate", "low", "The share of episodes in which the car spun."),
     ):
         values = np.array(
             [

@@ -17,7 +17,7 @@ from .seeds import salted_seeds
 Array = npt.NDArray[np.float64]
 
 CHUNK = 250
-COST = NUMBERS.index("cost")
+COST, FAILURE = NUMBERS.index("cost"), NUMBERS.index("failure")
 NOTEWORTHY = 2.0  # a manoeuvre is scored where the uncontrolled car costs this often informed
 
 

@@ -10,7 +10,7 @@ import pytest
 from sideslip.agents import make_agent
 from sideslip.agents.rollout import rollout
 from sideslip.benchmarks.matrix import contest, drive, results
-from sideslip.benchmarks.matrix.ceiling import failures_of, tops_of
+from sideslip.benchmarks.matrix.ceiling import refusals_of, tops_of
 from sideslip.benchmarks.matrix.contestants import MANOEUVRES, YAW, Cell, cells
 from sideslip.benchmarks.matrix.drive import NUMBERS, Chunk
 from sideslip.benchmarks.matrix.kept import Kept
@@ -110,7 +110,7 @@ def test_a_cell_that_cannot_be_built_says_why_and_the_rest_goes_on() -> None:
     found = measure(asked, 4, salt="ab" * 8, jobs=1)
     assert np.isfinite(found.of(YAW, "gust", "none").costs).all()
     assert "nobody-kf" in found.of(YAW, "gust", "two-dof", "nobody-kf").error
-    assert any("not driven" in line[-1] and "nobody-kf" in line[-1] for line in failures_of(found))
+    assert any("not driven" in line[-1] and "nobody-kf" in line[-1] for line in refusals_of(found))
 
 
 def test_standing_car_and_diverging_plant_end_finite() -> None:
