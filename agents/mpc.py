@@ -17,10 +17,12 @@ from .quadratic import Quadratic, quadratic
 
 STEP = 10  # ticks, the shortest of the prediction
 NOT_FINITE = "the observation is not finite"
+RHO = 0.1  # the solver's first; every call starts from it, whatever the last one ended with
 _SETTINGS = {
     "verbose": False,
-    "adaptive_rho": False,  # else the answer would depend on earlier calls
-    "rho": 0.3,
+    "adaptive_rho": 1,  # by iterations, not by the time they take
+    "adaptive_rho_interval": 50,
+    "rho": RHO,
     "eps_abs": 1e-4,  # of full scale
     "eps_rel": 1e-4,
     "check_termination": 10,
@@ -137,6 +139,7 @@ class Mpc(Lqr):
             low[count] += memory[0]
             high[count] += memory[0]
         program, solver = self._ready(_nearest(speed))
+        solver.update_settings(rho=RHO)
         solver.update(q=program.F @ z, l=low, u=high)
         solver.warm_start(x=memory[1 : 1 + count], y=memory[1 + count :])
         found = solver.solve(raise_error=False)
@@ -174,4 +177,4 @@ class Mpc(Lqr):
 
 
 def _nearest(speed: float) -> float:
-    return min(SPEEDS, key=lambda each: abs(each - speed))
+    return float(min(SPEEDS, key=lambda each: abs(each - speed)))

@@ -93,7 +93,7 @@ def test_periodic_gains_are_designed_for_the_true_car() -> None:
 def _told(vector: bool, env: Any) -> Any:
     wrapper = vectorised.EstimateObservation if vector else EstimateObservation
     truth = VectorTruthObservation if vector else TruthObservation
-    return truth(wrapper(env, "exact-kf", **OPTIONS))
+    return truth(wrapper(env, "exact-kf", **OPTIONS))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
@@ -159,7 +159,7 @@ def test_bad_input() -> None:
     kinds = ("coms", "passenger-car")
     cars = SyncVectorEnv([functools.partial(gym.make, FUSION, vehicle=kind) for kind in kinds])
     with pytest.raises(ValueError, match="row 1 was told another nominal vehicle"):
-        make_agent("feedforward", cars)  # type: ignore[arg-type]
+        make_agent("feedforward", cars)
 
 
 def test_one_table_serves_all_who_ask_for_it() -> None:
