@@ -23,6 +23,7 @@ HEAVY = {
     "highway_env",
     "matplotlib",
     "numba",
+    "omegaconf",
     "optuna",
     "pandas",
     "plotly",
@@ -30,6 +31,7 @@ HEAVY = {
     "sqlalchemy",
     "stable_baselines3",
     "torch",
+    "vehiclemodels",
 }
 
 

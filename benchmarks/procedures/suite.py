@@ -1,5 +1,6 @@
 """Question: do the cars pass the standard test procedures, and on equations that are not ours?"""
 
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -26,9 +27,12 @@ _TEXT = (
     "check of the car's body against the cones. ISO 4138: understeer gradient of a circle driven "
     "slowly faster. ISO 7401: step and swept sine. The COMS is tested at 40 km/h, on tracks of "
     "half the length: it oversteers and is unstable above 63 km/h. The 0.3 g and the 1.83 m stay. "
-    "The passenger car is tested at 80 km/h. References are limited by friction. Outside plants "
-    "are CommonRoad's models of a BMW 320i, whose equations and tyres are not ours."
+    "The passenger car is tested at 80 km/h. References are limited by friction."
 )
+_OUTSIDE = (
+    " Outside plants are CommonRoad's models of a BMW 320i, whose equations and tyres are not ours."
+)
+_NONE_OUTSIDE = " Outside plants are left out: pip install 'sideslip[outside]'."
 
 
 def measure(case: Case) -> Any:
@@ -65,12 +69,14 @@ def _transient(case: Case) -> Transient:
 
 
 def cases_of(quick: bool) -> list[Case]:
-    """Everything that is driven."""
+    """Everything that is driven; outside plants only where their extra is installed."""
     contestants = range(len(CONTESTANTS))
     driven = ("fmvss-126", *iso3888.TRACKS)
-    cases = [Case("check", outside.MODEL)]
-    cases += [Case(p, car, k, (), quick) for p in driven for car in CARS for k in contestants]
+    cases = [Case(p, car, k, (), quick) for p in driven for car in CARS for k in contestants]
     cases += [Case(p, car) for p in ("iso-4138", "iso-7401") for car in CARS]
+    if find_spec("vehiclemodels") is None:
+        return cases
+    cases.append(Case("check", outside.MODEL))
     seeds = tuple(range(QUICK_EPISODES if quick else EPISODES))
     known = [k for k in contestants if CONTESTANTS[k].agent != "feedforward"]
     cases += [Case("outside", model, k, seeds) for model in OUTSIDE_PLANTS for k in known]
@@ -81,7 +87,8 @@ def run(quick: bool = False, jobs: int | None = None, console: Console | None = 
     """Every procedure for both cars and every contestant, and the outside plants."""
     cases = cases_of(quick)
     done = dict(zip(cases, run_cases(measure, cases, NAME, jobs, console), strict=True))
-    suite = Suite(NAME, "Standard test procedures", _TEXT)
+    there = any(case.procedure == "outside" for case in cases)
+    suite = Suite(NAME, "Standard test procedures", _TEXT + (_OUTSIDE if there else _NONE_OUTSIDE))
     tables.add(suite, done)
     try:
         from . import draw

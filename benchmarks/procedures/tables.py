@@ -19,7 +19,8 @@ def add(suite: Suite, done: Done) -> None:
     _tracks(suite, {track: of(done, track) for track in iso3888.TRACKS})
     _circle(suite, of(done, "iso-4138"))
     _step(suite, of(done, "iso-7401"))
-    _episodes(suite, of(done, "outside"))
+    if episodes := of(done, "outside"):
+        _episodes(suite, episodes)
     for found in of(done, "check").values():
         _check(suite, found)
 

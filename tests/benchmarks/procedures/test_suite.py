@@ -22,6 +22,12 @@ def test_every_contestant_drives_every_procedure_that_has_a_verdict() -> None:
     assert {len(seeds) for seeds in told.values()} == {20}
 
 
+def test_without_the_extra_outside_plants_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(suite, "find_spec", lambda name: None)
+    kinds = {case.procedure for case in suite.cases_of(quick=True)}
+    assert kinds == {"fmvss-126", "iso-3888-1", "iso-3888-2", "iso-4138", "iso-7401"}
+
+
 @pytest.mark.long
 def test_the_check_on_the_drift_model_is_reproduced() -> None:
     """FMVSS 126 at 80 km/h: no control fails at 5 A, 500 N m pass at 6.5 A, on both sides."""
