@@ -2,8 +2,7 @@
 
 Every tick of a period counts in the cost, so both the motion and the cost are summed tick by tick:
 what is minimised is the episode's cost J itself, but for its cap, of the linear car at a held
-speed, with the driver's command and the references held as they are now. Where a linear law may
-steer, `haste` is added, without which it would ask for what the steering's rate cannot give.
+speed, with the driver's command and the references held as they are now.
 """
 
 import math
@@ -44,8 +43,7 @@ class Purpose:
 
     period: ticks. full_scale: N m of the first input. steers: whether steering is the second.
     kind: of `envs.reference.REFERENCES` by number. disturbances: of `DISTURBANCES`.
-    disturbance_time: s, in which forces decay. haste: what it costs per second to ask for steering
-    that the actuator's rate cannot follow, by the square of how much further than it can.
+    disturbance_time: s, in which forces decay.
     """
 
     period: int
@@ -54,7 +52,6 @@ class Purpose:
     kind: int
     disturbances: str = "none"
     disturbance_time: float = 0.3
-    haste: float = 0.0
 
     @property
     def states(self) -> tuple[str, ...]:
@@ -103,8 +100,7 @@ def one_tick(vehicle: Vehicle, speed: float, purpose: Purpose) -> tuple[Array, A
     """(G, H) of a tick, and (C, D) from state and input at its start to what the cost judges.
 
     Judged at the tick's end: e_beta, e_gamma, and the means over the tick of the delivered share
-    of the yaw moment and of the added steering, which is the applied less the driver's; and how
-    far the steering asked for is ahead of that, in what its rate covers in a period and a lag.
+    of the yaw moment and of the added steering, which is the applied less the driver's.
     """
     lags = [lag_of(tau, TICK) for tau in (vehicle.motor_lag, vehicle.steering_lag)]
     plane, push = _tick_of_the_plane(vehicle, speed, purpose)
@@ -114,7 +110,7 @@ def one_tick(vehicle: Vehicle, speed: float, purpose: Purpose) -> tuple[Array, A
     G[:2, :4], H[:2, :1], G[:2, 4:5] = plane[:, :4], plane[:, 4:5], plane[:, 5:6]
     if purpose.steers:
         H[:2, 1:] = plane[:, 5:6]
-    C, D = np.zeros((5, n)), np.zeros((5, m))
+    C, D = np.zeros((4, n)), np.zeros((4, m))
     C[2, 2], C[3, 3], C[3, 4] = lags[0].mean, lags[1].mean, -lags[1].mean
     for i, lag in enumerate(lags):
         G[2 + i, 2 + i] = lag.end
@@ -125,9 +121,6 @@ def one_tick(vehicle: Vehicle, speed: float, purpose: Purpose) -> tuple[Array, A
         G[:2, 7:] = push
         if purpose.disturbances == "forces":
             G[7:, 7:] *= math.exp(-TICK / purpose.disturbance_time)
-    if purpose.steers:
-        reach = vehicle.steering_rate * (purpose.period * TICK + vehicle.steering_lag)
-        C[4, 3], C[4, 4], D[4, 1] = -1.0 / reach, 1.0 / reach, 1.0 / reach
     C[:2], D[:2] = G[:2], H[:2]
     C[0, 5], C[1, 6] = -1.0, -1.0
     return G, H, C, D
@@ -155,19 +148,20 @@ def _tick_of_the_plane(vehicle: Vehicle, speed: float, purpose: Purpose) -> tupl
 
 
 def _weights(purpose: Purpose) -> Sequence[float]:
-    """Of the four that the cost judges, DESIGN section 4, and of haste."""
+    """Of the four that the cost judges, DESIGN section 4."""
     return (
         1.0 / BETA_SCALE**2,
         0.0 if purpose.kind == ZERO_SLIP else 1.0 / GAMMA_SCALE**2,
         EFFORT_WEIGHT,
         EFFORT_WEIGHT / STEER_SCALE**2 if purpose.steers else 0.0,
-        purpose.haste,
     )
 
 
-def regulator(model: DesignModel) -> Array:
-    """K (m, n) of u = -K x, which minimises the sum of the model's cost; see `cost_to_go`."""
-    return cost_to_go(model)[0]
+def regulator(model: DesignModel) -> tuple[Array, Array]:
+    """K (m, n) of u = -K x, which minimises the sum of the model's cost, and S (m, m): another
+    input for one period costs (u + K x)'S(u + K x) more. See `cost_to_go`."""
+    K, V = cost_to_go(model)
+    return K, model.R + model.H.T @ V @ model.H
 
 
 def cost_to_go(model: DesignModel) -> tuple[Array, Array]:

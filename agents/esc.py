@@ -12,7 +12,7 @@ from ..envs.reference import LIMITED, reference, target_of
 from ..envs.vehicle import Vehicle
 from .controller import Array, Controller
 from .given import AnyEnv, given
-from .lqr import SPEEDS, cell
+from .schedule import SPEEDS, cell
 
 BANDWIDTH = 16.0  # rad/s
 RELEASE = 0.5  # s, in which the integral is let go within the dead band

@@ -17,12 +17,13 @@ from ..envs.vehicle import Vehicle
 from .controller import Array, Controller
 from .design_model import optimal
 from .given import AnyEnv
-from .lqr import HASTE, SPEEDS, interpolated
+from .schedule import SPEEDS, interpolated
 
 MOVED = ("beta", "gamma", "psi", "y", "N_z", "delta_f", "integral")
 """States that the inputs move; y is the offset of the centre of gravity from the road, in m, and
 the integral its own, in m s."""
 OTHERS = ("driver", "kappa")
+HASTE = 3.0
 OFFSET_SCALE, INTEGRAL_SCALE = 0.1, 0.2  # m, m s
 MEMORY = ("integral", "rate", "heading", "started")
 
@@ -34,8 +35,9 @@ def lane_model(
 
     Inputs: the share of the full yaw moment in N m, and rad added to the driver's steering. The
     cost rate is the env's of beta and of both inputs, with gamma against V kappa, the offset over
-    0.1 m and its integral over 0.2 m s squared; haste is that of `Purpose`. It is taken at the end
-    of each period.
+    0.1 m and its integral over 0.2 m s squared, and haste times the square of how far the steering
+    asked for is ahead of the applied, in what its rate covers in a period and a lag: without it a
+    linear law asks for what the rate cannot give. It is taken at the end of each period.
     """
     n, T = len(MOVED) + len(OTHERS), period * TICK
     plane = vision(vehicle, speed)
@@ -116,7 +118,7 @@ class LaneKeeping(Controller):
     `curvature_time` seconds; what that lacks, the integral makes up. y is the offset of the centre
     of gravity, not of the preview point, which on a curve is never zero for a car in its lane.
 
-    moment: also by the yaw moment, else by steering alone. haste: of `Purpose`. Memory: MEMORY.
+    moment: also by the yaw moment, else by steering alone. haste: of `lane_model`. Memory: MEMORY.
 
     Raises ValueError for an env whose action does not steer, a missing entry or an option out of
     range, ModuleNotFoundError without python-control.

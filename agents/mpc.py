@@ -1,5 +1,6 @@
 """Linear model predictive control: the LQR's cost under the actuators' limits, solved by OSQP."""
 
+import dataclasses
 from functools import lru_cache
 from typing import Any
 
@@ -12,8 +13,9 @@ from ..envs.vehicle import Vehicle
 from .controller import Array
 from .design_model import Purpose, design_model
 from .given import AnyEnv
-from .lqr import SPEEDS, Lqr, predicted_state
+from .lqr import Lqr, predicted_state
 from .quadratic import Quadratic, quadratic
+from .schedule import SPEEDS
 
 STEP = 10  # ticks, the shortest of the prediction
 NOT_FINITE = "the observation is not finite"
@@ -45,7 +47,7 @@ class Mpc(Lqr):
     Where none is met this is the LQR. The program is that of the nearest speed of `SPEEDS`.
 
     horizon: steps of a control period, or of 10 ms where that is shorter. iterations: the solver's
-    most. disturbance_time, haste: of `lqr`.
+    most. disturbance_time: of `lqr`.
 
     `status` says for each row of the last call "solved", "solved inaccurate" (ten times the
     tolerance of 1e-4 of full scale) or why there is no solution: then the row's action is NaN.
@@ -62,7 +64,6 @@ class Mpc(Lqr):
         horizon: int = 30,
         iterations: int = 20000,
         disturbance_time: float = 0.3,
-        haste: float = 0.0,
     ) -> None:
         try:
             import osqp
@@ -73,16 +74,13 @@ class Mpc(Lqr):
         for name, value in (("horizon", horizon), ("iterations", iterations)):
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
                 raise ValueError(f"{name} is a positive whole number, got {value!r}")
-        super().__init__(env, disturbance_time=disturbance_time, haste=haste)
+        super().__init__(env, disturbance_time=disturbance_time)
         self._osqp: Any = osqp
         known = osqp.SolverStatus
         self._good = (int(known.OSQP_SOLVED), int(known.OSQP_SOLVED_INACCURATE))
         self.horizon, self.iterations = horizon, iterations
         period = max(self.control_period, STEP)
-        self.prediction = Purpose(
-            period, self.full_scale, self.purpose.steers, self.purpose.kind,
-            self.purpose.disturbances, self.purpose.disturbance_time, float(haste),
-        )  # fmt: skip
+        self.prediction = dataclasses.replace(self.purpose, period=period)
         self._shift = period == self.control_period
         self._change = self.nominal.steering_rate * period * TICK / self.authority
         inputs = horizon * self.width

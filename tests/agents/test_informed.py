@@ -47,7 +47,7 @@ def test_gains_between_the_knots_are_those_of_the_true_car() -> None:
         speed, front, rear = rng.uniform((5.0, 0.6, 0.6), (10.0, 1.4, 1.4))
         car = COMS.scaled(front, rear)
         K = agent.gains(speed, car.front_stiffness, car.rear_stiffness)
-        wanted = regulator(design_model(car, speed, agent.purpose))
+        wanted = regulator(design_model(car, speed, agent.purpose))[0]
         assert np.abs(K[:, :4] - wanted[:, :4]).max() < 0.02 * np.abs(wanted[:, :4]).max()
 
 
@@ -133,6 +133,24 @@ def test_knowing_the_car_pays() -> None:
     for name in ("lqr", "two-dof", "feedforward"):
         log_ratio = np.log(informed / cost(nominal, make_agent(name, nominal), seeds))
         assert log_ratio.mean() + 3.0 * log_ratio.std() / len(seeds) ** 0.5 < 0.0, name
+
+
+@pytest.mark.long
+def test_told_the_truth_the_filter_knows_its_error() -> None:
+    """Small angles and linear tyres, car and speed drawn: the squared errors are those of P."""
+    plain = {"small_angle": True, "linear_tyres": True, "roll": False, "lags": False}
+    env, agent = make_informed(FUSION, scenario={"base": "random-steering", **plain})
+    means = []
+    for seed in range(16):
+        obs, _ = env.reset(seed=seed)
+        nees, over = [], False
+        while not over:
+            obs, _, terminated, truncated, info = env.step(agent.predict(obs)[0])
+            over = terminated or truncated
+            nees.append(info["nees"])
+        means.append(np.mean(nees[100:]))
+    error = np.std(means, ddof=1) / len(means) ** 0.5
+    assert abs(np.mean(means) - 1.0) < 3.0 * error < 0.3
 
 
 def test_levels_are_the_scenarios() -> None:

@@ -9,8 +9,8 @@ import pytest
 
 from sideslip.agents import make_agent
 from sideslip.agents.design_model import optimal
-from sideslip.agents.lane_keeping import MOVED, LaneKeeping, lane_model
-from sideslip.agents.lqr import HASTE, SPEEDS
+from sideslip.agents.lane_keeping import HASTE, MOVED, LaneKeeping, lane_model
+from sideslip.agents.schedule import SPEEDS
 from sideslip.envs import COMS
 from sideslip.estimators import EstimateObservation
 

@@ -16,7 +16,7 @@ from sideslip.agents.design_model import (
     design_model,
     regulator,
 )
-from sideslip.agents.lqr import SPEEDS
+from sideslip.agents.schedule import SPEEDS
 from sideslip.envs import COMS, PASSENGER_CAR
 from sideslip.envs.reference import MODEL, ZERO_SLIP, reference, target_of
 from sideslip.estimators import EstimateObservation
@@ -90,13 +90,13 @@ def test_gains_are_python_controls_for_all_states_at_once(
     G[held, held] *= 1.0 - 1e-8
     wanted, _, _ = control.dlqr(G, model.H, model.Q, model.R, model.N)
     scale = np.abs(wanted).max()
-    assert regulator(model) / scale == pytest.approx(np.asarray(wanted) / scale, abs=1e-6)
+    assert regulator(model)[0] / scale == pytest.approx(np.asarray(wanted) / scale, abs=1e-6)
 
 
 def test_tabled_gains_are_the_designed_ones(steered: Any) -> None:
     agent = agent_of(steered)
     for speed in (SPEEDS[3], SPEEDS[20]):
-        wanted = regulator(design_model(COMS, speed, agent.purpose))
+        wanted = regulator(design_model(COMS, speed, agent.purpose))[0]
         assert agent.gains(speed) == pytest.approx(wanted, rel=1e-12)
     assert (agent.gains(0.1) == agent.gains(SPEEDS[0])).all()
     assert (agent.gains(99.0) == agent.gains(SPEEDS[-1])).all()
@@ -107,7 +107,7 @@ def test_tabled_gains_are_the_designed_ones(steered: Any) -> None:
 def test_the_closed_loop_is_stable_over_the_speeds(car: Any, steers: bool) -> None:
     """At the tabled speeds and between; the COMS alone is unstable above 17.6 m/s."""
     purpose = Purpose(10, car.yaw_moment_limit, steers, MODEL)
-    gains = [regulator(design_model(car, speed, purpose)) for speed in SPEEDS[::4]]
+    gains = [regulator(design_model(car, speed, purpose))[0] for speed in SPEEDS[::4]]
     for i, (low, high) in enumerate(zip(SPEEDS[::4], SPEEDS[4::4], strict=False)):
         for share in (0.0, 0.5):
             K = (1.0 - share) * gains[i] + share * gains[i + 1]
@@ -118,7 +118,7 @@ def test_the_closed_loop_is_stable_over_the_speeds(car: Any, steers: bool) -> No
 def test_it_follows_the_references_where_they_can_be_had(steered: Any) -> None:
     """With both inputs free of limits, beta and gamma reach the model's steady state."""
     model = design_model(COMS, 7.0, agent_of(steered).purpose)
-    K, d = regulator(model), len(DYNAMIC)
+    K, d = regulator(model)[0], len(DYNAMIC)
     refs = reference(0.01, 7.0, target_of(COMS), MODEL)
     held = np.array([0.01, *refs])
     closed = model.G - model.H @ K

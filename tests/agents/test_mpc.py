@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from sideslip.agents import make_agent
-from sideslip.agents.lqr import SPEEDS, Lqr
+from sideslip.agents.lqr import Lqr
 from sideslip.agents.mpc import NOT_FINITE, Mpc
+from sideslip.agents.schedule import SPEEDS
 from sideslip.envs import COMS
 from sideslip.estimators import EstimateObservation
 from tests.envs.helpers import bits
@@ -47,7 +48,7 @@ def test_without_a_limit_it_is_the_lqr(steers: bool, told: dict[str, float], hor
     """Bellman: any horizon, when the rest costs what the regulator's rest costs."""
     env = env_of(steers)
     agent = agent_of(env, horizon=horizon)
-    lqr: Any = Lqr(env, haste=0.0)
+    lqr = Lqr(env)
     obs = observed(env, **told)
     program = agent.program(V)
     K = lqr.gains(V) / np.array([1.0, COMS.steering_authority])[: agent.width, None]
