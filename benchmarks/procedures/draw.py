@@ -24,12 +24,15 @@ def add(suite: Suite, done: Done) -> None:
             (
                 f"FMVSS 126, {car}: yaw rate at 5 A over its own peak",
                 yaw_rates(of(mine, "fmvss-126")),
-                "Bars: at most 35 % and 20 % of the peak after the steer reversal may be left.",
+                "Bars: at most 35 % and 20 % of the peak after the steer reversal may be left. A "
+                "car that spins before completion of steer is left out.",
             )
         )
         for name in iso3888.TRACKS:
-            text = "Each controller's fastest clean run, or the slowest run where none is clean."
-            suite.figures.append((f"{name}, {car}: way and cones", cones(of(mine, name)), text))
+            runs = {case: _best(found) for case, found in of(mine, name).items()}
+            speeds = ", ".join(f"{_label(k)} {3.6 * run.speed:.0f} km/h" for k, run in runs.items())
+            text = f"The fastest clean run, or the slowest where none is clean: {speeds}."
+            suite.figures.append((f"{name}, {car}: way and cones", cones(runs), text))
         for found in of(mine, "iso-7401").values():
             text = "Dots: measured by a swept sine, no control. Line: the linear model."
             title = f"ISO 7401, {car}: frequency response to steering"
@@ -39,7 +42,8 @@ def add(suite: Suite, done: Done) -> None:
 def yaw_rates(done: dict[Case, Sine]) -> Any:
     """Yaw rate at 5 A as a share of its peak after the reversal, with the two limits."""
     t = max((found.shown.t for found in done.values()), key=len)
-    series = {_label(case): _shares(found, t) for case, found in done.items()}
+    whole = {k: found for k, found in done.items() if found.shown.t[-1] >= fmvss126.COMPLETION}
+    series = {_label(case): _shares(found, t) for case, found in whole.items()}
     figure = time_series("", t, series, "yaw rate / its peak after the reversal")
     for time, most in fmvss126.RATIOS:
         at = fmvss126.COMPLETION + time
@@ -58,16 +62,20 @@ def _shares(found: Sine, t: Array) -> Array:
     return np.interp(t, shown.t, -shown.gamma / peak, right=np.nan)
 
 
-def cones(done: dict[Case, list[iso3888.Pass]]) -> Any:
+def _best(runs: list[iso3888.Pass]) -> iso3888.Pass:
+    """The fastest clean run, or the first of all."""
+    return max((run for run in runs if run.passed), key=lambda run: run.speed, default=runs[0])
+
+
+def cones(done: dict[Case, iso3888.Pass]) -> Any:
     """The ways of the centre of gravity, from where the first lane begins, and the cones."""
     ways: dict[str, tuple[Array, Array]] = {}
     lanes: tuple[Section, ...] = ()
     speed = 0.0
-    for case, runs in done.items():
-        best = max((run for run in runs if run.passed), key=lambda run: run.speed, default=runs[0])
-        start = best.speed * iso3888.ONSET
-        ways[f"{_label(case)}, {3.6 * best.speed:.0f} km/h"] = best.series.X - start, best.series.Y
-        lanes, speed = iso3888.lanes_of(CARS[case.car], case.procedure, best.speed), best.speed
+    for case, run in done.items():
+        speed = run.speed
+        ways[_label(case)] = run.series.X - speed * iso3888.ONSET, run.series.Y
+        lanes = iso3888.lanes_of(CARS[case.car], case.procedure, speed)
     figure = track(ways)
     places = [
         (x - speed * iso3888.ONSET, lane.offset + side * 0.5 * lane.width)
@@ -85,8 +93,7 @@ def cones(done: dict[Case, list[iso3888.Pass]]) -> Any:
 
 def bode(found: Transient) -> Any:
     """Magnitude and phase of both outputs over the frequency."""
-    titles = ("yaw rate / (1/s)", "lateral acceleration / (m/s2/rad)")
-    figure = make_subplots(rows=2, cols=2, shared_xaxes=True, subplot_titles=titles)
+    figure = make_subplots(rows=2, cols=2, shared_xaxes=True, vertical_spacing=0.06)
     for column, name in enumerate(iso7401.OUTPUTS, 1):
         measured, linear = found.sweep[name], found.linear_sweep[name]
         for H, mode, who in ((measured.H, "markers", "measured"), (linear, "lines", "linear")):
@@ -102,10 +109,12 @@ def bode(found: Transient) -> Any:
                     line={"color": GREY},
                 )
                 figure.add_trace(trace, row=row, col=column)
-    figure.update_xaxes(title_text="frequency / Hz", row=2)
-    figure.update_yaxes(title_text="gain", row=1, col=1)
-    figure.update_yaxes(title_text="phase / deg", row=2, col=1)
-    figure.update_layout(height=520)
+    figure.update_xaxes(title_text="frequency / Hz", row=2, automargin=True)
+    for column, unit in enumerate(("yaw rate / (1/s)", "a_y / (m/s2/rad)"), 1):
+        figure.update_yaxes(title_text=unit, row=1, col=column, automargin=True)
+        figure.update_yaxes(title_text="phase / deg", row=2, col=column, automargin=True)
+    legend = {"orientation": "h", "x": 0, "xanchor": "left", "y": 1.02, "yanchor": "bottom"}
+    figure.update_layout(height=520, legend=legend)
     return figure
 
 
