@@ -4,7 +4,6 @@ A plan is solved for the whole episode and scored by what its actions cost in th
 its own objective. On the nonlinear plant it is a local optimum, solved from several starts.
 """
 
-import logging
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,8 +13,10 @@ import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 
-from ..envs.vehicle import GRAVITY
+from ..envs.layout import P
 from ..envs.reference import reference
+from ..envs.vehicle import GRAVITY
+from .clairvoyant_linear import is_linear, solve_linear
 from .clairvoyant_nonlinear import Solution, Trajectory, solve, tracking_gains
 from .controller import Controller
 from .foreseen import Foreseen, Known, State, foresee, state_of
@@ -23,10 +24,9 @@ from .foreseen import Foreseen, Known, State, foresee, state_of
 Array = npt.NDArray[np.float64]
 Actions = npt.NDArray[np.float32]
 
-GRIPS = (3.0, 1.7, 1.3, 1.1, 1.0)  # times the true friction, on the way to a hard episode's plan
+GRIPS = (3.0, 1.5, 1.0)  # times the true friction, on the way to a hard episode's plan
 REFINEMENTS = 3  # plans from the newest run, while they still gain
 GAIN = 1e-3  # of the cost, below which another refinement is not worth its seconds
-_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -88,25 +88,41 @@ def plan(env: gym.Env[Any, Any], seed: int, start: npt.ArrayLike | None = None) 
     """
     began = time.process_time()
     env.reset(seed=seed)
-    foreseen = foresee(env.unwrapped)
+    base: Any = env.unwrapped
+    linear = is_linear(base)
+    foreseen = foresee(base, base.control_period if linear else 1)
     shape = (foreseen.fixed.periods, foreseen.fixed.width)
     actions = np.zeros(shape) if start is None else np.asarray(start, np.float64)
     if actions.shape != shape:
         raise ValueError(f"a plan of this episode has shape {shape}, got {actions.shape}")
+    if linear:
+        made, objective, status = solve_linear(foreseen)
+        best = drive(env, seed, made)
+    else:
+        best, objective, status = _search(env, seed, foreseen, actions, start is None)
+    taken = best.trajectory.actions.astype(np.float32)
+    return Plan(taken, best.cost, objective, status, time.process_time() - began)
+
+
+def _search(
+    env: gym.Env[Any, Any], seed: int, foreseen: Foreseen, actions: Array, free: bool
+) -> tuple[Run, float, str]:
+    """The best run of the plans from a start, with the objective and status of its plan.
+
+    free: whether the plan may start elsewhere where IPOPT does not finish from the actions' run.
+    """
     found = solve(foreseen, drive(env, seed, actions).trajectory)
-    if not found.solved and start is None:
+    if free and not found.solved:
         found = _from_grip(foreseen)
     best, objective, status = _follow(env, seed, foreseen, found), found.objective, found.status
     for _ in range(REFINEMENTS):
-        found = solve(foreseen, best.trajectory)
+        before, found = best.cost, solve(foreseen, best.trajectory)
         run = _follow(env, seed, foreseen, found)
-        better = run.cost < best.cost * (1.0 - GAIN)
         if run.cost < best.cost:
             best, objective, status = run, found.objective, found.status
-        if not better:
+        if best.cost > before * (1.0 - GAIN):
             break
-    taken = best.trajectory.actions.astype(np.float32)
-    return Plan(taken, best.cost, objective, status, time.process_time() - began)
+    return best, objective, status
 
 
 def _follow(env: gym.Env[Any, Any], seed: int, foreseen: Foreseen, found: Solution) -> Run:
@@ -135,3 +151,85 @@ def _from_grip(foreseen: Foreseen) -> Solution:
         found = solve(foreseen, at, grip)
         at = found.trajectory
     return found
+
+
+@dataclass(frozen=True)
+class Ceiling:
+    """The best run found of an episode.
+
+    winner: a label of costs. costs: of every start's own run ("two-dof") and of the plan from it
+    ("from two-dof"). statuses: of the plans.
+    """
+
+    actions: Actions
+    cost: float
+    winner: str
+    costs: dict[str, float]
+    statuses: dict[str, str]
+    seconds: float
+
+
+def ceiling(
+    env: gym.Env[Any, Any], seed: int, starts: Mapping[str, npt.ArrayLike] | None = None
+) -> Ceiling:
+    """The best of the plans from zero and from other methods' runs, and of those runs themselves.
+
+    starts: actions (K, width) by method. A method that no plan beats is the ceiling.
+    """
+    began = time.process_time()
+    first = plan(env, seed)
+    tried: dict[str, Actions] = {"none": np.zeros_like(first.actions)}
+    tried |= {name: np.asarray(actions, np.float32) for name, actions in (starts or {}).items()}
+    costs = {name: replay(env, seed, actions) for name, actions in tried.items()}
+    plans = {"none": first}
+    plans |= {name: plan(env, seed, tried[name]) for name in starts or {}}
+    for name, made in plans.items():
+        tried[f"from {name}"], costs[f"from {name}"] = made.actions, made.cost
+    winner = min(costs, key=lambda label: costs[label])
+    return Ceiling(
+        tried[winner],
+        costs[winner],
+        winner,
+        costs,
+        {name: made.status for name, made in plans.items()},
+        time.process_time() - began,
+    )
+
+
+def actions_of(env: gym.Env[Any, Any], agent: Any, seed: int) -> Actions:
+    """(K, width): what an agent does in an episode; zeros after a failure."""
+    base: Any = env.unwrapped
+    obs, _ = env.reset(seed=seed)
+    periods = -int(-base.get_state()["params"][P.task] // base.control_period)
+    taken = np.zeros((periods, *base.action_space.shape), np.float32)
+    state, first = None, np.ones(1, bool)
+    for k in range(periods):
+        taken[k], state = agent.predict(obs, state, first, deterministic=True)
+        obs, _, terminated, truncated, _ = env.step(taken[k])
+        first = np.zeros(1, bool)
+        if terminated or truncated:
+            break
+    return taken
+
+
+class Replay(Controller):
+    """A plan as an agent: the actions of one episode, whatever is observed; zeros after them.
+
+    actions: (K, width) shares of full scale.
+    """
+
+    memory = 1
+
+    def __init__(self, env: gym.Env[Any, Any], actions: npt.ArrayLike) -> None:
+        super().__init__(env)
+        planned = np.asarray(actions, np.float64)
+        if planned.ndim != 2 or planned.shape[1] != self.width or not np.isfinite(planned).all():
+            raise ValueError(
+                f"a plan is finite numbers (K, {self.width}), got shape {planned.shape}"
+            )
+        self._actions = np.vstack([planned, np.zeros((1, self.width))])
+
+    def _law(self, inputs: Array, state: Array, action: Array) -> None:
+        step = state[:, 0].astype(int)
+        action[:] = self._actions[np.minimum(step, len(self._actions) - 1)]
+        state[:, 0] += 1.0

@@ -18,15 +18,16 @@ from .foreseen_plant import advance, carried, node_cost, scales
 Array = npt.NDArray[np.float64]
 
 TOLERANCE = 1e-6
-MOST_ITERATIONS = 60
+MOST_ITERATIONS = 30
 SOLVED = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
-_OPTIONS = {
+_OPTIONS: dict[str, Any] = {
     "print_time": False,
     "error_on_fail": False,
     "ipopt.print_level": 0,
     "ipopt.sb": "yes",
     "ipopt.tol": TOLERANCE,
     "ipopt.max_iter": MOST_ITERATIONS,
+    "ipopt.mu_strategy": "adaptive",
     # where tyres and motors saturate the text has kinks, at which dual variables do not settle:
     # a feasible plan whose cost stands still will do
     "ipopt.acceptable_tol": 1e10,
@@ -104,7 +105,7 @@ def problem_of(fixed: Fixed) -> Problem:
     rest = [ca.vec(ahead - W[:size, 1:])]
     if fixed.width > 1:
         rest.append(ca.vec(moved))
-    nlp = {
+    nlp: dict[str, Any] = {
         "x": ca.vec(W),
         "p": ca.vec(C),
         "f": ca.sum2(node.map(K + 1)(W, C)) + ca.sum2(effort),
@@ -118,7 +119,8 @@ def problem_of(fixed: Fixed) -> Problem:
 def solve(foreseen: Foreseen, start: Trajectory, grip: float = 1.0) -> Solution:
     """The plan that IPOPT finds from a trajectory, which need not obey the plant.
 
-    grip: factor on the friction of road and tyres.
+    grip: factor on the friction of road and tyres. Where IPOPT ends with numbers that are not
+    finite the solution is the start, with IPOPT's return text.
     """
     fixed = foreseen.fixed
     problem = problem_of(fixed)
@@ -138,16 +140,16 @@ def solve(foreseen: Foreseen, start: Trajectory, grip: float = 1.0) -> Solution:
         x0=_flat(guess), p=_flat(known), lbx=_flat(low), ubx=_flat(high),
         lbg=-limits, ubg=limits,
     )  # fmt: skip
-    best = np.array(found["x"]).reshape(guess.shape, order="F")
+    stats = problem.solver.stats()
+    status, iterations = str(stats["return_status"]), int(stats["iter_count"])
+    objective = float(found["f"])
+    if not np.isfinite(objective):
+        return Solution(start, objective, status, iterations)
+    best = found["x"].full().reshape(guess.shape, order="F")
     states = start.states.copy()
     states[:, at] = best[:size].T * problem.scale
-    stats = problem.solver.stats()
-    return Solution(
-        Trajectory(states, np.clip(best[size:, :K].T, -1.0, 1.0)),
-        float(found["f"]),
-        str(stats["return_status"]),
-        int(stats["iter_count"]),
-    )
+    actions = np.clip(best[size:, :K].T, -1.0, 1.0)
+    return Solution(Trajectory(states, actions), objective, status, iterations)
 
 
 def tracking_gains(foreseen: Foreseen, plan: Trajectory) -> Array:
@@ -158,11 +160,12 @@ def tracking_gains(foreseen: Foreseen, plan: Trajectory) -> Array:
     """
     problem = problem_of(foreseen.fixed)
     size, K, at = len(problem.names), foreseen.fixed.periods, problem.at
-    slopes = np.array(problem.slopes(_packed(problem, plan)[:, :K], foreseen.known[:, :K]))
+    slopes = problem.slopes(_packed(problem, plan)[:, :K], foreseen.known[:, :K]).full()
     slopes = slopes.reshape(size, K, -1).transpose(1, 0, 2)
     v = max(float(plan.states[0, 0]), SLOW)
     weight = {"v_y": 1.0 / (BETA_SCALE * v), "gamma": 1.0 / GAMMA_SCALE}
-    Q = np.diag([(weight.get(n, 0.0) * c) ** 2 for n, c in zip(problem.names, problem.scale)])
+    wanted = np.array([weight.get(name, 0.0) for name in problem.names])
+    Q = np.diag((wanted * problem.scale) ** 2)
     R = np.eye(foreseen.fixed.width)
     P, gains = Q, np.zeros((K, len(R), len(State._fields)))
     for k in reversed(range(K)):

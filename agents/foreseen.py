@@ -113,6 +113,10 @@ def foresee(base: Any, steps: int = 1) -> Foreseen:
     n = base.control_period
     if steps < 1 or n % steps:
         raise ValueError(f"{steps} steps do not divide a control period of {n} ticks")
+    if base.scenario.steering == "driver":
+        raise ValueError(
+            f"scenario {base.scenario.name!r}: a driver who reacts to the car cannot be foreseen"
+        )
     snapshot = base.get_state()
     p, z = snapshot["params"], snapshot["state"]
     if z[Z.clock + 2] != 0.0:
@@ -132,7 +136,7 @@ def state_of(z: Array) -> State:
     """The State in a packed state vector of the env."""
     motion = z[Z.motion : Z.motion + len(Motion._fields)].tolist()
     drive = Drive(*z[Z.drive : Z.drive + len(Drive._fields)].tolist())
-    return State(*motion, drive.T_l, drive.T_r, drive.integral, drive.slewing, drive.added)
+    return State._make((*motion, drive.T_l, drive.T_r, drive.integral, drive.slewing, drive.added))
 
 
 def _part(kind: Any, p: Array, at: int) -> Any:
@@ -141,9 +145,7 @@ def _part(kind: Any, p: Array, at: int) -> Any:
 
 def _fixed(base: Any, p: Array, switches: Any, ticks: int, steps: int) -> Fixed:
     vehicle, lags = base.vehicle, base.scenario.lags
-    motor, steering = (
-        (vehicle.motor_lag, vehicle.steering_lag) if lags else (0.0, 0.0)
-    )
+    motor, steering = (vehicle.motor_lag, vehicle.steering_lag) if lags else (0.0, 0.0)
     task = _part(Task, p, P.task)
     return Fixed(
         _part(Car, p, P.car)._replace(C_f=0.0, C_r=0.0, mu=0.0),
@@ -203,7 +205,7 @@ def _known(p: Array, fixed: Fixed, drive: Array, command: Array) -> Array:
     push = (forces + blown).reshape(-1, q, 3).mean(axis=1)
     pace = np.array([_wish(float(tick), _part(Pace, p, P.pace)) for tick in at])
     car = _part(Car, p, P.car)
-    table = Known(
+    table = (
         wheels(at, lag.start),
         wheels(middle, lag.middle if q % 2 else lag.start),
         wheels(at + q - 1, lag.end),
@@ -213,10 +215,12 @@ def _known(p: Array, fixed: Fixed, drive: Array, command: Array) -> Array:
         *pace.T,
         _weights(at, fixed),
     )
-    known = np.array(table)
+    known = np.array(Known._make(table))
     end = known[:, -1:].copy()  # of the episode's end only command and weight are looked at
     end[Known._fields.index("command")] = command[last]
-    end[Known._fields.index("weight")] = 0.5 * (q + 1) * TICK if last == fixed.task.duration else 0.0
+    end[Known._fields.index("weight")] = (
+        0.5 * (q + 1) * TICK if last == fixed.task.duration else 0.0
+    )
     return np.hstack([known, end])
 
 
@@ -228,7 +232,7 @@ def _wish(tick: float, pace: Pace) -> tuple[float, float]:
     return both - ahead, ahead
 
 
-def _weights(at: Array, fixed: Fixed) -> Array:
+def _weights(at: npt.NDArray[np.int_], fixed: Fixed) -> Array:
     """Seconds for which the cost rate at each step's start stands in the sum over ticks 1 .. T.
 
     The sum over every q-th tick by the trapezoid rule, its end kept apart; exact for q = 1.

@@ -5,18 +5,22 @@ from typing import Any, NamedTuple
 import casadi as ca
 
 from ..envs.actuators import distribute, lagged, yaw_moment
+from ..envs.backend import plain
 from ..envs.dynamics import Motion, Push, rk4, sideslip_angle
 from ..envs.programme import acceleration_command
 from ..envs.record import TICK
 from ..envs.reference import cost_rate, reference
 from ..envs.tyres import Inputs, load_of
 from .foreseen import Fixed, Known, State
-from .symbolic import SYMBOLS, plain, symbolic
+from .symbolic import SYMBOLS, symbolic
 
 _rk4, _load_of, _distribute = symbolic(rk4), symbolic(load_of), symbolic(distribute)
 _acceleration, _reference = symbolic(acceleration_command), symbolic(reference)
 _slip, _lagged, _yaw_moment = symbolic(sideslip_angle), symbolic(lagged), symbolic(yaw_moment)
-_uncapped = plain(cost_rate, SYMBOLS | {"minimum": lambda rate, cap: rate})
+# a sum of squares: without its cap and, for the sake of its slope at zero, its sign's guard
+_uncapped = plain(
+    cost_rate, SYMBOLS | {"minimum": lambda rate, cap: rate, "absolute": lambda rate: rate}
+)
 
 TORQUES = ("T_l", "T_r")
 
@@ -101,13 +105,15 @@ def advance(fixed: Fixed, x: State, action: Any, known: Known) -> Step:
         share = _yaw_moment(_lagged(to_l, x.T_l, rest), _lagged(to_r, x.T_r, rest), car)
         added = _lagged(extra, x.added, right.mean * right.end**tick)
         effort += TICK * _uncapped(0.0, 0.0, share / task.yaw_scale, added, switches.reference)
-    after = State(
-        *motion,
-        _lagged(to_l, x.T_l, motor.end),
-        _lagged(to_r, x.T_r, motor.end),
-        x.integral + q * (grown - x.integral),
-        slewing,
-        _lagged(extra, x.added, steering.end),
+    after = State._make(
+        (
+            *motion,
+            _lagged(to_l, x.T_l, motor.end),
+            _lagged(to_r, x.T_r, motor.end),
+            x.integral + q * (grown - x.integral),
+            slewing,
+            _lagged(extra, x.added, steering.end),
+        )
     )
     return Step(after, effort, moved)
 

@@ -55,6 +55,9 @@ def _replace(function: Any, done: set[int]) -> None:
         callee = names.get(name)
         if name in _ELEMENTARY:
             names[name] = _ELEMENTARY[name]
-        elif isinstance(callee, types.FunctionType) and id(callee) not in done:
-            if callee.__module__.startswith(_OURS):
-                _replace(callee, done)
+        elif (
+            isinstance(callee, types.FunctionType)
+            and callee.__module__.startswith(_OURS)
+            and id(callee) not in done
+        ):
+            _replace(callee, done)
