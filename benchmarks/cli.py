@@ -1,4 +1,4 @@
-"""The command line: list, run, bench, replay, tune."""
+"""The command line: list, run, bench, replay, tune, calibrate."""
 
 import platform
 import shlex
@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from .. import __version__
+from .calibrate_command import calibrate_command
 from .rows import Row, Suite, check_writable, write_json, write_parquet, write_whole
 from .screen import print_suite
 from .suites import SUITES, Wish
@@ -25,6 +26,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 app.add_typer(tune_app, name="tune")
+app.command("calibrate")(calibrate_command)
 console = Console()
 
 Quick = Annotated[bool, typer.Option("--quick", help="Few seeds: a first look in seconds.")]
