@@ -1,0 +1,184 @@
+"""The clairvoyant knows the plant exactly, and no other run of an episode is better."""
+
+import dataclasses
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+
+import sideslip
+from sideslip.envs.actuators import distribute
+from sideslip.envs.layout import P, Z
+from sideslip.envs.programme import Wind, wind_at
+from sideslip.estimators import EstimateObservation
+
+ca = pytest.importorskip("casadi")
+pytest.importorskip("osqp")
+from sideslip.agents import clairvoyant, clairvoyant_nonlinear, make_agent  # noqa: E402
+from sideslip.agents.clairvoyant import (  # noqa: E402
+    Replay,
+    actions_of,
+    ceiling,
+    drive,
+    plan,
+    replay,
+)
+from sideslip.agents.foreseen import Known, State, foresee  # noqa: E402
+from sideslip.agents.foreseen_plant import advance  # noqa: E402
+from sideslip.agents.rollout import rollout  # noqa: E402
+from sideslip.agents.symbolic import symbolic  # noqa: E402
+
+assert sideslip.__version__
+ID = "sideslip/YawFusion-v0"
+
+
+def make(
+    name: str, duration: float = 2.0, period: int = 10, **changes: Any
+) -> gymnasium.Env[Any, Any]:
+    """The fusion env on a shorter, changed scenario."""
+    scenario = {"base": name, "duration": duration} | changes
+    return gymnasium.make(ID, scenario=scenario, control_period=period)
+
+
+@pytest.mark.parametrize("lags", [False, True])
+@pytest.mark.parametrize("small_angle", [False, True])
+@pytest.mark.parametrize("scenario", ["lane-change", "gust"])
+def test_a_symbolic_tick_is_the_envs(scenario: str, small_angle: bool, lags: bool) -> None:
+    """From each state of a hard run in the env, one step of the plan's plant is the env's tick."""
+    changes: dict[str, Any] = {
+        "small_angle": small_angle,
+        "lags": lags,
+        "onset": 0.0,
+        "wind_start": 0.05,
+    }
+    env = make(scenario, 0.2, 1, **changes)
+    env.reset(seed=2)
+    foreseen = foresee(env.unwrapped)
+    w = ca.SX.sym("w", len(State._fields))
+    u, known = ca.SX.sym("u"), ca.SX.sym("known", len(Known._fields))
+    step = advance(foreseen.fixed, State(*ca.vertsplit(w)), [u], Known(*ca.vertsplit(known)))
+    tick = ca.Function("tick", [w, u, known], [ca.vertcat(*step.state)])
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (200, 1))
+    run = drive(env, 2, actions).trajectory
+    for k in range(200):
+        after = tick(run.states[k], run.actions[k], foreseen.known[:, k]).full()[:, 0]
+        np.testing.assert_allclose(after, run.states[k + 1], rtol=1e-9, atol=1e-9)
+
+
+def test_what_is_foreseen_is_what_the_car_meets() -> None:
+    """The disturbances of a run with other actions are those that were listed."""
+    env = make("gust", 0.5, 1)
+    env.reset(seed=5)
+    foreseen = foresee(env.unwrapped)
+    state: Any = env.unwrapped
+    snapshot = state.get_state()
+    wind = Wind(*snapshot["params"][P.wind : P.wind + len(Wind._fields)])
+    for k in range(500):
+        z = state.get_state()["state"]
+        force = z[Z.drive + 4] + wind_at(float(k), wind)[0]
+        assert foreseen.known[Known._fields.index("F_d"), k] == force
+        env.step(np.array([0.7], np.float32))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("scenario", ["random-steering", "lane-change", "gust"])
+def test_no_run_is_better(scenario: str) -> None:
+    """Neither the uncontrolled car, nor a controller, nor the plan a little changed.
+
+    The plan's steps are ten times the env's, hence the thousandth.
+    """
+    env = make(scenario, 3.0)
+    sensed = EstimateObservation(env, "exact-kf")
+    agent = make_agent("two-dof", sensed)
+    rng = np.random.default_rng(1)
+    for seed in range(2):
+        best = ceiling(env, seed, {"two-dof": actions_of(sensed, agent, seed)})
+        assert best.winner.startswith("from ")
+        assert best.cost == replay(env, seed, best.actions)
+        assert best.cost <= min(best.costs["none"], best.costs["two-dof"])
+        for size in (0.01, 0.05):
+            for _ in range(4):
+                held = np.repeat(rng.normal(0.0, size, (30, 1)), 10, axis=0)
+                other = np.clip(best.actions + held, -1.0, 1.0)
+                assert replay(env, seed, other) > (1.0 - 1e-3) * best.cost
+
+
+@pytest.mark.long
+def test_a_sliding_car_is_kept_on_its_plan() -> None:
+    """Where the plan alone would be lost, the regulated run costs what the plan expects."""
+    env = make("lane-change", 6.0)
+    found = plan(env, 2)
+    none = replay(env, 2, np.zeros_like(found.actions))
+    assert found.cost < 0.3 * none
+    assert found.cost == replay(env, 2, found.actions)
+    assert found.cost < 1.05 * found.objective  # which knows no cap
+
+
+@pytest.mark.long
+def test_steering_too() -> None:
+    """Two actions do better than one, and the planned steering keeps its rate limit."""
+    alone = plan(make("lane-change"), 0)
+    env = gymnasium.make(
+        "sideslip/AfsYawFusion-v0", scenario={"base": "lane-change", "duration": 2.0}
+    )
+    both = plan(env, 0)
+    assert both.actions.shape == (200, 2)
+    assert both.cost < 0.5 * alone.cost
+    most = 0.8 * 0.01 / 0.1  # rad/s times the period over the authority
+    assert np.abs(np.diff(both.actions[:, 1])).max() < most * (1.0 + 1e-4)
+
+
+def test_a_plan_is_an_agent() -> None:
+    env = make("sine", 0.5)
+    actions = np.random.default_rng(3).uniform(-1.0, 1.0, (50, 1)).astype(np.float32)
+    agent = Replay(env, actions)
+    assert rollout(env, agent, 4).cost == pytest.approx(replay(env, 4, actions), rel=1e-12)
+    np.testing.assert_array_equal(actions_of(env, agent, 4), actions)
+    obs = np.zeros((3, len(env.get_wrapper_attr("layout"))), np.float32)
+    taken, state = agent.predict(obs, np.array([[0.0], [7.0], [50.0]]))
+    np.testing.assert_array_equal(taken[:, 0], [actions[0, 0], actions[7, 0], 0.0])
+    np.testing.assert_array_equal(state[:, 0], [1.0, 8.0, 51.0])
+
+
+def test_an_unfinished_plan_says_so_and_the_better_run_stands(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(clairvoyant_nonlinear._OPTIONS, "ipopt.max_iter", 1)
+    monkeypatch.setattr(clairvoyant, "REFINEMENTS", 0)
+    clairvoyant_nonlinear.problem_of.cache_clear()
+    env = make("sine", 1.0)
+    good = np.zeros((100, 1))
+    found = ceiling(env, 0, {"other": good})
+    clairvoyant_nonlinear.problem_of.cache_clear()
+    assert set(found.statuses.values()) == {"Maximum_Iterations_Exceeded"}
+    assert found.cost == min(found.costs.values()) == found.costs[found.winner]
+
+
+def test_a_failed_solve_gives_back_its_start() -> None:
+    env = make("sine", 0.2)
+    env.reset(seed=0)
+    foreseen = foresee(env.unwrapped)
+    start = drive(env, 0, np.full((20, 1), 0.25)).trajectory
+    lost = dataclasses.replace(foreseen, known=np.full_like(foreseen.known, np.nan))
+    found = clairvoyant_nonlinear.solve(lost, start)
+    assert not found.solved and found.status == "Invalid_Number_Detected"
+    np.testing.assert_array_equal(found.trajectory.actions, start.actions)
+
+
+def test_bad_input() -> None:
+    env = make("sine", 0.2)
+    with pytest.raises(ValueError, match=r"shape \(20, 1\), got \(3, 1\)"):
+        plan(env, 0, np.zeros((3, 1)))
+    with pytest.raises(ValueError, match="3 steps do not divide a control period of 10 ticks"):
+        foresee(env.unwrapped, 3)
+    env.step(np.zeros(1, np.float32))
+    with pytest.raises(ValueError, match="call reset"):
+        foresee(env.unwrapped)
+    for wrong in (np.zeros(5), np.zeros((5, 2)), np.full((5, 1), np.nan)):
+        with pytest.raises(ValueError, match="a plan is finite numbers"):
+            Replay(env, wrong)
+    joined = symbolic(wind_at)
+    with pytest.raises(TypeError, match="&"):
+        joined(ca.SX.sym("tick"), Wind(1.0, 0.0, 0.0, 1.0))
+    assert symbolic(distribute) is not distribute

@@ -1,0 +1,68 @@
+"""On the linear plant the plan is the optimum of the env's own cost."""
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+
+import sideslip
+
+pytest.importorskip("casadi")
+pytest.importorskip("osqp")
+from sideslip.agents.clairvoyant import plan, replay
+
+assert sideslip.__version__
+
+LINEAR: dict[str, Any] = {
+    "base": "random-steering",
+    "small_angle": True,
+    "linear_tyres": True,
+    "roll": False,
+    "speed": 25.0 / 3.6,
+    "onset": 0.0,
+}
+
+
+def make(reference: str = "zero-slip", **changes: Any) -> gymnasium.Env[Any, Any]:
+    return gymnasium.make("sideslip/YawVision-v0", scenario=LINEAR | changes, reference=reference)
+
+
+@pytest.mark.parametrize("lags", [False, True])
+def test_its_cost_in_the_env_is_the_objective(lags: bool) -> None:
+    """The programme has the env's own ticks; only the actions' float32 is between the two."""
+    env = make(lags=lags, duration=2.0)
+    found = plan(env, 3)
+    assert found.status == "solved"
+    assert found.cost == pytest.approx(found.objective, rel=1e-6)
+    assert found.cost == replay(env, 3, found.actions)
+    assert found.cost < 0.2 * replay(env, 3, np.zeros_like(found.actions))
+
+
+def test_the_plan_meets_the_conditions_of_optimality_of_the_envs_cost() -> None:
+    """J(u) = J_0 + g' u + u' H u / 2, probed by replays; a quarter of full scale is exact in
+    float32. At the plan the slope vanishes, or points out of the limits where one is reached."""
+    env = make(duration=0.1, lags=True, disturbance_moment=600.0, amplitude=(0.04, 0.04))
+    K, step = 10, 0.25
+    units = step * np.eye(K)[:, :, None]
+    none = replay(env, 1, np.zeros((K, 1)))
+    ahead = np.array([replay(env, 1, unit) for unit in units])
+    back = np.array([replay(env, 1, -unit) for unit in units])
+    g = (ahead - back) / (2.0 * step)
+    H = np.empty((K, K))
+    for i in range(K):
+        for j in range(K):
+            pair = replay(env, 1, units[i] + units[j])
+            H[i, j] = (pair - ahead[i] - ahead[j] + none) / step**2
+    found = plan(env, 1).actions[:, 0].astype(np.float64)
+    slope = (g + H @ found) / np.abs(g).max()
+    at_limit = np.abs(found) > 1.0 - 1e-6
+    assert at_limit.any() and not at_limit.all()  # both conditions are put to the test
+    assert np.abs(slope[~at_limit]).max() < 1e-5
+    assert np.all(slope[at_limit] * found[at_limit] < 0.0)
+
+
+def test_the_measured_speed_of_a_reference_is_all_that_the_plan_does_not_know() -> None:
+    silent = make("model", duration=2.0, noise={"wheel": 0.0})
+    found = plan(silent, 3)
+    assert found.cost == pytest.approx(found.objective, rel=1e-6)
