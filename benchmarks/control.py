@@ -6,8 +6,7 @@ from pathlib import Path
 from rich.console import Console
 
 from .. import __version__
-from .calibration import ceilings
-from .matrix.ceiling import refusals_of, tops_of
+from .matrix.ceiling import ceilings, refusals_of, tops_of
 from .matrix.contestants import EPISODES, STEERING, YAW, cells
 from .matrix.illustrate import illustrate
 from .matrix.price import DELAYS, SCENARIO, Price, price_of_delay

@@ -1,12 +1,22 @@
 """The ceiling of every manoeuvre: the clairvoyant's mean cost, unless a method beats it."""
 
 from ...envs import FAILURES
-from ..calibration import ceilings
+from ..calibrate import FILE, read_calibration
 from .results import FAILURE, Results
 from .scores import Ceiling
 
 _OF_THE_CAR = ("none", "spin", "off-road")
 _ERRORS = 3.0  # standard errors by which a method must win to become the ceiling
+
+
+def ceilings(env_id: str) -> dict[str, Ceiling]:
+    """The calibrated ceiling of each scenario of an id; none where the file is not there."""
+    entries = read_calibration() if FILE.is_file() else {}
+    return {
+        entry.scenario: Ceiling(entry.clairvoyant, entry.clairvoyant_error)
+        for entry in entries.values()
+        if entry.env_id == env_id
+    }
 
 
 def tops_of(results: Results, env_id: str) -> tuple[dict[str, Ceiling], list[str]]:
