@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..envs.layout import P
+from ..envs.programme import DRIVER
 from ..envs.reference import reference
 from ..envs.vehicle import GRAVITY
 from .clairvoyant_linear import is_linear, solve_linear
@@ -91,11 +92,14 @@ def plan(env: gym.Env[Any, Any], seed: int, start: npt.ArrayLike | None = None) 
     base: Any = env.unwrapped
     linear = is_linear(base)
     foreseen = foresee(base, base.control_period if linear else 1)
+    reacts = foreseen.fixed.switches.steering == DRIVER
     shape = (foreseen.fixed.periods, foreseen.fixed.width)
     actions = np.zeros(shape) if start is None else np.asarray(start, np.float64)
     if actions.shape != shape:
         raise ValueError(f"a plan of this episode has shape {shape}, got {actions.shape}")
-    if linear:
+    if reacts and start is not None:
+        foreseen = foresee(base, 1, actions)
+    if linear and not reacts:
         made, objective, status = solve_linear(foreseen)
         best = drive(env, seed, made)
     else:
@@ -116,6 +120,9 @@ def _search(
         found = _from_grip(foreseen)
     best, objective, status = _follow(env, seed, foreseen, found), found.objective, found.status
     for _ in range(REFINEMENTS):
+        if foreseen.fixed.switches.steering == DRIVER:  # who will answer to the newest run
+            env.reset(seed=seed)
+            foreseen = foresee(env.unwrapped, 1, best.trajectory.actions)
         before, found = best.cost, solve(foreseen, best.trajectory)
         run = _follow(env, seed, foreseen, found)
         if run.cost < best.cost:
@@ -142,7 +149,8 @@ def _from_grip(foreseen: Foreseen) -> Solution:
         for command, speed in zip(known.command, v, strict=True)
     ]
     beta, gamma = np.array(refs).T
-    share = np.minimum(1.0, 0.8 * known.mu * GRAVITY / np.maximum(v * np.abs(gamma), 1e-9))
+    mu = 0.5 * (known.mu + known.mu_r)
+    share = np.minimum(1.0, 0.8 * mu * GRAVITY / np.maximum(v * np.abs(gamma), 1e-9))
     states = np.tile(np.array(foreseen.start), (len(v), 1))
     states[:, State._fields.index("v_y")] = share * beta * v
     states[:, State._fields.index("gamma")] = share * gamma

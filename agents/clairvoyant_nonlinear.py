@@ -127,7 +127,7 @@ def solve(foreseen: Foreseen, start: Trajectory, grip: float = 1.0) -> Solution:
     size, K, at = len(problem.names), fixed.periods, problem.at
     guess = _packed(problem, start)
     known = foreseen.known.copy()
-    known[Known._fields.index("mu")] *= grip
+    known[[Known._fields.index(name) for name in ("mu", "mu_r")]] *= grip
     low, high = np.full_like(guess, -np.inf), np.full_like(guess, np.inf)
     low[:size, 0] = high[:size, 0] = np.array(foreseen.start)[at] / problem.scale
     low[size:], high[size:] = -1.0, 1.0

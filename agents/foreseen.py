@@ -10,16 +10,9 @@ from ..envs.actuators import Lag, lag_of, lagged
 from ..envs.backend import plain
 from ..envs.dynamics import Car, Motion, Road
 from ..envs.kernel import step_vehicle
-from ..envs.layout import Drive, P, Task, Z
-from ..envs.programme import (
-    FOREVER,
-    STEERING_WIDTH,
-    Pace,
-    Wind,
-    acceleration_command,
-    steering_at,
-    wind_at,
-)
+from ..envs.layout import Change, Drive, P, Task, Z
+from ..envs.pace import Pace, acceleration_command
+from ..envs.programme import DRIVER, FOREVER, STEERING_WIDTH, Wind, steering_at, wind_at
 from ..envs.record import TICK
 from ..envs.reference import Target
 from ..envs.switches import REPORT, Switches
@@ -40,6 +33,7 @@ class Known(NamedTuple):
     C_f: Any  # N/rad
     C_r: Any
     mu: Any
+    mu_r: Any
     speed: Any  # m/s, the driver's wish
     ahead: Any  # m/s2, the driver's acceleration, fed forward
     weight: Any  # s for which the cost rate at the start counts
@@ -104,19 +98,17 @@ class Foreseen:
     driver: Array
 
 
-def foresee(base: Any, steps: int = 1) -> Foreseen:
+def foresee(base: Any, steps: int = 1, actions: Array | None = None) -> Foreseen:
     """The rest of an episode that was just reset.
 
     base: the unwrapped env at tick 0. steps: of the plan in one control period, which they divide.
-    Raises ValueError where they do not, and for an env that is not at the start of an episode.
+    actions: (K, width), none: zero; a driver who reacts to the car is foreseen to steer as in the
+    run of these actions. Raises ValueError where steps do not divide it, and for an env that is not
+    at the start of an episode.
     """
     n = base.control_period
     if steps < 1 or n % steps:
         raise ValueError(f"{steps} steps do not divide a control period of {n} ticks")
-    if base.scenario.steering == "driver":
-        raise ValueError(
-            f"scenario {base.scenario.name!r}: a driver who reacts to the car cannot be foreseen"
-        )
     snapshot = base.get_state()
     p, z = snapshot["params"], snapshot["state"]
     if z[Z.clock + 2] != 0.0:
@@ -124,10 +116,13 @@ def foresee(base: Any, steps: int = 1) -> Foreseen:
     start = state_of(z)
     fixed = _fixed(base, p, snapshot["template"].switches, n // steps, steps)
     ticks = fixed.periods * n
-    drive = _drive_alone(base, snapshot, ticks)
-    every = np.arange(ticks + 1)
+    if actions is None:
+        actions = np.zeros((fixed.periods, fixed.width))
+    drive, driver = _driven(base, snapshot, actions, n)
     programme = tuple(p[P.steering : P.steering + STEERING_WIDTH].tolist())
-    command = np.array([steering_at(float(tick), programme) for tick in every])
+    reacts = fixed.switches.steering == DRIVER
+    every = range(ticks + 1)
+    command = driver if reacts else np.array([steering_at(float(k), programme) for k in every])
     known = _known(p, fixed, drive, command)
     return Foreseen(fixed, known, start, command[:-1].reshape(-1, n))
 
@@ -148,7 +143,7 @@ def _fixed(base: Any, p: Array, switches: Any, ticks: int, steps: int) -> Fixed:
     motor, steering = (vehicle.motor_lag, vehicle.steering_lag) if lags else (0.0, 0.0)
     task = _part(Task, p, P.task)
     return Fixed(
-        _part(Car, p, P.car)._replace(C_f=0.0, C_r=0.0, mu=0.0),
+        _part(Car, p, P.car)._replace(C_f=0.0, C_r=0.0, mu=0.0, mu_r=0.0),
         _part(Road, p, P.road),
         _part(Pace, p, P.pace)._replace(
             speed=0.0, acceleration=0.0, start=0.0, end=FOREVER, surge=0.0
@@ -167,22 +162,24 @@ def _fixed(base: Any, p: Array, switches: Any, ticks: int, steps: int) -> Fixed:
     )
 
 
-def _drive_alone(base: Any, snapshot: Any, ticks: int) -> Array:
-    """(ticks + 1, len(Drive)): the env's own ticks without control.
+def _driven(base: Any, snapshot: Any, actions: Array, n: int) -> tuple[Array, Array]:
+    """(K n + 1, len(Drive)) and the driver's angle (K n + 1,): the env's own ticks under actions.
 
-    The disturbances, and the front wheels without what is added, do not depend on the motion.
+    Disturbances, and a programme's front wheels without what is added, do not depend on them.
     """
     p, z = snapshot["params"], snapshot["state"]
     bounds = np.array([[entry.low, entry.high] for entry in base.layout]).T.copy()
     obs = np.empty(len(base.layout), np.float32)
     rows, packets, report = snapshot["rows"], snapshot["packets"], np.zeros(len(REPORT))
-    action = np.zeros(base.action_space.shape, np.float32)
     switches = snapshot["template"].switches
-    drive = np.empty((ticks + 1, len(Drive._fields)))
+    taken = np.repeat(np.vstack([actions, actions[-1:]]).astype(np.float32), n, axis=0)
+    ticks = n * len(actions)
+    drive, driver = np.empty((ticks + 1, len(Drive._fields))), np.empty(ticks + 1)
     for tick in range(ticks + 1):
         drive[tick] = z[Z.drive : Z.drive + drive.shape[1]]
-        step_vehicle(p, z, switches, action, 1, bounds, obs, rows, packets, report)
-    return drive
+        driver[tick] = z[Z.driver]
+        step_vehicle(p, z, switches, taken[tick], 1, bounds, obs, rows, packets, report)
+    return np.nan_to_num(drive), np.nan_to_num(driver)  # a car thrown about may leave the numbers
 
 
 def _known(p: Array, fixed: Fixed, drive: Array, command: Array) -> Array:
@@ -190,7 +187,7 @@ def _known(p: Array, fixed: Fixed, drive: Array, command: Array) -> Array:
     q, last = fixed.ticks, len(command) - 1
     at = np.arange(0, last, q)
     names = Drive._fields
-    angle = drive[:, names.index("delta_f")]
+    angle = drive[:, names.index("delta_f")] - drive[:, names.index("added")]
 
     def wheels(ticks: Any, rest: float) -> Array:
         """The front wheels without what is added, once `rest` of a tick's deviation is left."""
@@ -204,14 +201,20 @@ def _known(p: Array, fixed: Fixed, drive: Array, command: Array) -> Array:
     )
     push = (forces + blown).reshape(-1, q, 3).mean(axis=1)
     pace = np.array([_wish(float(tick), _part(Pace, p, P.pace)) for tick in at])
-    car = _part(Car, p, P.car)
+    car, change = _part(Car, p, P.car), _part(Change, p, P.change)
+    worn = at >= change.tick
+    tyres = [
+        np.where(worn, factor * stiffness, stiffness)
+        for factor, stiffness in ((change.front, car.C_f), (change.rear, car.C_r))
+    ]
     table = (
         wheels(at, lag.start),
         wheels(middle, lag.middle if q % 2 else lag.start),
         wheels(at + q - 1, lag.end),
         command[at],
         *push.T,
-        *(np.full(len(at), value) for value in (car.C_f, car.C_r, car.mu)),
+        *tyres,
+        *(np.full(len(at), value) for value in (car.mu, car.mu_r)),
         *pace.T,
         _weights(at, fixed),
     )

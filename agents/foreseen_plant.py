@@ -7,7 +7,7 @@ import casadi as ca
 from ..envs.actuators import distribute, lagged, yaw_moment
 from ..envs.backend import plain
 from ..envs.dynamics import Motion, Push, rk4, sideslip_angle
-from ..envs.programme import acceleration_command
+from ..envs.pace import acceleration_command
 from ..envs.record import TICK
 from ..envs.reference import cost_rate, reference
 from ..envs.tyres import Inputs, load_of
@@ -62,7 +62,7 @@ def advance(fixed: Fixed, x: State, action: Any, known: Known) -> Step:
     action: shares of full scale, as the env takes them. The driver's acceleration is that of the
     step's start; added steering acts by its mean over the step.
     """
-    car = fixed.car._replace(C_f=known.C_f, C_r=known.C_r, mu=known.mu)
+    car = fixed.car._replace(C_f=known.C_f, C_r=known.C_r, mu=known.mu, mu_r=known.mu_r)
     task, switches, q = fixed.task, fixed.switches, fixed.ticks
     pace = fixed.pace._replace(speed=known.speed, acceleration=known.ahead)
     limit = 2.0 * car.T_max / (car.m * car.r)

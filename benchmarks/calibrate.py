@@ -100,12 +100,8 @@ def _digits(text: str) -> int:
 
 
 def scored_scenarios() -> list[str]:
-    """The scenarios of a score whose steering is known in advance."""
-    return [
-        name
-        for name, scenario in SCENARIOS.items()
-        if scenario.scored and scenario.steering != "driver"
-    ]
+    """The scenarios of a score."""
+    return [name for name, scenario in SCENARIOS.items() if scenario.scored]
 
 
 def measure(case: Case) -> Episode:
