@@ -44,7 +44,7 @@ class OutsideEnv(StabilityEnv):
 
     Action, observation, record, reward, info and options of reset are those of `StabilityEnv`; a
     plant whose state is no longer finite ends the episode as "not-finite". Needs the extra
-    `outside`. A loop in Python: some fifty times slower than ours.
+    `outside`. A loop in Python, hundreds of times slower than ours.
 
     model: "single-track", "drift" or "multi-body". nominal: what estimators and controllers are
     told (default: `outside_vehicle()`). The other arguments are those of `StabilityEnv`, but there

@@ -75,7 +75,7 @@ def check(model: str = MODEL) -> Check:
 
 @dataclass(frozen=True)
 class Episode:
-    """One seed: the cost, whether it failed, RMS and peak of the slip in rad."""
+    """One seed: the cost, whether it failed, the peak of the slip in rad."""
 
     cost: float
     failed: bool
