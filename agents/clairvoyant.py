@@ -28,6 +28,7 @@ Actions = npt.NDArray[np.float32]
 GRIPS = (3.0, 1.5, 1.0)  # times the true friction, on the way to a hard episode's plan
 REFINEMENTS = 3  # plans from the newest run, while they still gain
 GAIN = 1e-3  # of the cost, below which another refinement is not worth its seconds
+AGREEMENT = 5e-3  # between a solved plan's cost and objective: nothing is left to refine
 
 
 @dataclass(frozen=True)
@@ -119,6 +120,8 @@ def _search(
     if free and not found.solved:
         found = _from_grip(foreseen)
     best, objective, status = _follow(env, seed, foreseen, found), found.objective, found.status
+    if found.solved and abs(best.cost - objective) <= AGREEMENT * best.cost:
+        return best, objective, status
     for _ in range(REFINEMENTS):
         if foreseen.fixed.switches.steering == DRIVER:  # who will answer to the newest run
             env.reset(seed=seed)

@@ -34,8 +34,8 @@ _OPTIONS: dict[str, Any] = {
     "ipopt.acceptable_dual_inf_tol": 1e10,
     "ipopt.acceptable_compl_inf_tol": 1e-2,
     "ipopt.acceptable_constr_viol_tol": 1e-3,
-    "ipopt.acceptable_obj_change_tol": 1e-4,
-    "ipopt.acceptable_iter": 5,
+    "ipopt.acceptable_obj_change_tol": 1e-3,
+    "ipopt.acceptable_iter": 4,
 }
 
 
