@@ -43,7 +43,7 @@ class Purpose:
 
     period: ticks. full_scale: N m of the first input. steers: whether steering is the second.
     kind: of `envs.reference.REFERENCES` by number. disturbances: of `DISTURBANCES`.
-    disturbance_time: s, in which forces decay.
+    disturbance_time: s, in which forces decay. steer_weight: of added steering, times the cost's.
     """
 
     period: int
@@ -52,6 +52,7 @@ class Purpose:
     kind: int
     disturbances: str = "none"
     disturbance_time: float = 0.3
+    steer_weight: float = 1.0
 
     @property
     def states(self) -> tuple[str, ...]:
@@ -153,7 +154,7 @@ def _weights(purpose: Purpose) -> Sequence[float]:
         1.0 / BETA_SCALE**2,
         0.0 if purpose.kind == ZERO_SLIP else 1.0 / GAMMA_SCALE**2,
         EFFORT_WEIGHT,
-        EFFORT_WEIGHT / STEER_SCALE**2 if purpose.steers else 0.0,
+        purpose.steer_weight * EFFORT_WEIGHT / STEER_SCALE**2 if purpose.steers else 0.0,
     )
 
 

@@ -80,7 +80,8 @@ class Lqr(Controller):
     disturbance_time: s, in which F_d and N_d decay. vehicle: designed for this instead of the
     env's nominal. stiffness: two entries of the observation with the front and the rear cornering
     stiffness, on which the gains are then scheduled too, within `span` times the vehicle's, on
-    `knots` knots each; the table is designed once.
+    `knots` knots each; the table is designed once. steer_weight: of added steering, times the
+    cost's: the rate limit, which the design does not know, punishes haste.
 
     Raises ValueError for a missing entry or an option out of range, ModuleNotFoundError without
     python-control.
@@ -94,7 +95,10 @@ class Lqr(Controller):
         stiffness: Sequence[str] = (),
         span: tuple[float, float] = (0.5, 1.6),
         knots: int = 7,
+        steer_weight: float = 1.0,
     ) -> None:
+        if not 0.0 < steer_weight < math.inf:
+            raise ValueError(f"steer_weight is positive, got {steer_weight!r}")
         if not 0.0 < disturbance_time < math.inf:
             raise ValueError(f"disturbance_time is positive, in s, got {disturbance_time!r}")
         if len(stiffness) not in (0, 2):
@@ -121,6 +125,7 @@ class Lqr(Controller):
             REFERENCES.index(self.reference),
             kind,
             float(disturbance_time),
+            float(steer_weight),
         )
         fronts, rears = (
             tuple((own * np.geomspace(*span, knots)).tolist()) if stiffness else ()

@@ -49,8 +49,8 @@ def test_a_failed_write_leaves_the_old_file(
 
 
 def test_words_outside_the_vocabulary_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="unknown metric 'speed'"):
-        Row("a", "b", "speed", 1.0)
+    with pytest.raises(ValueError, match="unknown metric 'swiftness'"):
+        Row("a", "b", "swiftness", 1.0)
     with pytest.raises(ValueError, match="unknown verdict 'good'"):
         Row("a", "b", "rmse", 1.0, verdict="good")
     path = tmp_path / "rows.json"
