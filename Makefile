@@ -11,13 +11,16 @@ INSTALL := PIP_CONSTRAINT=constraints.txt PIP_BUILD_CONSTRAINT=constraints.txt \
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
-.PHONY: help bench test test-all coverage lint types wheel clean
+.PHONY: help bench bench-full test test-all coverage lint types wheel clean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1\t\2/p' Makefile | expand -t 18
 
-bench: .venv/ready-bench ## compare estimators and controllers; writes report.html and results.json (LOG=file adds a recorded drive)
-	$(BIN)/sideslip bench --html report.html --json results.json $(if $(LOG),--log "$(LOG)")
+bench: .venv/ready-bench ## compare estimators and controllers on few seeds; writes report.html and results.json (LOG=file adds a recorded drive)
+	$(BIN)/sideslip bench --quick --html report.html --json results.json $(if $(LOG),--log "$(LOG)")
+
+bench-full: .venv/ready-bench ## the same on all seeds: about two CPU-hours; goes on where it was stopped
+	$(BIN)/sideslip bench --html report.html --json results.json --keep .bench $(if $(LOG),--log "$(LOG)")
 
 test: .venv/ready-all ## the tests, the examples in docstrings, and the marked tests without compilation
 	$(PYTEST) -n $(WORKERS) -m "not long"
@@ -46,11 +49,11 @@ wheel: .venv/ready-all ## source distribution and wheel, in dist/
 	$(BIN)/python -m build --no-isolation
 
 clean: ## remove the virtual environment and everything made here
-	rm -rf .venv dist build report.html results.json .coverage .hypothesis .import_linter_cache .mypy_cache .pytest_cache .ruff_cache
+	rm -rf .venv .bench dist build report.html results.json .coverage .hypothesis .import_linter_cache .mypy_cache .pytest_cache .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # One stamp for each set of extras: the benchmark does without torch.
-.venv/ready-bench: EXTRAS := design,report,bench,outside
+.venv/ready-bench: EXTRAS := design,mpc,report,bench,outside
 .venv/ready-all: EXTRAS := all,dev
 .venv/ready-bench .venv/ready-all: pyproject.toml constraints.txt | $(BIN)/python
 	@echo "Installing sideslip[$(EXTRAS)] into .venv (the first time takes a minute or more)"
