@@ -3,10 +3,10 @@
 import pytest
 
 pytest.importorskip("vehiclemodels")
-from sideslip.benchmarks.cli import SUITES
 from sideslip.benchmarks.procedures import outside, suite
 from sideslip.benchmarks.procedures.cars import CARS, CONTESTANTS
 from sideslip.benchmarks.procedures.found import Case
+from sideslip.benchmarks.suites import SUITES
 from sideslip.envs.outside import OUTSIDE_PLANTS
 
 
