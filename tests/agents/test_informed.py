@@ -10,7 +10,7 @@ from gymnasium.vector import SyncVectorEnv
 
 from sideslip.agents import make_agent
 from sideslip.agents.design_model import design_model, regulator
-from sideslip.agents.informed import OUTPUTS, levels_of, make_informed
+from sideslip.agents.informed import GRIP, OUTPUTS, PARAMETERS, levels_of, make_informed
 from sideslip.agents.lqr import Lqr
 from sideslip.envs import COMS
 from sideslip.envs.manoeuvres import SCENARIOS
@@ -57,7 +57,8 @@ def test_filter_and_observation_are_told_the_car_of_each_episode() -> None:
     for seed in range(3):
         obs, _ = env.reset(seed=seed)
         car = env.unwrapped.vehicle
-        assert obs[-2:] == pytest.approx([car.front_stiffness, car.rear_stiffness], rel=1e-7)
+        told = [car.front_stiffness, car.rear_stiffness, car.friction]
+        assert obs[-3:] == pytest.approx(told, rel=1e-7)
         told = env.get_wrapper_attr("estimator").filters[0].car
         assert list(told[4:6]) == [car.front_stiffness, car.rear_stiffness]
         seen.add(car.front_stiffness)
@@ -93,7 +94,7 @@ def test_periodic_gains_are_designed_for_the_true_car() -> None:
 def _told(vector: bool, env: Any) -> Any:
     wrapper = vectorised.EstimateObservation if vector else EstimateObservation
     truth = VectorTruthObservation if vector else TruthObservation
-    return truth(wrapper(env, "exact-kf", **OPTIONS))  # type: ignore[arg-type]
+    return truth(wrapper(env, "exact-kf", **OPTIONS), PARAMETERS)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
@@ -184,3 +185,36 @@ def test_one_table_serves_all_who_ask_for_it() -> None:
     """The design takes a second: it is kept."""
     one, other = make_informed(FUSION)[1], make_informed(FUSION, scenario="gust")[1]
     assert isinstance(one, Lqr) and one.table is other.table
+
+
+@pytest.mark.parametrize("env_id", [FUSION, "sideslip/AfsYawFusion-v0"])
+def test_it_asks_for_no_more_than_the_true_friction_gives(env_id: str) -> None:
+    """The motors take at most GRIP of the rear tyres' grip; steering does not slide the front."""
+    env, agent = make_informed(env_id)
+    names = [entry.name for entry in env.get_wrapper_attr("layout")]
+    obs, _ = env.reset(seed=0)
+    for friction in (0.05, 0.3, 0.9):
+        harsh = obs.copy()
+        harsh[names.index("true_friction")] = friction
+        harsh[names.index("beta_hat")] = 0.3
+        action, _ = agent.predict(harsh)
+        load = COMS.mass * 9.80665 * COMS.front_arm / (2.0 * COMS.wheelbase)  # N, a rear tyre's
+        most = GRIP * friction * load * COMS.rear_track / COMS.yaw_moment_limit
+        assert abs(action[0]) == pytest.approx(min(most, 1.0), rel=1e-3)
+        if len(action) == 2:
+            driver, gamma = harsh[names.index("steer_command")], harsh[names.index("gamma_hat")]
+            v = 0.5 * (harsh[names.index("wheel_left")] + harsh[names.index("wheel_right")])
+            slip = driver + 0.1 * action[1] - 0.3 - COMS.front_arm * gamma / v
+            front = COMS.mass * 9.80665 * COMS.rear_arm / (2.0 * COMS.wheelbase)
+            most = 3.0 * friction * front / harsh[names.index("true_front_stiffness")]
+            assert action[1] == 0.0 or abs(slip) <= most + 1e-6 or abs(action[1]) == 1.0
+
+
+def test_without_the_true_friction_it_says_who_tells_it() -> None:
+    env = _short()
+    with pytest.raises(ValueError, match=r"true_friction.*make_informed"):
+        make_agent("informed", env)
+
+
+def _short() -> Any:
+    return TruthObservation(EstimateObservation(gym.make(FUSION), "exact-kf", **OPTIONS))
