@@ -24,6 +24,7 @@ METRICS = {
     "score": "-",
     "iqm": "-",
     "cost_over_informed": "-",
+    "probability_of_improvement": "-",
     "rms_slip_error": "rad",
     "rms_yaw_error": "rad/s",
     "spin_rate": "-",

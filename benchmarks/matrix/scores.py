@@ -99,15 +99,12 @@ def normalised(none: Array, costs: Array, ceiling: Ceiling) -> Array:
 
 def improvement(costs: Array, others: Array) -> float:
     """Probability that an episode of the one costs less than one of the other, ties half: rliable's
-    probability of improvement, the Mann-Whitney statistic; averaged over manoeuvres (first axis).
+    probability of improvement, the Mann-Whitney statistic. costs (n,), others (m,).
     """
-    shares = []
-    for ours, theirs in zip(np.atleast_2d(costs), np.atleast_2d(others), strict=True):
-        ordered = np.sort(theirs)
-        above = len(ordered) - np.searchsorted(ordered, ours, side="right")
-        ties = np.searchsorted(ordered, ours, side="right") - np.searchsorted(ordered, ours)
-        shares.append(float(np.mean((above + 0.5 * ties) / len(ordered))))
-    return float(np.mean(shares))
+    ordered = np.sort(others)
+    after = np.searchsorted(ordered, costs, side="right")
+    ties = after - np.searchsorted(ordered, costs)
+    return float(np.mean(len(ordered) - after + 0.5 * ties)) / len(ordered)
 
 
 def _estimate(value: float, spread: Array) -> Estimate:

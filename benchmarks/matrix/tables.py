@@ -9,10 +9,10 @@ import numpy as np
 from ... import __version__
 from ...envs import FAILURES
 from ..rows import Row, Table
-from .contestants import INFORMED, Cell
+from .contestants import INFORMED, REFERENCE_CONTROLLER, REFERENCE_FILTER, Cell
 from .drive import NUMBERS, control_period, rate_of
 from .results import Result, Results
-from .scores import Ceiling, Estimate, Resampled
+from .scores import Ceiling, Estimate, Resampled, improvement
 
 RATES = {"spin": "spin_rate", "off-road": "departure_rate"}
 _FAILED = {"not-finite": "not_finite_rate", "bad-action": "bad_action_rate"}
@@ -23,8 +23,9 @@ _MEANS = tuple(name for name in NUMBERS if name not in ("cost", "failure"))
 class Standing:
     """A contestant over all manoeuvres of a table.
 
-    by_scenario: {scenario: {metric: Estimate}}. overall: {"score", "iqm",
-    "cost_over_informed"} over the scored manoeuvres and all of them.
+    by_scenario: {scenario: {metric: Estimate}}. overall: "score" and "iqm" over the scored
+    manoeuvres, "cost_over_informed" (the geometric mean) and "probability_of_improvement" (on
+    two-dof with exact-kf, without interval) over all.
     """
 
     cell: Cell
@@ -70,6 +71,7 @@ def standings(results: Results, env_id: str, tops: dict[str, Ceiling]) -> list[S
                            [tops[s] for s in scored])  # fmt: skip
         ratios = [by[s]["cost_over_informed"] for s in scenarios]
         overall["cost_over_informed"] = _geometric(ratios)
+        overall["probability_of_improvement"] = _improvement(results, env_id, mine)
         found.append(Standing(mine[scenarios[0]].cell, mine, by, overall))
     return sorted(found, key=lambda each: -_rank(each))
 
@@ -100,6 +102,16 @@ def _metrics(
 
 def _overall(draw: Resampled, costs: Any, none: Any, tops: list[Ceiling]) -> dict[str, Estimate]:
     return draw.aggregate(np.array(none), np.array(costs), tops) if tops else {}
+
+
+def _improvement(results: Results, env_id: str, mine: dict[str, Result]) -> Estimate:
+    """Over the reference pair, on every manoeuvre alike."""
+    pairs = [
+        (r.costs, results.of(env_id, s, REFERENCE_CONTROLLER, REFERENCE_FILTER).costs)
+        for s, r in mine.items()
+    ]
+    value = float(np.mean([improvement(ours, theirs) for ours, theirs in pairs]))
+    return Estimate(value, np.nan, np.nan)
 
 
 def _geometric(ratios: list[Estimate]) -> Estimate:
@@ -154,6 +166,7 @@ def main_table(title: str, found: list[Standing], note: str) -> Table:
         "95 % interval",
         "IQM",
         "cost / informed",
+        "better / %",
         "spin / %",
         "left road / %",
         "us a decision",
@@ -168,6 +181,7 @@ def main_table(title: str, found: list[Standing], note: str) -> Table:
                 f"{score.low:.3f} .. {score.high:.3f}" if score else "",
                 f"{iqm.value:.3f}" if iqm else "",
                 f"{each.overall['cost_over_informed'].value:.2f}",
+                f"{100 * each.overall['probability_of_improvement'].value:.0f}",
                 f"{100 * each.rate('spin'):.1f}",
                 f"{100 * each.rate('off-road'):.1f}",
                 f"{each.us:.0f}" if np.isfinite(each.us) else "",
