@@ -37,6 +37,7 @@ METRICS = {
     "drift": "rad",
     "difference": "-",
     "residual": "-",
+    "offset": "m",
     "rank": "-",
     "share": "-",
     "spectral_radius": "-",

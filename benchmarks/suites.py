@@ -46,6 +46,16 @@ def _papers(wish: Wish) -> Suite:
     return papers.run(seeds, wish.jobs, console=wish.console)
 
 
+def _following(wish: Wish) -> Suite:
+    from . import following
+
+    if wish.quick:
+        return following.run(
+            following.QUICK_SEEDS, following.QUICK_CARS, wish.jobs, console=wish.console
+        )
+    return following.run(jobs=wish.jobs, console=wish.console)
+
+
 def _procedures(wish: Wish) -> Suite:
     from .procedures import suite
 
@@ -62,6 +72,7 @@ SUITES: dict[str, Callable[[Wish], Suite]] = {
     "estimation": _estimation,
     "control": _control,
     "papers": _papers,
+    "following": _following,
     "procedures": _procedures,
     "speed": _speed,
 }

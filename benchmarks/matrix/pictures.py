@@ -58,9 +58,16 @@ def heat_map(
 
 
 def curves(
-    x: Array, series: Mapping[str, tuple[Array, Array, Array]], x_label: str, y_label: str
+    x: Array,
+    series: Mapping[str, tuple[Array, Array, Array]],
+    x_label: str,
+    y_label: str,
+    log: bool = False,
 ) -> Any:
-    """Lines with dots and whiskers; series: name to (value, low, high), each as long as x."""
+    """Lines with dots and whiskers; series: name to (value, low, high), each as long as x.
+
+    log: x on a logarithmic axis.
+    """
     figure = go.Figure()
     for name, (shade, dash) in line_styles(series).items():
         value, low, high = series[name]
@@ -77,7 +84,7 @@ def curves(
         )
     legend = {"orientation": "h", "x": 0, "y": 1.02, "yanchor": "bottom"}
     figure.update_layout(height=420, legend=legend, hovermode="x unified")
-    figure.update_xaxes(title_text=x_label, automargin=True)
+    figure.update_xaxes(title_text=x_label, automargin=True, type="log" if log else "linear")
     figure.update_yaxes(title_text=y_label, automargin=True)
     return figure
 

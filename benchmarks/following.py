@@ -1,0 +1,225 @@
+"""Question: what do steering and yaw moment do together? dakf-stability's bandwidth K, and lanes
+kept on curved roads from camera and gyro, the aim of uneven-delay."""
+
+import warnings
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import numpy.typing as npt
+from rich.console import Console
+
+from .. import __version__
+from ..agents import make_agent
+from ..agents.model_following import feedback_gains
+from ..envs import scenario_from
+from ..envs.dynamics import Motion
+from ..envs.linear import LinearModel, bicycle
+from ..envs.record import TICK
+from ..estimators import UnobservableWarning
+from ..estimators.vector import EstimateObservation
+from .cases import run_cases
+from .rows import Row, Suite, Table
+from .stats import interval
+from .tracking import drive, tracking
+
+Array = npt.NDArray[np.float64]
+
+BANDWIDTHS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)  # rad/s, K_beta = K_gamma
+SEEDS, QUICK_SEEDS = 10, 2
+STEP = "dakf-fig7"
+ROAD, ROAD_ID = "curved-road", "sideslip/YawVisionUneven-v0"
+CARS, QUICK_CARS = 200, 20
+KEEPERS = (
+    ("none", "uneven-delay-kf", None),
+    ("steering alone", "uneven-delay-kf", False),
+    ("both", "uneven-delay-kf", True),
+    ("steering alone", "multirate-residual-kf", False),
+    ("both", "multirate-residual-kf", True),
+    ("steering alone", "exact-kf", False),
+    ("both", "exact-kf", True),
+)
+_TEXT = """\
+dakf-stability V.D says that the bandwidth K is limited by actuators and filter: its step by wire \
+(Fig. 7) with dakf in the loop, from K = 1 to 100 rad/s. The radius is that of the sampled loop of \
+the true car with its lags, without the filter: beyond 1 it is unstable.
+
+Lane keeping: bends of drawn curvature, 1 / 100 m to 1 / 33 m, a lane of 3.5 m, camera and gyro \
+with uneven delay; nobody steers but the controller."""
+_STATES = ("beta", "gamma", "psi", "y_l")
+
+
+def loop_radius(scenario: str | dict[str, Any], bandwidth: float) -> float:
+    """Spectral radius of dakf-stability's loop as sampled every millisecond, without a filter.
+
+    The true car with its lags, the PI (31) designed for the nominal one and summed by forward
+    Euler: beyond 1 the loop is unstable.
+    """
+    made = scenario_from(scenario)
+    env: Any = gym.make("sideslip/AfsYawFusion-v0", scenario=made).unwrapped
+    env.reset(seed=0)
+    car, speed = env.vehicle, made.range("speed")[0]
+    plane = bicycle(car, speed)
+    lags = np.array([car.steering_lag, car.motor_lag]) * made.lags
+    slow = lags > 0.0
+    A, B = np.zeros((4, 4)), np.zeros((4, 2))
+    A[:2, :2] = plane.A
+    for i in range(2):
+        if slow[i]:
+            A[:2, 2 + i], A[2 + i, 2 + i], B[2 + i, i] = plane.B[:, i], -1 / lags[i], 1 / lags[i]
+        else:  # acts at once: its state is not there
+            B[:2, i], A[2 + i, 2 + i] = plane.B[:, i], -1.0 / TICK
+    G, H = LinearModel(A, B, np.eye(4), (), (), ()).discrete(TICK)
+    P, I = feedback_gains(env.nominal, speed, (bandwidth, bandwidth))  # noqa: E741
+    fed = H @ P, -TICK * I, np.zeros((2, 2))
+    loop = np.block([[G - np.hstack([fed[0], np.zeros((4, 2))]), H], [fed[1], fed[2], np.eye(2)]])
+    return float(np.abs(np.linalg.eigvals(loop)).max())
+
+
+@dataclass(frozen=True)
+class Case:
+    """A bandwidth (0: no control) on one seed of STEP."""
+
+    bandwidth: float
+    seed: int
+
+
+def follow(case: Case) -> Array:
+    """(rms_beta, rms_gamma, saturated, failed) of an episode with dakf in the loop."""
+    control = case.bandwidth > 0.0
+    options = {"bandwidth": (case.bandwidth, case.bandwidth)} if control else {}
+    agent = "model-following" if control else "none"
+    found = tracking(drive(case.seed, STEP, agent, **options))
+    return np.array([found.rms_beta, found.rms_gamma, found.saturated, found.failed], float)
+
+
+def keep_lane(keeper: int, cars: int) -> Array:
+    """(cars, 3): largest offset from the lane's centre in m, RMS slip in rad, left the road."""
+    _, estimator, moment = KEEPERS[keeper]
+    env: Any = gym.make_vec(ROAD_ID, num_envs=cars, scenario=ROAD, steering=True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UnobservableWarning)
+        env = EstimateObservation(env, estimator, outputs=_STATES, std=False)
+    options = {} if moment is None else {"moment": moment}
+    agent = make_agent("none" if moment is None else "lane-keeping", env, **options)
+    base = env.unwrapped
+    obs, infos = env.reset(seed=0)
+    state, start = None, np.ones(cars, bool)
+    on, most, squares, steps = np.ones(cars, bool), np.zeros(cars), np.zeros(cars), np.zeros(cars)
+    left = np.zeros(cars)
+    y = Motion._fields.index("y")
+    while on.any():
+        actions, state = agent.predict(obs, state, start, deterministic=True)
+        obs, _, terminated, truncated, infos = env.step(actions)
+        most = np.where(on, np.maximum(most, np.abs(base.motion[:, y])), most)
+        squares += np.where(on, infos["beta"] ** 2, 0.0)
+        steps += on
+        left = np.where(on & terminated, 1.0, left)
+        on &= ~(terminated | truncated)
+        start = np.zeros(cars, bool)
+    return np.stack([most, np.sqrt(squares / steps), left], axis=1)
+
+
+def run(
+    seeds: int = SEEDS, cars: int = CARS, jobs: int | None = None, console: Console | None = None
+) -> Suite:
+    """Both questions; seeds of the step, cars on the road."""
+    suite = Suite(
+        "following",
+        "What steering and yaw moment do together",
+        _TEXT,
+    )
+    cases = [Case(K, seed) for K in (0.0, *BANDWIDTHS) for seed in range(seeds)]
+    found = np.array(run_cases(follow, cases, "bandwidth", jobs, console))
+    _bandwidths(suite, found.reshape(len(BANDWIDTHS) + 1, seeds, -1))
+    lanes = run_cases(_keeper, [(k, cars) for k in range(len(KEEPERS))], "lanes", jobs, console)
+    _lanes(suite, lanes)
+    return suite
+
+
+def _keeper(case: tuple[int, int]) -> Array:
+    return keep_lane(*case)
+
+
+def _bandwidths(suite: Suite, found: Array) -> None:
+    """found: (none and every bandwidth, seeds, numbers of `follow`)."""
+    none = found[0].mean(axis=0)
+    radius = np.array([loop_radius(STEP, K) for K in BANDWIDTHS])
+    lines: dict[str, list[tuple[float, float, float]]] = {
+        "error of beta / without control": [],
+        "error of the yaw rate / without control": [],
+        "share of time at the motors' limit": [],
+        "share of runs that fail": [],
+    }
+    cells = []
+    for K, numbers, r in zip(BANDWIDTHS, found[1:], radius, strict=True):
+        numbers = numbers / np.where([True, True, False, False], none, 1.0)
+        spread = [interval(column) for column in numbers.T]
+        for name, each in zip(lines, spread, strict=True):
+            lines[name].append(each)
+        cells.append([f"{K:.0f}", *(f"{value:.3f}" for value, _, _ in spread), f"{r:.5f}"])
+        for metric, each in zip(("ratio", "ratio", "saturation", "share"), spread, strict=True):
+            suite.rows.append(_row(f"{STEP}, K = {K:.0f} rad/s", metric, each, found.shape[1]))
+        suite.rows.append(_row(f"{STEP}, K = {K:.0f} rad/s", "spectral_radius", (r, r, r), 1))
+    header = ("K / (rad/s)", "beta", "yaw rate", "saturated", "failed", "radius")
+    note = "Errors over those without control; shares of time and of runs."
+    suite.tables.append(Table("The bandwidth K", header, cells, note, keyed=False))
+    try:
+        from .matrix.pictures import curves
+    except ModuleNotFoundError:
+        return
+    shown = {name: _columns(each) for name, each in lines.items()}
+    shown["spectral radius of the loop"] = (radius, radius, radius)
+    figure = curves(np.array(BANDWIDTHS), shown, "K / (rad/s)", "ratio or share", log=True)
+    caption = "Tracking, saturation and stability against the bandwidth; whiskers 95 % over seeds."
+    suite.figures.append(("dakf-stability V.D: the bandwidth K", figure, caption))
+
+
+def _columns(each: list[tuple[float, float, float]]) -> tuple[Array, Array, Array]:
+    value, low, high = np.array(each).T
+    return value, low, high
+
+
+def _lanes(suite: Suite, lanes: list[Array]) -> None:
+    cells = []
+    for (what, estimator, _), numbers in zip(KEEPERS, lanes, strict=True):
+        most, slip, left = (interval(column) for column in numbers.T)
+        cells.append(
+            [
+                f"{what} on {estimator}" if what != "none" else what,
+                f"{most[0]:.3f}",
+                f"{most[1]:.3f} .. {most[2]:.3f}",
+                f"{1e3 * slip[0]:.1f}",
+                f"{100.0 * left[0]:.1f}",
+            ]
+        )
+        for metric, each in (("offset", most), ("rms_slip", slip), ("departure_rate", left)):
+            suite.rows.append(_row(ROAD, metric, each, len(numbers), estimator, what))
+    header = ("controller", "largest offset / m", "95 % interval", "RMS slip / mrad", "left / %")
+    note = "The largest offset of the centre of gravity from the lane's centre, mean over cars."
+    suite.tables.append(Table("Keeping the lane on curved roads", header, cells, note))
+
+
+def _row(
+    scenario: str,
+    metric: str,
+    each: tuple[float, float, float],
+    n: int,
+    estimator: str = "dakf",
+    controller: str = "model-following",
+) -> Row:
+    value, low, high = each
+    return Row(
+        "following",
+        scenario,
+        metric,
+        value,
+        estimator=estimator,
+        controller=controller,
+        low=low,
+        high=high,
+        n=n,
+        salt="fixed",
+        env_version=__version__,
+    )
