@@ -100,7 +100,7 @@ def plan(env: gym.Env[Any, Any], seed: int, start: npt.ArrayLike | None = None) 
         raise ValueError(f"a plan of this episode has shape {shape}, got {actions.shape}")
     if reacts and start is not None:
         foreseen = foresee(base, 1, actions)
-    if linear and not reacts:
+    if linear:
         made, objective, status = solve_linear(foreseen)
         best = drive(env, seed, made)
     else:

@@ -54,9 +54,13 @@ class Programme:
 
 
 def is_linear(base: Any) -> bool:
-    """Whether an episode of an env is a quadratic programme: the rate limit of steering is not."""
-    switches = base.get_state()["template"].switches
+    """Whether an episode of an env is a quadratic programme with one slope for all periods.
+
+    The rate limit of steering, tyres that change and a driver who reacts to the car are not.
+    """
+    scenario, switches = base.scenario, base.get_state()["template"].switches
     plant = switches[0] == 1 and switches[1] == LINEAR
+    plant = plant and scenario.tyre_change_time is None and scenario.steering != "driver"
     return bool(plant and base.held_speed is not None and base.action_space.shape == (1,))
 
 

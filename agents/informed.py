@@ -100,6 +100,7 @@ class Informed(Lqr):
             low = np.minimum(straight - slides, 0.0) / self.authority
             high = np.maximum(straight + slides, 0.0) / self.authority
             action[:, 1] = np.clip(action[:, 1], low, high)
+            state[:, 0] = action[:, 1] * self.authority  # what its rate is counted from
 
 
 def make_informed(

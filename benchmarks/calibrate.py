@@ -148,11 +148,7 @@ def calibrate(
         raise ValueError(f"a standard error needs two seeds or more, got {seeds}")
     import_solvers()
     folder.mkdir(exist_ok=True)
-    cases = [
-        Case(env_id, scenario, seed, start, estimator, str(folder))
-        for scenario in scenarios
-        for seed in calibration_seeds(env_id, scenario, seeds)
-    ]
+    cases = cases_of(scenarios, folder, env_id, seeds, start, estimator)
     episodes = run_cases(measure, cases, "calibration", jobs, console)
     entries = []
     for i, scenario in enumerate(scenarios):
@@ -177,6 +173,27 @@ def calibrate(
             )
         )
     return entries
+
+
+def cases_of(
+    scenarios: Sequence[str], folder: Path, env_id: str, seeds: int, start: str, estimator: str
+) -> list[Case]:
+    """Every episode, scenario by scenario."""
+    return [
+        Case(env_id, scenario, seed, start, estimator, str(folder))
+        for scenario in scenarios
+        for seed in calibration_seeds(env_id, scenario, seeds)
+    ]
+
+
+def forget(
+    scenarios: Sequence[str], folder: Path, env_id: str, seeds: int, start: str, estimator: str
+) -> None:
+    """Remove the finished cases of a run, and their folder if no other run's are left in it."""
+    for case in cases_of(scenarios, folder, env_id, seeds, start, estimator):
+        case.path.unlink(missing_ok=True)
+    if not any(folder.iterdir()):
+        folder.rmdir()
 
 
 def import_solvers() -> None:

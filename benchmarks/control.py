@@ -6,7 +6,7 @@ from pathlib import Path
 from rich.console import Console
 
 from .. import __version__
-from .matrix.ceiling import ceilings, refusals_of, tops_of
+from .matrix.ceiling import calibrated_by, refusals_of, tops_of
 from .matrix.contestants import EPISODES, STEERING, YAW, cells
 from .matrix.illustrate import illustrate
 from .matrix.price import DELAYS, SCENARIO, Price, price_of_delay
@@ -30,11 +30,12 @@ Ten manoeuvres with drawn tyres, friction, speed and steering; camera (33 ms, 30
 gyro; everybody, the uncontrolled car included, drives the same salted seeds. score: 0 is the \
 uncontrolled car, 1 the clairvoyant optimum, which knows the truth and the disturbances ahead; \
 IQM is the interquartile mean of the episodes' scores. `informed` is the LQG of the true car with \
-the same sensors: cost / informed is 1 where nothing better can be made of them on a linear plant. \
+the same sensors, as it is at the start: cost / informed is 1 where nothing better can be made of \
+them on a linear plant whose tyres do not change. \
 Intervals are 95 % bootstraps, stratified by manoeuvre.
 
-An estimator uses its own sensors only: dakf the GPS, the others the camera, bicycle-kf neither; \
-"truth" is an estimator without error. Controllers know the nominal car alone."""
+An estimator uses its own sensors only, camera or GPS; "truth" is an estimator without error. \
+Controllers know the nominal car alone."""
 
 
 def run(
@@ -51,10 +52,10 @@ def run(
     salt = salt_of()
     suite = Suite("control", "Which controller and estimator hold the car", _TEXT)
     results = measure(list(cells()), episodes, salt=salt, jobs=jobs, console=console, keep=keep)
-    found, yard, more = {}, [], []
+    found, tops, yard, more = {}, {}, [], []
     for env_id, title in TITLES.items():
-        tops, log = tops_of(results, env_id)
-        found[env_id] = standings(results, env_id, tops)
+        tops[env_id], log = tops_of(results, env_id)
+        found[env_id] = standings(results, env_id, tops[env_id])
         for each in found[env_id]:
             if not any(result.error for result in each.results.values()):
                 each.us = decision_time(each.cell)
@@ -62,18 +63,21 @@ def run(
         note = " ".join([_note(found[env_id], episodes), *log])
         suite.tables.append(main_table(f"{title} ({env_id})", found[env_id], note))
         more.append(motion_table(f"{title}: the motion", found[env_id]))
-        yard.append(yardsticks(results, env_id, tops))
-    suite.tables += [*yard, *more, *_refusals(results)]
+        yard.append(yardsticks(results, env_id, tops[env_id]))
+    suite.tables += [*yard, *more]
     share = max(4, round(PRICE_SHARE * episodes))
-    top = ceilings(YAW).get(SCENARIO)
-    prices = price_of_delay(top, share, salt=salt, jobs=jobs, console=console, keep=keep)
+    top = tops[YAW].get(SCENARIO) if results.scored(YAW, SCENARIO) else None
+    prices, late = price_of_delay(top, share, salt=salt, jobs=jobs, console=console, keep=keep)
     suite.rows += _price_rows(prices, share, salt)
+    suite.tables += _refusals([results, *late])
     illustrate(suite, found, results, prices, salted_seeds(salt, 1)[0])
+    spent = sum(cell.seconds for each in (results, *late) for cell in each.found.values())
+    suite.text += f"\n\nDriven in {spent / 60.0:.1f} CPU-minutes. {calibrated_by()}"
     return suite
 
 
-def _refusals(results: Results) -> list[Table]:
-    lines = refusals_of(results)
+def _refusals(all_results: list[Results]) -> list[Table]:
+    lines = [line for results in all_results for line in refusals_of(results)]
     if not lines:
         return []
     header = ("env", "manoeuvre", "controller and estimator", "what happened")
@@ -91,7 +95,8 @@ def _price_rows(prices: list[Price], n: int, salt: str) -> list[Row]:
             f"{SCENARIO}, sensors {1e3 * delay:.0f} ms late",
             metric,
             each.value,
-            controller=price.label,
+            estimator=price.cell.estimator,
+            controller=price.cell.controller,
             low=each.low,
             high=each.high,
             n=n,
@@ -105,9 +110,10 @@ def _price_rows(prices: list[Price], n: int, salt: str) -> list[Row]:
 
 
 def _note(found: list[Standing], episodes: int) -> str:
-    widest = max((s.overall["score"].half_width for s in found if "score" in s.overall), default=0)
+    judged = [each for each in found if "score" in each.overall and not each.cell.slow]
+    widest = max((each.overall["score"].half_width for each in judged), default=float("nan"))
     return (
-        f"{episodes} episodes a manoeuvre, mpc at most 64. The widest interval of a score is "
-        f"+-{widest:.3f}. better: probability that an episode costs less than one of two-dof on "
-        "exact-kf. A decision is the estimator's step and the controller's, of one car."
+        f"{episodes} episodes a manoeuvre, mpc at most 64. But for it the widest interval of a "
+        f"score is +-{widest:.3f}. better: probability that an episode costs less than one of "
+        "two-dof on exact-kf. A decision is the estimator's step and the controller's, of one car."
     )

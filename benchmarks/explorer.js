@@ -1,4 +1,5 @@
 // A figure with menus: any cell's time series. The last choice stays where the next one has it.
+const EXPLORERS = [];
 function explore(figure) {
   const { menus, panels, cells } = JSON.parse(figure.querySelector("script").textContent);
   const plot = figure.querySelector(".plot");
@@ -59,7 +60,11 @@ function explore(figure) {
   }));
   fill(0);
   show();
-  DARK.addEventListener("change", show);
+  EXPLORERS.push(show);
 }
 
 for (const figure of document.querySelectorAll("figure.explorer")) setTimeout(explore, 0, figure);
+DARK.addEventListener("change", () => EXPLORERS.forEach((show) => show()));
+for (const name of ["beforeprint", "afterprint"]) { // after the page has changed its colours
+  window.addEventListener(name, () => DARK.matches && EXPLORERS.forEach((show) => show()));
+}

@@ -88,7 +88,8 @@ class Case:
 def follow(case: Case) -> Array:
     """(rms_beta, rms_gamma, saturated, failed) of an episode with dakf in the loop."""
     control = case.bandwidth > 0.0
-    options = {"bandwidth": (case.bandwidth, case.bandwidth)} if control else {}
+    K = (case.bandwidth, case.bandwidth)
+    options: dict[str, Any] = {"bandwidth": K} if control else {}
     agent = "model-following" if control else "none"
     found = tracking(drive(case.seed, STEP, agent, **options))
     return np.array([found.rms_beta, found.rms_gamma, found.saturated, found.failed], float)

@@ -31,6 +31,8 @@ METRICS = {
     "departure_rate": "-",
     "not_finite_rate": "-",
     "bad_action_rate": "-",
+    "steer_effort": "-",
+    "largest_steer_step": "rad",
     "us_per_decision": "us",
     "ratio": "-",
     "static_slip": "rad",

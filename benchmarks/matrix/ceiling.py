@@ -19,6 +19,13 @@ def ceilings(env_id: str) -> dict[str, Ceiling]:
     }
 
 
+def calibrated_by() -> str:
+    """The commands that made the ceilings."""
+    entries = read_calibration() if FILE.is_file() else {}
+    commands = " ".join(f"`{entry.command}`" for entry in entries.values())
+    return f"The ceilings were made by {commands}" if commands else "No ceiling is calibrated."
+
+
 def tops_of(results: Results, env_id: str) -> tuple[dict[str, Ceiling], list[str]]:
     """({manoeuvre: ceiling}, what to log): a method that wins by three errors is the ceiling.
 

@@ -91,3 +91,4 @@ def cells(manoeuvres: tuple[str, ...] = MANOEUVRES) -> Iterator[Cell]:
             yield Cell(STEERING, scenario, "", controller)
         for controller in STEERING_CONTROLLERS:
             yield Cell(STEERING, scenario, REFERENCE_FILTER, controller)
+        yield Cell(STEERING, scenario, "dakf", "model-following")  # the paper's own pair

@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...envs import FAILURES
+from ...envs.border import actions_of
 from ...envs.record import TICK
 from .contest import make_contest
 from .contestants import Cell
@@ -22,10 +23,17 @@ NUMBERS = (
     "rms_yaw_error",
     "effort",
     "largest_step",
+    "steer_effort",
+    "largest_steer_step",
     "saturation",
     "failure",
 )
-"""What is kept of an episode, in this order; `failure` is a code of `FAILURES`."""
+"""What is kept of an episode, in this order; `failure` is a code of `FAILURES`.
+
+effort: mean square share of the yaw moment that was delivered. steer_effort: of the added steering
+that was asked for. largest_step (N m), largest_steer_step (rad): between two decisions. saturation:
+share of the decisions that ask for all of an input.
+"""
 SIGNALS = ("beta", "gamma", "beta_ref", "gamma_ref", "yaw_moment", "steer")
 FULL = 0.999  # of the yaw moment: saturated
 
@@ -41,30 +49,31 @@ class Chunk:
 
 @dataclass
 class Driven:
-    """numbers: (seeds, NUMBERS). us: CPU us per env-step, everything included. series: (k, 1 +
-    SIGNALS) with the time first, of the first seed. error: why the cell could not be driven."""
+    """numbers: (seeds, NUMBERS). seconds: of CPU time. series: (k, 1 + SIGNALS) with the time
+    first, of the first seed. error: why the cell could not be driven; its numbers are NaN."""
 
     numbers: Array
-    us: float
+    seconds: float
     series: Array | None = None
     error: str = ""
 
 
 class _Sums:
-    """What accumulates while the episodes run."""
+    """What accumulates while the episodes run; full: of each input, N m and rad."""
 
-    def __init__(self, cars: int, full_scale: float) -> None:
-        self.full_scale = full_scale
+    def __init__(self, cars: int, full: Array) -> None:
+        self.full = full
         self.alive = np.ones(cars, bool)
         self.steps = np.zeros(cars)
-        self.sums = np.zeros((6, cars))  # cost, slip, slip error, yaw error, effort, saturation
-        self.peak, self.largest = np.zeros(cars), np.zeros(cars)
-        self.failure = np.zeros(cars)
-        self.before = np.zeros(cars)
+        self.sums = np.zeros((7, cars))
+        self.peak, self.failure = np.zeros(cars), np.zeros(cars)
+        self.before, self.largest = np.zeros((cars, 2)), np.zeros((cars, 2))
 
     def add(self, actions: Any, rewards: Any, ended: Any, infos: dict[str, Any]) -> None:
         on = self.alive
-        asked = np.nan_to_num(np.asarray(actions, np.float64)[:, 0])
+        asked = np.zeros((len(on), 2))
+        shares = actions_of(actions, len(on), len(self.full), fail=True)
+        asked[:, : len(self.full)] = np.clip(np.nan_to_num(shares), -1.0, 1.0)
         beta, gamma = infos["beta"], infos["gamma"]
         e_beta, e_gamma = beta - infos["beta_ref"], gamma - infos["gamma_ref"]
         terms = (
@@ -72,13 +81,14 @@ class _Sums:
             beta * beta,
             e_beta * e_beta,
             e_gamma * e_gamma,
-            (infos["yaw_moment"] / self.full_scale) ** 2,
-            np.abs(asked) >= FULL,
+            (infos["yaw_moment"] / self.full[0]) ** 2,
+            asked[:, 1] ** 2,
+            (np.abs(asked) >= FULL).any(axis=1),
         )
         self.sums += np.where(on, terms, 0.0)
         self.peak = np.where(on, np.maximum(self.peak, np.abs(beta)), self.peak)
-        step = np.abs(asked - self.before)
-        self.largest = np.where(on, np.maximum(self.largest, step), self.largest)
+        step = np.maximum(self.largest, np.abs(asked - self.before))
+        self.largest = np.where(on[:, None], step, self.largest)
         self.failure = np.where(on & ended, infos["failure"], self.failure)
         self.steps += on
         self.before = asked
@@ -86,8 +96,9 @@ class _Sums:
 
     def numbers(self) -> Array:
         """(cars, NUMBERS)."""
-        cost, *squares, effort, saturation = self.sums
+        cost, *squares, effort, steer_effort, saturation = self.sums
         slip, slip_error, yaw_error = (np.sqrt(s / self.steps) for s in squares)
+        largest = self.largest[:, : len(self.full)] * self.full
         return np.stack(
             [
                 cost,
@@ -96,7 +107,9 @@ class _Sums:
                 slip_error,
                 yaw_error,
                 effort / self.steps,
-                self.largest * self.full_scale,
+                largest[:, 0],
+                steer_effort / self.steps,
+                largest[:, 1] if len(self.full) > 1 else np.zeros(len(cost)),
                 saturation / self.steps,
                 self.failure,
             ],
@@ -114,14 +127,16 @@ def drive(chunk: Chunk) -> Driven:
 
 
 def _drive(chunk: Chunk) -> Driven:
+    begun = time.process_time()
     env, agent = make_contest(chunk.cell, len(chunk.seeds))
     base: Any = env.unwrapped
-    sums = _Sums(len(chunk.seeds), base.vehicle[0].yaw_moment_limit)
+    car, width = base.vehicle[0], base.single_action_space.shape[0]
+    full = np.array([car.yaw_moment_limit, car.steering_authority])[:width]
+    sums = _Sums(len(chunk.seeds), full)
     seeds: Any = list(chunk.seeds)
     obs, infos = env.reset(seed=seeds)
     state, start = None, np.ones(len(chunk.seeds), bool)
     series = [_signals(infos)]
-    begun, steps = time.process_time(), 0
     while sums.alive.any():
         actions, state = agent.predict(obs, state, start, deterministic=True)
         obs, rewards, terminated, truncated, infos = env.step(actions)
@@ -130,10 +145,10 @@ def _drive(chunk: Chunk) -> Driven:
             series.append(_signals(infos))
         sums.add(actions, rewards, ended, infos)
         start = np.zeros(len(start), bool)
-        steps += 1
-    us = 1e6 * (time.process_time() - begun) / (steps * len(chunk.seeds))
     env.close()
-    return Driven(sums.numbers(), us, np.array(series) if chunk.keep else None)
+    return Driven(
+        sums.numbers(), time.process_time() - begun, np.array(series) if chunk.keep else None
+    )
 
 
 def _signals(infos: dict[str, Any]) -> list[float]:
@@ -141,8 +156,14 @@ def _signals(infos: dict[str, Any]) -> list[float]:
 
 
 def rate_of(numbers: Array, failure: str) -> float:
-    """The share of episodes that ended by a failure of this name."""
-    return float(np.mean(numbers[:, NUMBERS.index("failure")] == FAILURES.index(failure)))
+    """The share of episodes that ended by a failure of this name; NaN where none was driven."""
+    return float(failed_by(numbers, failure).mean())
+
+
+def failed_by(numbers: Array, failure: str) -> Array:
+    """(episodes,) 1 where an episode ended by a failure of this name, NaN where none was driven."""
+    codes = numbers[:, NUMBERS.index("failure")]
+    return np.where(np.isnan(codes), np.nan, codes == FAILURES.index(failure))
 
 
 def control_period(cell: Cell) -> float:

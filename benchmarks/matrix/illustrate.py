@@ -15,6 +15,7 @@ from ..colours import INK, colour
 from ..explorer import Explorer, Panel
 from ..kml import track_kml
 from ..rows import Suite
+from .contest import outputs_for
 from .contestants import STEERING, YAW, Cell
 from .drive import SIGNALS
 from .price import DELAYS, Price, lines
@@ -45,11 +46,10 @@ def illustrate(
     prices: Sequence[Price],
     seed: int,
 ) -> None:
-    """Add the figures to the suite; without plotly only the time series and the track.
+    """Add the figures to the suite; without plotly only the tracks.
 
     seed: of the runs in motion.
     """
-    suite.explorers.append(_time_series(results))
     drives = {m: {cell.label: _run(cell, m, seed) for cell in _SHOWN} for m in _MOVING}
     for manoeuvre, runs in drives.items():
         tracks = {name: (run["X"], run["Y"]) for name, run in runs.items()}
@@ -59,6 +59,7 @@ def illustrate(
         from .pictures import animation, curves
     except ModuleNotFoundError:
         return
+    suite.explorers.append(_time_series(results))
     for env_id, standings in found.items():
         suite.figures += _maps(env_id, standings)
     for what, label in (("score", "score"), ("over", "cost / cost of informed")):
@@ -69,8 +70,8 @@ def illustrate(
                 (
                     f"The price of delay: {label}",
                     curves(ms, shown, "delay of camera and GPS / ms", label),
-                    "Random steering. informed is designed for each delay; dividing by its cost "
-                    "leaves what a method loses, not what the sensors do.",
+                    "Random steering, camera every 50 ms, GPS every 200 ms. informed is designed "
+                    "for each delay; dividing by its cost leaves what a method loses by it.",
                 )
             )
     size = (VEHICLES["coms"].wheelbase, VEHICLES["coms"].front_track)
@@ -135,5 +136,6 @@ def _run(cell: Cell, manoeuvre: str, seed: int) -> Rollout:
     """One episode of a contestant in a single env."""
     env: gym.Env[Any, Any] = gym.make(cell.env_id, scenario=manoeuvre, on_bad_action="fail")
     if cell.estimator:
-        env = EstimateObservation(env, cell.estimator, std=False)
+        outputs = outputs_for(cell.estimator)
+        env = EstimateObservation(env, cell.estimator, outputs=outputs, std=False)
     return rollout(env, make_agent(cell.controller, env), seed)

@@ -3,12 +3,14 @@
 import hashlib
 import json
 from dataclasses import asdict, dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
 
+from ...envs.backend import source_stamp
 from .drive import Chunk, Driven, drive
 
 _LENGTH = 24
@@ -18,7 +20,8 @@ _LENGTH = 24
 class Kept:
     """`drive` that looks in a folder first and leaves its result there.
 
-    folder: None keeps nothing. salt: results of other sources are not taken for ours.
+    folder: None keeps nothing. salt: of the seeds. Results of other sources, plant and matrix
+    included, are not taken for ours.
     """
 
     folder: Path | None
@@ -39,14 +42,23 @@ class Kept:
 
     def _path(self, chunk: Chunk) -> Path:
         assert self.folder is not None
-        text = json.dumps([self.salt, asdict(chunk)], sort_keys=True)
+        text = json.dumps([self.salt, sources(), asdict(chunk)], sort_keys=True)
         return self.folder / f"{hashlib.sha256(text.encode()).hexdigest()[:_LENGTH]}.npz"
+
+
+@cache
+def sources() -> str:
+    """A hash of all files that an episode's numbers depend on."""
+    digest = hashlib.sha256(source_stamp("agents").encode())
+    for path in sorted(Path(__file__).parent.glob("*.py")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
 
 
 def _read(path: Path) -> Driven | None:
     try:
         with np.load(path, allow_pickle=False) as found:
-            return Driven(found["numbers"], float(found["us"]), found.get("series"))
+            return Driven(found["numbers"], float(found["seconds"]), found.get("series"))
     except (OSError, ValueError, KeyError, BadZipFile):  # absent or cut short: driven again
         return None
 
@@ -54,7 +66,7 @@ def _read(path: Path) -> Driven | None:
 def _write(path: Path, driven: Driven) -> None:
     """The whole file or none; a full disk loses the kept case, not the run."""
     part = path.with_suffix(f".{hash(path)}.part.npz")
-    arrays: dict[str, Any] = {"numbers": driven.numbers, "us": np.array(driven.us)}
+    arrays: dict[str, Any] = {"numbers": driven.numbers, "seconds": np.array(driven.seconds)}
     if driven.series is not None:
         arrays["series"] = driven.series
     try:

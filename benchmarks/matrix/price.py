@@ -15,6 +15,7 @@ from .scores import Ceiling, Estimate, Resampled
 Array = npt.NDArray[np.float64]
 
 DELAYS = (0.0, 0.03, 0.06, 0.1, 0.15, 0.2, 0.25, 0.3)  # s, of camera and GPS alike
+FRAME = 0.05  # s: so slow that a camera's frames 0.3 s late find room under way
 SCENARIO = "random-steering"
 CONTESTANTS = (
     ("none", ""),
@@ -22,7 +23,7 @@ CONTESTANTS = (
     ("two-dof", "multirate-kf"),
     ("two-dof", "exact-kf"),
     ("lqr", "single-rate-kf"),
-    ("lqr", "multirate-residual-kf"),
+    ("lqr", "dakf"),
     ("lqr", "exact-kf"),
 )
 
@@ -31,15 +32,15 @@ CONTESTANTS = (
 class Price:
     """A contestant's score and cost over informed at each delay."""
 
-    label: str
+    cell: Cell
     score: list[Estimate]
     over: list[Estimate]
 
 
 def late_cells(delay: float) -> list[Cell]:
-    """The contestants with camera and GPS a delay (s) late."""
+    """The contestants with camera (every FRAME) and GPS a delay (s) late."""
     late = {"delays": [delay], "jitter": 0.0}
-    options = {"camera": late, "gps": late}
+    options = {"camera": late | {"period": FRAME}, "gps": late}
     return [Cell(YAW, SCENARIO, estimator, who, options) for who, estimator in CONTESTANTS]
 
 
@@ -51,20 +52,19 @@ def price_of_delay(
     jobs: int | None = None,
     console: Console | None = None,
     keep: Path | None = None,
-    delays: Sequence[float] = DELAYS,
-) -> list[Price]:
-    """Every contestant at every delay, all on the same seeds; informed designed for each delay.
+) -> tuple[list[Price], list[Results]]:
+    """Every contestant at each of DELAYS, all on the same seeds, and the results by delay.
 
     top: the ceiling of SCENARIO, which needs no sensor; None leaves the scores out.
     """
     found: list[Results] = [
         measure(late_cells(d), episodes, salt=salt, jobs=jobs, console=console, keep=keep)
-        for d in delays
+        for d in DELAYS
     ]
     draw = Resampled(episodes, 1)
     prices = []
     for controller, estimator in CONTESTANTS:
-        price = Price(Cell(YAW, SCENARIO, estimator, controller).label, [], [])
+        price = Price(Cell(YAW, SCENARIO, estimator, controller), [], [])
         for results in found:
             costs = results.of(YAW, SCENARIO, controller, estimator).costs
             none = results.of(YAW, SCENARIO, "none").costs
@@ -74,7 +74,7 @@ def price_of_delay(
                 price.score.append(draw.score(none, costs, top, 0))
         if controller != "none":
             prices.append(price)
-    return prices
+    return prices, found
 
 
 def lines(prices: Sequence[Price], what: str) -> dict[str, tuple[Array, Array, Array]]:
@@ -84,5 +84,5 @@ def lines(prices: Sequence[Price], what: str) -> dict[str, tuple[Array, Array, A
         each: list[Estimate] = getattr(price, what)
         if each:
             value, low, high = np.array([(e.value, e.low, e.high) for e in each]).T
-            found[price.label] = value, low, high
+            found[price.cell.label] = value, low, high
     return found

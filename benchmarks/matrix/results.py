@@ -23,11 +23,11 @@ NOTEWORTHY = 2.0  # a manoeuvre is scored where the uncontrolled car costs this 
 
 @dataclass
 class Result:
-    """A cell's episodes in the order of the seeds; error where it could not be driven."""
+    """A cell's episodes in the order of the seeds, CPU seconds; error where it was not driven."""
 
     cell: Cell
     numbers: Array
-    us: float
+    seconds: float
     series: Array | None = None
     error: str = ""
 
@@ -42,7 +42,6 @@ class Results:
     """Every cell's result and the salt of the seeds."""
 
     salt: str
-    episodes: int
     found: dict[Cell, Result] = field(default_factory=dict)
 
     def of(self, env_id: str, scenario: str, controller: str, estimator: str = "") -> Result:
@@ -74,7 +73,7 @@ def measure(
             for first in range(0, len(mine), CHUNK)
         ]
     driven = run_cases(Kept(keep, salt), chunks, "control", jobs, console)
-    results = Results(salt, episodes)
+    results = Results(salt)
     for cell in cells:
         mine_driven = [d for c, d in zip(chunks, driven, strict=True) if c.cell is cell]
         results.found[cell] = _joined(cell, mine_driven)
@@ -86,7 +85,7 @@ def _joined(cell: Cell, parts: list[Driven]) -> Result:
     return Result(
         cell,
         np.concatenate([part.numbers for part in parts]),
-        float(np.mean([part.us for part in parts])),
+        sum(part.seconds for part in parts),
         parts[0].series,
         errors[0] if errors else "",
     )

@@ -99,8 +99,10 @@ def normalised(none: Array, costs: Array, ceiling: Ceiling) -> Array:
 
 def improvement(costs: Array, others: Array) -> float:
     """Probability that an episode of the one costs less than one of the other, ties half: rliable's
-    probability of improvement, the Mann-Whitney statistic. costs (n,), others (m,).
+    probability of improvement, the Mann-Whitney statistic. costs (n,), others (m,); NaN if one is.
     """
+    if not (np.isfinite(costs).all() and np.isfinite(others).all()):
+        return float("nan")
     ordered = np.sort(others)
     after = np.searchsorted(ordered, costs, side="right")
     ties = after - np.searchsorted(ordered, costs)

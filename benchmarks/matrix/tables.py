@@ -7,10 +7,9 @@ import gymnasium as gym
 import numpy as np
 
 from ... import __version__
-from ...envs import FAILURES
 from ..rows import Row, Table
 from .contestants import INFORMED, REFERENCE_CONTROLLER, REFERENCE_FILTER, Cell
-from .drive import NUMBERS, control_period, rate_of
+from .drive import NUMBERS, control_period, failed_by, rate_of
 from .results import Result, Results
 from .scores import Ceiling, Estimate, Resampled, improvement
 
@@ -95,8 +94,7 @@ def _metrics(
     for name in _MEANS:
         found[name] = draw.mean(mine.numbers[:, NUMBERS.index(name)], which)
     for failure, metric in (RATES | _FAILED).items():
-        hit = mine.numbers[:, NUMBERS.index("failure")] == FAILURES.index(failure)
-        found[metric] = draw.mean(hit.astype(float), which)
+        found[metric] = draw.mean(failed_by(mine.numbers, failure), which)
     return found
 
 
@@ -199,6 +197,7 @@ def motion_table(title: str, found: list[Standing]) -> Table:
         "yaw error",
         "effort",
         "step",
+        "steer step",
         "saturated",
         "of the period",
     )
@@ -210,6 +209,7 @@ def motion_table(title: str, found: list[Standing]) -> Table:
             f"{1e3 * each.mean('rms_yaw_error'):.1f}",
             f"{each.mean('effort'):.3f}",
             f"{each.mean('largest_step'):.0f}",
+            f"{1e3 * each.mean('largest_steer_step'):.1f}",
             f"{100 * each.mean('saturation'):.1f}",
             f"{1e-4 * each.us / control_period(each.cell):.2f}" if np.isfinite(each.us) else "",
         ]
@@ -217,8 +217,8 @@ def motion_table(title: str, found: list[Standing]) -> Table:
     ]
     note = (
         "Slip in mrad, RMS error of the yaw rate in mrad/s, effort: mean square share of the full "
-        "yaw moment, step: largest of the asked moment between two decisions in N m, saturated: % "
-        "of the decisions, a decision's time in % of the control period."
+        "yaw moment, steps: largest of what is asked between two decisions in N m and mrad, "
+        "saturated: % of the decisions, a decision's time in % of the control period."
     )
     return Table(title, header, cells, note)
 

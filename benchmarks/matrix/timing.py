@@ -13,7 +13,7 @@ STEPS = 200
 
 
 def decision_time(cell: Cell) -> float:
-    """CPU us a decision of one car: predict, and what the estimator adds to an env-step.
+    """us (wall) a decision of one car: predict, and what the estimator adds to an env-step.
 
     Median of STEPS steps, the bare env stepped side by side.
     """

@@ -25,17 +25,17 @@ def add(suite: Suite, done: Done) -> None:
         _check(suite, found)
 
 
-def _row(case: Case, metric: str, value: float, **more: Any) -> Row:
+def _row(case: Case, metric: str, value: float, of: str = "", **more: Any) -> Row:
+    """of: what is measured, if a case has several."""
     contestant = CONTESTANTS[case.contestant]
+    who: dict[str, Any] = {"estimator": contestant.estimator, "controller": contestant.agent}
     return Row(
         NAME,
-        f"{case.procedure} {case.car}",
+        f"{case.procedure} {case.car}" + (f", {of}" if of else ""),
         metric,
         value,
-        estimator=contestant.estimator,
-        controller=contestant.agent,
         env_version=__version__,
-        **more,
+        **(who | more),
     )
 
 
@@ -107,8 +107,8 @@ def _step(suite: Suite, done: dict[Case, Transient]) -> None:
     for case, found in done.items():
         for name in iso7401.OUTPUTS:
             one, other = found.step[name], found.linear_step[name]
-            suite.rows.append(_row(case, "response_time", one.response_time, paper=name))
-            suite.rows.append(_row(case, "overshoot", one.overshoot, paper=name))
+            suite.rows.append(_row(case, "response_time", one.response_time, name))
+            suite.rows.append(_row(case, "overshoot", one.overshoot, name))
             pairs = [(a, vars(other)[key]) for key, a in vars(one).items()]
             cells.append([*_who(case), name, *(f"{a:.3g} ({b:.3g})" for a, b in pairs)])
     header = (
@@ -158,8 +158,8 @@ def _check(suite: Suite, found: outside.Check) -> None:
                 "passes" if result.passed else "fails",
             ]
         )
-        row = _row(case, "ratio", worst.ratio_1, n=len(result.runs), verdict=verdict, paper=text)
-        suite.rows.append(row)
+        more: dict[str, Any] = {"n": len(result.runs), "verdict": verdict, "paper": text}
+        suite.rows.append(_row(case, "ratio", worst.ratio_1, controller=who, **more))
     header = ("control", "amplitude / A", "at 1.00 s / %", "at 1.75 s / %", "sideways / m", "")
     title = f"Sine with dwell on the drift model at 80 km/h: {text}: {verdict}"
     suite.tables.append(Table(title, header, cells, "Worst of both sides.", keyed=False))

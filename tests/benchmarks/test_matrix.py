@@ -9,15 +9,18 @@ import pytest
 
 from sideslip.agents import make_agent
 from sideslip.agents.rollout import rollout
+from sideslip.benchmarks import control
+from sideslip.benchmarks.calibrate import read_calibration
 from sideslip.benchmarks.matrix import contest, drive, results
 from sideslip.benchmarks.matrix.ceiling import refusals_of, tops_of
-from sideslip.benchmarks.matrix.contestants import MANOEUVRES, YAW, Cell, cells
+from sideslip.benchmarks.matrix.contestants import MANOEUVRES, STEERING, YAW, Cell, cells
 from sideslip.benchmarks.matrix.drive import NUMBERS, Chunk
+from sideslip.benchmarks.matrix.illustrate import _SHOWN, _run
 from sideslip.benchmarks.matrix.kept import Kept
+from sideslip.benchmarks.matrix.price import SCENARIO
 from sideslip.benchmarks.matrix.results import measure
-from sideslip.benchmarks.matrix.scores import Ceiling
-from sideslip.benchmarks.matrix.seeds import salted_seeds
-from sideslip.benchmarks.matrix.tables import rows_of, standings
+from sideslip.benchmarks.matrix.scores import Ceiling, Resampled
+from sideslip.benchmarks.matrix.tables import _metrics, rows_of, standings
 from sideslip.envs import FAILURES, SCENARIOS
 from sideslip.estimators import EstimateObservation
 
@@ -111,6 +114,9 @@ def test_a_cell_that_cannot_be_built_says_why_and_the_rest_goes_on() -> None:
     assert np.isfinite(found.of(YAW, "gust", "none").costs).all()
     assert "nobody-kf" in found.of(YAW, "gust", "two-dof", "nobody-kf").error
     assert any("not driven" in line[-1] and "nobody-kf" in line[-1] for line in refusals_of(found))
+    lost, ones = found.of(YAW, "gust", "two-dof", "nobody-kf"), np.ones(4)
+    told = _metrics(Resampled(4, 1), 0, lost, ones, ones, None)
+    assert all(np.isnan(each.value) for each in told.values())  # not "never spun"
 
 
 def test_standing_car_and_diverging_plant_end_finite() -> None:
@@ -134,6 +140,11 @@ def test_a_stopped_run_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     assert np.array_equal(first.series, again.series)
     with pytest.raises(TypeError):  # another salt or chunk is driven
         Kept(tmp_path, "other")(chunk)
+    monkeypatch.setattr("sideslip.benchmarks.matrix.kept.sources", lambda: "edited")
+    with pytest.raises(TypeError):  # other sources: driven again
+        kept(chunk)
+    monkeypatch.undo()
+    monkeypatch.setattr("sideslip.benchmarks.matrix.kept.drive", None)
     (found,) = tmp_path.iterdir()
     found.write_bytes(found.read_bytes()[:100])  # cut short by a kill or a full disk
     with pytest.raises(TypeError):
@@ -142,7 +153,7 @@ def test_a_stopped_run_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 
 def ready(asked: list[Cell]) -> results.Results:
     """Made-up costs: none 10, informed 2, lqr 3, the rest 5."""
-    found = results.Results("ab" * 8, 8)
+    found = results.Results("ab" * 8)
     rng = np.random.default_rng(0)
     for cell in asked:
         level = {"none": 10.0, "informed": 2.0, "lqr": 3.0}.get(cell.controller, 5.0)
@@ -181,5 +192,46 @@ def test_a_manoeuvre_that_informed_hardly_improves_is_not_scored() -> None:
     assert "score" not in standings(found, YAW, {MANOEUVRES[0]: Ceiling(1.0, 0.0)})[0].overall
 
 
-def test_seeds_of_a_run_are_the_salts() -> None:
-    assert salted_seeds("ab" * 8, 3) == salted_seeds("ab" * 8, 5)[:3]
+def test_a_small_matrix_from_end_to_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tables, rows, figures, menus, tracks; the animated run is the cell's own episode."""
+    few = [
+        Cell(env_id, name, estimator, who)
+        for env_id in (YAW, STEERING)
+        for name in (SCENARIO, "double-lane-change")
+        for estimator, who in (("", "none"), ("", "informed"), ("exact-kf", "two-dof"))
+    ]
+    top = {SCENARIO: Ceiling(0.1, 0.01)}
+    monkeypatch.setattr(control, "cells", lambda: few)
+    monkeypatch.setattr("sideslip.benchmarks.matrix.ceiling.ceilings", lambda _: top)
+    monkeypatch.setattr("sideslip.benchmarks.matrix.price.DELAYS", (0.0, 0.3))
+    monkeypatch.setattr("sideslip.benchmarks.control.DELAYS", (0.0, 0.3))
+    monkeypatch.setattr("sideslip.benchmarks.matrix.illustrate.DELAYS", (0.0, 0.3))
+    suite = control.run(4, jobs=1)
+    assert {row.env_version.split()[0] for row in suite.rows} == {YAW, STEERING}
+    assert {row.metric for row in suite.rows} >= {"score", "iqm", "cost_over_informed", "spin_rate"}
+    assert [row for row in suite.rows if not np.isfinite(row.value)] == []
+    assert not any("went wrong" in table.title for table in suite.tables)
+    assert len(suite.explorers) == 1 and len(suite.explorers[0].cells) == len(few)
+    assert [name for name, *_ in suite.files] == ["sine-with-dwell.kml", "double-lane-change.kml"]
+    titles = " ".join(title for title, *_ in suite.figures)
+    assert all(text in titles for text in ("score", "price of delay", "In motion"))
+
+
+def test_the_run_in_motion_is_the_cells_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    for cell in _SHOWN:
+        same = Cell(cell.env_id, "sine-with-dwell", cell.estimator, cell.controller)
+        driven = drive.drive(Chunk(same, (5,)))
+        alone = _run(cell, "sine-with-dwell", 5)
+        assert alone.cost == pytest.approx(number(driven, "cost")[0], rel=1e-12)
+
+
+def test_the_shipped_ceilings_are_of_this_env() -> None:
+    """The uncontrolled car costs on a calibration seed what it did when the file was made."""
+    entries = read_calibration()
+    assert {entry.scenario for entry in entries.values() if entry.env_id == YAW} >= set(MANOEUVRES)
+    for entry in entries.values():
+        env = gym.make(entry.env_id, scenario=entry.scenario)
+        first = entry.episodes[0]
+        cost = rollout(env, None, first.seed).cost
+        assert cost == pytest.approx(first.costs["none"], rel=1e-12)
+        assert entry.clairvoyant < entry.none
