@@ -1,6 +1,7 @@
-"""What a vector environment is given, as one array or list of its rows; refused where it is not."""
+"""What environments are given, one or as an array or list of rows; refused where it is not."""
 
 import operator
+import reprlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -11,6 +12,7 @@ from gymnasium.vector import AutoresetMode
 Mask = npt.NDArray[np.bool_]
 Actions = npt.NDArray[np.float32]
 NAMED = 8  # rows that a message lists
+_NO_NUMBERS = (TypeError, ValueError, OverflowError)  # what numpy raises where it finds none
 
 
 def count_of(num_envs: Any) -> int:
@@ -90,29 +92,54 @@ def options_of(options: Mapping[str, Any], count: int) -> list[dict[str, Any]]:
     return [{name: value[i] for name, value in columns.items()} for i in range(count)]
 
 
+def action_of(action: Any, width: int, fail: bool) -> Actions:
+    """One action (width,) as float32; what has another shape or is no numbers raises ValueError,
+    with `fail` it is NaN."""
+    try:
+        return _action_of(action, width)
+    except ValueError as error:
+        if not fail:
+            raise ValueError(
+                f"an action has shape ({width},), got {error}; nothing was stepped"
+            ) from None
+    return np.full(width, np.nan, np.float32)
+
+
 def actions_of(actions: Any, count: int, width: int, fail: bool) -> Actions:
     """Actions (count, width) as float32.
 
-    What has another shape raises ValueError and names the rows; with `fail` these rows are NaN.
+    What has another shape or is no numbers raises ValueError and names the rows; with `fail` these
+    rows are NaN.
     """
     try:
         force = np.array(actions, np.float32)  # a copy: contiguous whatever came
         if force.shape == (count, width):
             return force
-    except ValueError:  # rows of different lengths, or no numbers
+    except _NO_NUMBERS:  # rows of different lengths, or no numbers
         pass
+    force, wrong = np.full((count, width), np.nan, np.float32), {}
     try:
-        rows = [np.array(row, np.float32) for row in actions]
+        rows = list(actions)
     except TypeError:  # no rows at all
         rows = []
-    if len(rows) != count:
-        bad, got = list(range(count)), f"{len(rows)} rows"
-    else:
-        bad = [i for i, row in enumerate(rows) if row.shape != (width,)]
-        got = f"in {named(bad)} shape {rows[bad[0]].shape}"
-    if not fail:
+    for i, row in enumerate(rows if len(rows) == count else ()):
+        try:
+            force[i] = _action_of(row, width)
+        except ValueError as error:
+            wrong[i] = str(error)
+    if not fail and (wrong or len(rows) != count):
+        bad = list(wrong)
+        got = f"in {named(bad)} {wrong[bad[0]]}" if bad else f"{len(rows)} rows"
         raise ValueError(f"actions have shape ({count}, {width}), got {got}; nothing was stepped")
-    force = np.full((count, width), np.nan, np.float32)
-    for i in set(range(count)).difference(bad):
-        force[i] = rows[i]
+    return force
+
+
+def _action_of(action: Any, width: int) -> Actions:
+    """One action; ValueError says what came instead."""
+    try:
+        force = np.array(action, np.float32)
+    except _NO_NUMBERS as error:
+        raise ValueError(f"{reprlib.repr(action)}: {error}") from None
+    if force.shape != (width,):
+        raise ValueError(f"shape {force.shape}")
     return force

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.error import ResetNeeded
 
+from .border import action_of
 from .dynamics import Motion
 from .episode import info_of, motion_in, record_in, slow_in, vehicle_in
 from .kernel import step_vehicle
@@ -31,8 +32,8 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
     COMS; positive turns left and drives the right wheel). With `steering` it is
     `Box(-1, 1, (2,), float32)`: the second entry is the steering angle *added* to the driver's,
     as a share of its full scale (0.1 rad, positive to the left; at most 0.8 rad/s, and within the
-    stop of the front wheels). Zero is the uncontrolled car. Values outside are clipped. A
-    non-finite action or a wrong shape raises ValueError and steps nothing; with
+    stop of the front wheels). Zero is the uncontrolled car. Values outside are clipped. What is
+    not finite, no numbers or of a wrong shape raises ValueError and steps nothing; with
     `on_bad_action="fail"` it ends the episode as a failure.
 
     ## Observation
@@ -131,8 +132,7 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
         self._bounds = self.setting.bounds
         low, high = self._bounds.astype(np.float32)
         self.observation_space = gym.spaces.Box(low, high, dtype=np.float32)
-        self._action_shape = (self.setting.action_width,)
-        self.action_space = gym.spaces.Box(-1.0, 1.0, self._action_shape, np.float32)
+        self.action_space = gym.spaces.Box(-1.0, 1.0, (self.setting.action_width,), np.float32)
         self._params, self._state = np.zeros(P.end), np.zeros(Z.end)
         self.rows = np.zeros((self.control_period, FAST_WIDTH))
         self.packets = np.zeros((self.setting.room, PACKET_WIDTH))
@@ -184,12 +184,7 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
         """Hold the action for one control period."""
         if self._over:
             raise ResetNeeded("the episode is over or was never started: call reset() first")
-        force = np.array(action, np.float32)  # a copy: contiguous whatever came
-        if force.shape != self._action_shape:
-            expected = self._action_shape
-            if self.setting.on_bad_action == "raise":
-                raise ValueError(f"an action has shape {expected}, got shape {force.shape}")
-            force = np.full(expected, np.nan, np.float32)
+        force = action_of(action, self.setting.action_width, self.setting.on_bad_action == "fail")
         obs = np.empty(len(self.layout), np.float32)
         done = self._advance(force, obs)
         if done <= 0:

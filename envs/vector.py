@@ -50,9 +50,10 @@ class StabilityVectorEnv(Fleet, VectorEnv[Observations, Any, npt.NDArray[Any]]):
     environment resets itself start without options.
 
     ## Actions
-    (N, 1), or (N, 2) with `steering`. With `on_bad_action="raise"` a wrong number of actions or a
-    non-finite one raises ValueError, names the rows and steps nothing; with "fail" it ends these
-    rows' episodes as failures. Actions of rows that this step resets are not read.
+    (N, 1), or (N, 2) with `steering`. With `on_bad_action="raise"` a wrong number of actions, one
+    that is not finite or one that is no numbers raises ValueError, names the rows and steps
+    nothing; with "fail" it ends these rows' episodes as failures. Of rows that this step resets
+    the values are not read.
 
     ## Records
     `rows` (N, n, FAST_WIDTH) of which `ticks_done` (N,) are there, `packets` (N, room,

@@ -107,12 +107,16 @@ ACTIONS: list[tuple[Any, str]] = [
     (np.zeros(2, np.float32), r"an action has shape \(1,\), got shape \(2,\)"),
     (np.zeros((1, 1), np.float32), r"an action has shape \(1,\), got shape \(1, 1\)"),
     (np.zeros(0, np.float32), r"an action has shape \(1,\), got shape \(0,\)"),
-    (["left"], "could not convert"),
+    (["left"], r"an action has shape \(1,\), got \['left'\]: could not convert"),
+    ([[0.0], [0.0, 0.0]], r"an action has shape \(1,\), got \[\[0.0\], \[0.0, 0.0\]\]: .*inhomog"),
+    (None, r"an action has shape \(1,\), got shape \(\)"),
+    ({}, r"an action has shape \(1,\), got \{\}: .* 'dict'; nothing was stepped"),
+    ([10**400], "got .*too large"),
 ]
 
 
 @pytest.mark.smoke
-@pytest.mark.parametrize(("action", "message"), ACTIONS, ids=str)
+@pytest.mark.parametrize(("action", "message"), ACTIONS, ids=lambda told: str(told)[:40])
 def test_a_bad_action_steps_nothing(action: Any, message: str) -> None:
     env, untouched = StabilityEnv(), StabilityEnv()
     for each in (env, untouched):
@@ -126,7 +130,12 @@ def test_a_bad_action_steps_nothing(action: Any, message: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "action", [[math.nan], [math.inf], [-math.inf], [0.0, 0.0], [], 0.0, [[0.0]], None], ids=str
+    "action",
+    [
+        *([math.nan], [math.inf], [-math.inf], [0.0, 0.0], [], 0.0, [[0.0]]),
+        *(None, {}, "left", ["left"], [[0.0], [0.0, 0.0]], [None, {}], [10**400]),
+    ],
+    ids=lambda action: str(action)[:20],
 )
 def test_on_bad_action_fail_ends_the_episode_and_charges_the_rest(action: Any) -> None:
     env = StabilityEnv(scenario=LINEAR, on_bad_action="fail")

@@ -51,12 +51,16 @@ BAD: list[tuple[Any, str]] = [
     ([[0.0], [0.0], None], r"got in row 2 shape \(\)"),
     (0.5, r"got 0 rows"),
     (None, r"got 0 rows"),
-    ([["left"], [0.0], [0.0]], "could not convert"),
+    ([["left"], [0.0], [0.0]], r"shape \(3, 1\), got in row 0 \['left'\]: could not convert"),
+    ([[0.0], [[0.0], [0.0, 0.0]], {}], r"got in rows 1, 2 \(2 of them\) \[\[0.0\], .*inhomogen"),
+    ([[0.0], [0.0], {}], r"got in row 2 \{\}: .* 'dict'; nothing was stepped"),
+    ([[0.0], [0.0], [10**400]], "got in row 2 .*too large"),
+    ({}, "got 0 rows"),
 ]
 
 
 @pytest.mark.smoke
-@pytest.mark.parametrize(("actions", "message"), BAD, ids=str)
+@pytest.mark.parametrize(("actions", "message"), BAD, ids=lambda told: str(told)[:40])
 def test_bad_actions_are_refused_and_nothing_is_stepped(actions: Any, message: str) -> None:
     env, untouched = batch(FUSION, 3), batch(FUSION, 3)
     still = np.zeros((3, 1))
@@ -78,10 +82,15 @@ ROWS: list[tuple[Any, list[int]]] = [
     (np.zeros((3, 2)), [0, 1, 2]),
     (np.zeros((2, 1)), [0, 1, 2]),
     (None, [0, 1, 2]),
+    ({}, [0, 1, 2]),
+    ("left", [0, 1, 2]),
+    ([["left"], [0.0], {}], [0, 2]),
+    ([[0.0], [[0.0], [0.0, 0.0]], [0.0]], [1]),
+    ([[0.0], [None, {}], [10**400]], [1, 2]),
 ]
 
 
-@pytest.mark.parametrize(("actions", "rows"), ROWS, ids=str)
+@pytest.mark.parametrize(("actions", "rows"), ROWS, ids=lambda told: str(told)[:40])
 def test_on_bad_action_fail_ends_these_rows_only(actions: Any, rows: list[int]) -> None:
     """The rest of their episodes is charged; their neighbours keep their bits."""
     env, untouched = batch(FUSION, 3, on_bad_action="fail"), batch(FUSION, 3)
