@@ -12,7 +12,7 @@ from sideslip.envs import COMS, FAILURES, StabilityEnv
 from sideslip.envs.linear import bicycle
 from sideslip.envs.record import FAST, TICK, concatenate
 
-from .helpers import FULL, LINEAR, bits, fast_rows, play
+from .helpers import FULL, IDS, LINEAR, bits, fast_rows, play
 
 pytestmark = pytest.mark.plain
 
@@ -37,11 +37,7 @@ def bad_action(value: Any) -> pytest.RaisesExc[ValueError]:
 
 @pytest.mark.smoke
 def test_the_action_has_two_entries_on_one_id_only() -> None:
-    steering = {
-        name: gymnasium.make(name).action_space.shape
-        for name in gymnasium.registry
-        if name.startswith("sideslip/")
-    }
+    steering = {name: gymnasium.make(name).action_space.shape for name in IDS}
     assert steering.pop("sideslip/AfsYawFusion-v0") == (2,)
     assert set(steering.values()) == {(1,)}
 
