@@ -66,7 +66,8 @@ def test_the_path_runs_through_the_centres_and_keeps_the_car_between_the_cones(
 @pytest.mark.parametrize("track", TRACKS)
 def test_the_paths_slope_is_continuous(track: str) -> None:
     path = path_of(track, 1.8)
-    s, h = np.linspace(-5.0, 130.0, 4001), 1e-4
+    ends = [path.start_1, path.start_1 + path.length_1, path.start_2, path.start_2 + path.length_2]
+    s, h = np.append(np.linspace(-5.0, 130.0, 4001), ends), 1e-4
     offset = [offsets(path, s + k * h) for k in (-1.0, 0.0, 1.0)]
     # a cubic of length l over a shift a bends at most by 6 a / l^2; a kink would show as h, not h^2
     bends = [(path.shift_1, path.length_1), (path.shift_2, path.length_2)]
