@@ -107,6 +107,10 @@ def _check_draws(scenario: "Scenario") -> None:
         value = getattr(scenario, name)
         if value is not None and scenario.range(name)[0] <= 0.0:
             _refuse(scenario, f"{name} must be positive or None, got {value!r}")
+    for name in ("front_change", "rear_change"):
+        if scenario.tyre_change_time is None and scenario.range(name) != (1.0, 1.0):
+            value = getattr(scenario, name)
+            _refuse(scenario, f"{name} {value!r} needs a tyre_change_time, from which it acts")
     if scenario.steering in ("ramp", "sweep") and scenario.range("hold")[0] < 0.001:
         _refuse(scenario, f"hold of a {scenario.steering} is 1 ms or more, got {scenario.hold!r}")
     if scenario.steering == "sine-with-dwell" and scenario.range("hold")[0] < 0.0:

@@ -191,6 +191,8 @@ def test_round_trip_through_json(name: str) -> None:
         ({"tyre_change_time": -1.0}, "tyre_change_time must be positive or None, got -1.0"),
         ({"front_change": 0.0}, "front_change must be positive"),
         ({"rear_change": (1.0, 0.5)}, r"rear_change \(1.0, 0.5\) is not finite, or its ends are"),
+        ({"front_change": 0.7}, "front_change 0.7 needs a tyre_change_time, from which it acts"),
+        ({"rear_change": (0.7, 1.0)}, r"rear_change \(0.7, 1.0\) needs a tyre_change_time"),
         ({"curvature": (0.1, math.nan)}, r"curvature \(0.1, nan\) is not finite"),
         ({"steering": "ramp", "hold": 0.0}, "hold of a ramp is 1 ms or more, got 0.0"),
         ({"steering": "sweep", "hold": 0.0}, "hold of a sweep is 1 ms or more, got 0.0"),
