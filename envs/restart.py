@@ -27,11 +27,15 @@ from .vehicle import GRAVITY
 
 _CAR, _MOTION, _LINK, _TARGET = (len(each._fields) for each in (Car, Motion, Link, Target))
 _ROAD, _DRIVER, _PATH = (len(each._fields) for each in (Road, Driver, Path))
+_S = Motion._fields.index("s")
 
 
 @jit
-def _write_surroundings(p: Any, d: Any) -> None:
-    """Friction, wind, the road's curvature and the path from what was drawn."""
+def _write_surroundings(p: Any, d: Any, s: Any, v_x: Any) -> None:
+    """Friction, wind, the road and the path from what was drawn, for a car that starts at s, v_x.
+
+    The path begins where the car is at the onset; a mirrored bend leans to the other side.
+    """
     mirrored = d.side < 0.5
     right = select(d.friction_right > 0.0, d.friction_right, d.friction)
     p[P.car + 10] = select(mirrored, right, d.friction)
@@ -41,10 +45,11 @@ def _write_surroundings(p: Any, d: Any) -> None:
     p[P.wind + 2] = whole_ticks(d.wind_start)
     p[P.wind + 3] = p[P.wind + 2] + whole_ticks(d.wind_length)
     p[P.road] = select(mirrored, 0.0 - d.curvature, d.curvature)
+    p[P.road + 3] = select(mirrored, 0.0 - p[P.road + 3], p[P.road + 3])
     scaled = d.path_speed > 0.0
     scale = select(scaled, d.speed, 1.0) / select(scaled, d.path_speed, 1.0)
     path = Path(*fixed_tuple(p[P.path :], _PATH))
-    store(p, P.path, laid(path, d.onset * d.speed, scale, select(mirrored, -1.0, 1.0)))
+    store(p, P.path, laid(path, s + d.onset * v_x, scale, select(mirrored, -1.0, 1.0)))
 
 
 @jit
@@ -78,7 +83,6 @@ def reset_vehicle(
     change = select(d.tyre_change_time > 0.0, whole_ticks(d.tyre_change_time), FOREVER)
     store(p, P.change, (change, d.front_change, d.rear_change))
     write_steering(switches[3], d, p[P.steering :])
-    _write_surroundings(p, d)
     p[P.pace] = d.speed
     for i in range(Z.end):
         z[i] = 0.0
@@ -88,6 +92,7 @@ def reset_vehicle(
     for i in range(_MOTION):
         if start[i] == start[i]:
             z[Z.motion + i] = start[i]
+    _write_surroundings(p, d, z[Z.motion + _S], z[Z.motion])
     z[Z.sky] = p[P.sky + 1] * normals(key_low, key_high, 0, CHANNELS.sky)[1]
     n = normals(key_low, key_high, 0, CHANNELS.initial)
     road = Road(*fixed_tuple(p[P.road :], _ROAD))

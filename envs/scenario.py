@@ -23,12 +23,13 @@ class Scenario:
 
     Steering is a kind of `STEERING_KINDS`, built from onset, amplitude, frequency (random: two
     pairs of sines; sweep: to frequency_2) and hold (of a step, a dwell, a ramp or a sweep, or from
-    one lane change to the next). mirror: the seed draws the side of steering, track, bend and
-    friction_right, and that of the wind.
+    one lane change to the next). mirror: the seed draws the side of steering, track, bend, bank
+    and friction_right, and that of the wind.
 
     The steering "driver" keeps to a path of `PATHS` (`driver.py`): the road's centre line, or a
-    track that begins where the car is at the onset, for the vehicle's width; path_speed: m/s at
-    which it has its standard's lengths, which grow with the speed driven (None: at every speed).
+    track that begins where the car is at the onset at the speed it starts with, for the vehicle's
+    width; path_speed: m/s at which it has its standard's lengths, which grow with the speed drawn
+    (None: at every speed).
     driver_preview (s), driver_gain, driver_lag (s) and driver_rate (rad/s at the wheels). An
     episode ends where the car is half_width off the path (without a driver, off the road's centre
     line).
@@ -38,8 +39,9 @@ class Scenario:
     acceleration, which the held speed follows.
 
     Car: front_stiffness and rear_stiffness are factors on the vehicle's; draws that make the car
-    unstable at the drawn speed are drawn again and counted. From tyre_change_time (s, None: never)
-    on front_change and rear_change are further factors. vehicle and nominal: parameters that
+    unstable at the drawn speed are drawn again and counted. From tyre_change_time (s, None: never,
+    and then they are 1) on front_change and rear_change are further factors. vehicle and nominal:
+    parameters that
     replace those of the env. small_angle, linear_tyres, lags, roll: the plant.
 
     Surroundings: friction is the road's and replaces the vehicle's; friction_right, if given, is

@@ -1,5 +1,6 @@
 """The driver: his law, his arms, and what he keeps to."""
 
+import itertools
 import math
 from typing import Any
 
@@ -139,7 +140,7 @@ def test_the_driver_comes_back_to_the_line_with_little_overshoot() -> None:
 
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 def test_the_car_stays_between_the_cones_of_its_track(side: float) -> None:
-    """The nominal COMS: its corners, by place and heading, while in each lane."""
+    """The nominal COMS: its corners over the axles, by place and heading, while in each lane."""
     scene = {
         **(FULL | KEEPING),
         "path": "iso-3888-2",
@@ -158,11 +159,17 @@ def test_the_car_stays_between_the_cones_of_its_track(side: float) -> None:
     seen = 0
     for _ in range(800):
         play(env, [0.0])
-        for lane in lanes:
-            if lane.start <= env.motion.s <= lane.start + lane.length:
-                seen += 1
-                assert abs(env.motion.y - lane.offset) + 0.5 * COMS.width < 0.5 * lane.width
-    assert seen > 300
+        s, y, psi = env.motion.s, env.motion.y, env.motion.psi
+        for ahead, left in itertools.product(
+            (COMS.front_arm, -COMS.rear_arm), (-0.5 * COMS.width, 0.5 * COMS.width)
+        ):
+            along = s + ahead * math.cos(psi) - left * math.sin(psi)
+            across = y + ahead * math.sin(psi) + left * math.cos(psi)
+            for lane in lanes:
+                if lane.start <= along <= lane.start + lane.length:
+                    seen += 1
+                    assert abs(across - lane.offset) < 0.5 * lane.width
+    assert seen > 1200
 
 
 @pytest.mark.plain
@@ -180,6 +187,10 @@ def test_the_track_lies_where_onset_speed_and_side_put_it() -> None:
         side = math.copysign(1.0, packed.shift_1)
         assert packed == pytest.approx(laid(own, onset * v, scale, side), rel=1e-12)
         sides.add(side)
+        env.reset(seed=seed, options={"state": {"s": 7.0, "v_x": v + 0.5}})
+        started = Path(*env.get_state()["params"][P.path : P.path + 6].tolist())
+        begin = 7.0 + onset * (v + 0.5)
+        assert started == pytest.approx(laid(own, begin, scale, side), rel=1e-12)
     assert sides == {-1.0, 1.0}
     env.reset(seed=0, options={"scenario": {"base": "double-lane-change", "path_speed": None}})
     assert env.get_state()["params"][P.path + 2] == own.length_1  # the standard's

@@ -19,9 +19,11 @@ from sideslip.envs.dynamics import (
     gravity_at,
     rk4,
 )
+from sideslip.envs.layout import P
 from sideslip.envs.record import FAST
 from sideslip.envs.template import car_of
 from sideslip.envs.tyres import FIALA, LINEAR, Inputs, load_of, load_transfer, tyre_forces
+from sideslip.envs.vehicle import GRAVITY
 
 from .helpers import FULL, fast_rows, play, unwrapped
 from .helpers import LINEAR as PAPER
@@ -104,6 +106,19 @@ def test_bank_and_grade_come_in_along_the_road() -> None:
     for s, share in ((0.0, 0.0), (10.0, 0.0), (15.0, 0.25), (30.0, 1.0), (90.0, 1.0)):
         state = Motion(*[0.0] * 9)._replace(s=s)
         assert gravity_at(state, road, 1) == (share, 2.0 * share)
+
+
+def test_a_mirrored_bend_leans_to_the_other_side() -> None:
+    scene = {"base": "straight", "mirror": True, "curvature": 0.01, "bank": 0.1, "grade": 0.05}
+    env, across = StabilityEnv(scenario=scene), GRAVITY * math.sin(0.1)
+    leans = set()
+    for seed in range(8):
+        env.reset(seed=seed)
+        road = Road(*env.get_state()["params"][P.road : P.road + len(Road._fields)].tolist())
+        assert road.across == math.copysign(across, road.curvature)
+        assert road.along == GRAVITY * math.sin(0.05)
+        leans.add(road.curvature)
+    assert leans == {-0.01, 0.01}
 
 
 def test_an_undamped_body_on_tyres_without_force_keeps_its_energy() -> None:
