@@ -186,12 +186,11 @@ def cases_of(
     ]
 
 
-def forget(
-    scenarios: Sequence[str], folder: Path, env_id: str, seeds: int, start: str, estimator: str
-) -> None:
-    """Remove the finished cases of a run, and their folder if no other run's are left in it."""
-    for case in cases_of(scenarios, folder, env_id, seeds, start, estimator):
+def forget(cases: Sequence[Case]) -> None:
+    """Remove finished cases once their entries are written; those of other runs stay."""
+    for case in cases:
         case.path.unlink(missing_ok=True)
+    folder = Path(cases[0].folder)
     if not any(folder.iterdir()):
         folder.rmdir()
 

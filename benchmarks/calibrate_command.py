@@ -28,7 +28,7 @@ def calibrate_command(
 
     A stopped run goes on where it was when the same command is given again in the same folder.
     """
-    from .calibrate import FILE, calibrate, forget, scored_scenarios, update
+    from .calibrate import FILE, calibrate, cases_of, forget, scored_scenarios, update
 
     path = FILE if out is None else out
     check_writable(path)
@@ -40,7 +40,7 @@ def calibrate_command(
     folder = Path(f".{path.name}.cases")
     made = calibrate(names, folder, env, seeds, start, estimator, shlex.join(words), jobs, console)
     update(path, made)
-    forget(names, folder, env, seeds, start, estimator)
+    forget(cases_of(names, folder, env, seeds, start, estimator))
     table = Table("scenario", "none", "clairvoyant", "standard error", "plan from the agent wins")
     for entry in made:
         wins = sum(episode.winner == f"from {start}" for episode in entry.episodes)

@@ -14,6 +14,8 @@ from sideslip.agents.clairvoyant import Ceiling
 from sideslip.benchmarks.calibrate import (
     calibrate,
     calibration_seeds,
+    cases_of,
+    forget,
     read_calibration,
     scored_scenarios,
     update,
@@ -62,6 +64,11 @@ def test_a_stopped_run_goes_on(asked: list[int], tmp_path: Path) -> None:
     calibrate(["gust"], tmp_path / "cases", seeds=3, start="none", estimator="", jobs=1)
     assert len(asked) == 8  # another question
     assert len(entry.episodes) == 5
+    folder = tmp_path / "cases"
+    forget(cases_of(["gust"], folder, ID, 5, "none", "exact-kf"))
+    assert len(list(folder.iterdir())) == 3  # the other question's
+    forget(cases_of(["gust"], folder, ID, 3, "none", ""))
+    assert not folder.exists()
 
 
 def test_a_file_keeps_other_entries(asked: list[int], tmp_path: Path) -> None:
