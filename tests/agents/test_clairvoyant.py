@@ -66,6 +66,33 @@ def test_a_symbolic_tick_is_the_envs(scenario: str, small_angle: bool, lags: boo
         np.testing.assert_allclose(after, run.states[k + 1], rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"base": "stiffness-step", "tyre_change_time": 0.1},
+        {"base": "random-steering", "friction_right": 0.3, "friction": 0.8},
+        {"base": "double-lane-change", "onset": 0.05},
+    ],
+    ids=["changing tyres", "split friction", "driver"],
+)
+def test_a_symbolic_tick_is_the_envs_where_the_road_the_tyres_or_the_driver_act(
+    changes: dict[str, Any],
+) -> None:
+    """The driver is foreseen in the run of the actions, so that is the run that is compared."""
+    env = gymnasium.make(ID, scenario=changes | {"duration": 0.2}, control_period=1)
+    env.reset(seed=2)
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (200, 1))
+    foreseen = foresee(env.unwrapped, 1, actions)
+    w = ca.SX.sym("w", len(State._fields))
+    u, known = ca.SX.sym("u"), ca.SX.sym("known", len(Known._fields))
+    step = advance(foreseen.fixed, State(*ca.vertsplit(w)), [u], Known(*ca.vertsplit(known)))
+    tick = ca.Function("tick", [w, u, known], [ca.vertcat(*step.state)])
+    run = drive(env, 2, actions).trajectory
+    for k in range(200):
+        after = tick(run.states[k], run.actions[k], foreseen.known[:, k]).full()[:, 0]
+        np.testing.assert_allclose(after, run.states[k + 1], rtol=1e-9, atol=1e-9)
+
+
 def test_what_is_foreseen_is_what_the_car_meets() -> None:
     """The disturbances of a run with other actions are those that were listed."""
     env = make("gust", 0.5, 1)
