@@ -100,16 +100,19 @@ def outside_vehicle() -> Vehicle:
 
 
 class OutsidePlant:
-    """One of the models with its state `x` and the newest step's `acting`.
+    """One of the models with its state `x` and the newest step's `specific_force`: (a_x, a_y) in
+    m/s2 as accelerometers at the centre of gravity feel them at its end.
 
     friction: the tyre's peak lateral friction, in place of CommonRoad's 1.05 (None); the
-    longitudinal one keeps its ratio to it. stiffness: a factor on the cornering stiffness of all
-    tyres. A state that is no longer finite stays so (`finite`).
+    longitudinal one keeps its ratio to it. The single track's linear tyres know none: there it has
+    no effect. stiffness: a factor on the cornering stiffness of all tyres. A state that is no
+    longer finite stays so (`finite`).
     """
 
     law = ""  # the name of the model's module and function
     wheels = slice(0)  # wheel speeds in x, which may not be negative
     loaded = 0.0  # the most of the car's weight that rests on one wheel speed
+    velocities: tuple[int, ...] = (3, 5)  # in x, with the yaw rate
 
     def __init__(self, friction: float | None = None, stiffness: float = 1.0) -> None:
         base = _parameters()
@@ -125,7 +128,7 @@ class OutsidePlant:
         self._law: Callable[..., list[float]] = getattr(_module(self.law), self.law)
         slope = self.loaded * self.p.m * GRAVITY * tyre.p_kx1  # N, of force over slip
         self._fastest = self.p.R_w**2 * slope / self.p.I_y_w  # 1/s of the slip at 1 m/s
-        self.acting = Acting(0.0)
+        self.specific_force = (0.0, 0.0)
         self.x = np.zeros(0)
 
     def start(self, motion: Motion) -> None:
@@ -141,26 +144,30 @@ class OutsidePlant:
         """Where the car is, on a straight road along the ground's x axis."""
         raise NotImplementedError
 
-    @property
-    def specific_force(self) -> tuple[float, float]:
-        """(a_x, a_y) in m/s2 as accelerometers at the centre of gravity feel them now."""
+    def felt(self, acting: Acting) -> tuple[float, float]:
+        """The specific force of the state x under what acts; may raise what the models raise."""
         raise NotImplementedError
 
     @property
     def finite(self) -> bool:
-        """Whether the state is still a number; a spun multi-body car's is not."""
-        return bool(np.isfinite(self.x).all())
+        """Whether the state and the squares of its velocities, which references and sensors take,
+        are numbers; a spun multi-body car's are not."""
+        squares = sum(v * v for v in (float(self.x[i]) for i in self.velocities))
+        return bool(np.isfinite(self.x).all()) and math.isfinite(squares)
 
     def step(self, acting: Acting, h: float) -> None:
         """h seconds of the classical Runge-Kutta method, in as many parts as the wheels need."""
         eigenvalue = self._fastest / max(abs(float(self.x[3])), SLOWEST)
         parts = max(1, math.ceil(h * eigenvalue / STABLE)) if self.finite else 1
-        self.acting = acting
         try:
-            for _ in range(parts):
-                self.x = self._rk4(self.x, acting, h / parts)
-                self.x[self.wheels] = np.maximum(self.x[self.wheels], 0.0)
+            with np.errstate(over="ignore", invalid="ignore"):
+                for _ in range(parts):
+                    self.x = self._rk4(self.x, acting, h / parts)
+                    self.x[self.wheels] = np.maximum(self.x[self.wheels], 0.0)
+                self.specific_force = self.felt(acting)
         except (ArithmeticError, ValueError):  # a wheel at rest in a spin, the sine of infinity
+            self.specific_force = (math.nan, math.nan)
+        if not all(map(math.isfinite, self.specific_force)):
             self.x = np.full_like(self.x, np.nan)
 
     def _rk4(self, x: Array, acting: Acting, h: float) -> Array:
@@ -196,9 +203,8 @@ class SingleTrack(OutsidePlant):
         X, Y, _, v, psi, gamma, slip = self.x[:7].tolist()
         return Motion(v * math.cos(slip), v * math.sin(slip), gamma, psi, X, Y, X, Y, 0.0)
 
-    @property
-    def specific_force(self) -> tuple[float, float]:  # noqa: D102
-        rate, slip = self.derivative(self.x, self.acting), self.x[6]
+    def felt(self, acting: Acting) -> tuple[float, float]:  # noqa: D102
+        rate, slip = self.derivative(self.x, acting), self.x[6]
         along, across = rate[3], self.x[3] * (rate[6] + self.x[5])  # of the path
         sine, cosine = math.sin(slip), math.cos(slip)
         return float(along * cosine - across * sine), float(along * sine + across * cosine)
@@ -222,6 +228,7 @@ class MultiBody(OutsidePlant):
     law = "vehicle_dynamics_mb"
     wheels = slice(23, 27)
     loaded = 0.5
+    velocities = (3, 5, 10)
 
     def start(self, motion: Motion) -> None:  # noqa: D102
         speed, slip = math.hypot(motion.v_x, motion.v_y), math.atan2(motion.v_y, motion.v_x)
@@ -245,9 +252,8 @@ class MultiBody(OutsidePlant):
         x = self.x.tolist()
         return Motion(x[3], x[10], x[5], x[4], x[0], x[1], x[0], x[1], 0.0, -x[6], -x[7])
 
-    @property
-    def specific_force(self) -> tuple[float, float]:  # noqa: D102
-        rate, x = self.derivative(self.x, self.acting), self.x
+    def felt(self, acting: Acting) -> tuple[float, float]:  # noqa: D102
+        rate, x = self.derivative(self.x, acting), self.x
         a_x = rate[3] - x[5] * x[10]
         a_y = rate[10] + x[5] * x[3] - GRAVITY * math.sin(x[6])  # felt by the rolled body
         return float(a_x), float(a_y)

@@ -1,6 +1,5 @@
 """OutsideEnv: our sensors, scenarios, references and cost around a plant that is not ours."""
 
-import dataclasses
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -16,6 +15,7 @@ from .layout import Disturbance, Drive, P, Task, Z
 from .manoeuvres import scenario_from
 from .noise import CHANNELS, normals
 from .outside import OUTSIDE_PLANTS, Acting, OutsidePlant, outside_vehicle
+from .outside_checks import check_options, check_scenario
 from .pace import Pace, acceleration_command
 from .programme import DRIVER, STEERING_WIDTH, Wind, steering_at, wind_at
 from .record import FAST, TICK
@@ -25,18 +25,6 @@ from .stability import StabilityEnv
 from .summary import clip, observe, write_report
 from .switches import NOT_FINITE, OFF_ROAD, REPORT, RUNNING, SPIN
 from .tracks import Path, path_offset
-
-# Fields of a scenario that change our own plant or its road: only their defaults will do.
-_OURS = (
-    "curvature",
-    "bank",
-    "grade",
-    "small_angle",
-    "linear_tyres",
-    "vehicle",
-    "friction_right",
-    "tyre_change_time",
-)
 
 
 class OutsideEnv(StabilityEnv):
@@ -49,12 +37,15 @@ class OutsideEnv(StabilityEnv):
     model: "single-track", "drift" or "multi-body". nominal: what estimators and controllers are
     told (default: `outside_vehicle()`). The other arguments are those of `StabilityEnv`, but there
     is no `vehicle`: the true one is the model's. The scenario's friction is the tyre's peak
-    lateral friction; one tyre serves both axles, so its stiffness is scaled by the mean of the
-    scenario's two factors. Motors and steering act for a tick with the mean that the record tells.
+    lateral friction, which `vehicle` tells; on the single track, whose tyres are linear, it has no
+    effect, and there is no reset option "friction". One tyre serves both axles, so its stiffness
+    is scaled by the mean of the scenario's two factors. Motors and steering act for a tick with
+    the mean that the record tells. The multi-body model always rolls, the others never do.
 
     Raises ValueError for an unknown model, a scenario with a road or a plant that the model has
     not (curvature, bank, grade, small_angle, linear_tyres, vehicle, friction_right,
-    tyre_change_time), the reset option "vehicle" or a start off the road's own frame.
+    tyre_change_time; wind_height but for the multi-body model), one that has the multi-body model
+    below 1 m/s or without roll, the reset option "vehicle" or a start off the road's own frame.
     """
 
     def __init__(
@@ -70,7 +61,7 @@ class OutsideEnv(StabilityEnv):
         if "vehicle" in options:
             raise TypeError("an outside plant is its own vehicle; only nominal can be given")
         self.model = model
-        _check(scenario_from(scenario))
+        check_scenario(scenario_from(scenario), model)
         super().__init__(sensors, scenario, outside_vehicle(), reference=reference, **options)
         self.plant: OutsidePlant = OUTSIDE_PLANTS[model]()
 
@@ -79,11 +70,14 @@ class OutsideEnv(StabilityEnv):
     ) -> tuple[npt.NDArray[np.float32], dict[str, Any]]:
         """Start an episode; see `StabilityEnv`."""
         asked = dict(options or {})
-        if "vehicle" in asked:
-            raise ValueError("reset option vehicle: an outside plant is its own vehicle")
-        _check(scenario_from(asked.get("scenario", self.setting.base.scenario)))
-        if "state" in asked:
-            asked["state"] = self._on_the_road(asked["state"])
+        check_options(asked, self.model)
+        scenario = scenario_from(asked.get("scenario", self.setting.base.scenario))
+        if "duration" in asked:
+            scenario = scenario.replace(duration=float(asked["duration"]))
+        check_scenario(scenario, self.model)
+        if "state" in asked:  # s and y are X and Y on the straight road of these plants
+            state = asked["state"]
+            asked["state"] = {**state, "s": state.get("X", 0.0), "y": state.get("Y", 0.0)}
         told = super().reset(seed=seed, options=asked)
         p, base = self._params, self._now.vehicle
         scale = 0.5 * (p[P.car + 4] / base.front_stiffness + p[P.car + 5] / base.rear_stiffness)
@@ -92,18 +86,9 @@ class OutsideEnv(StabilityEnv):
         self.plant.start(self.motion)
         return told
 
-    def _on_the_road(self, state: Mapping[str, Any]) -> dict[str, Any]:
-        """The start with s and y, which are X and Y on the straight road of these plants."""
-        for name in ("s", "y", "theta"):
-            if name in state:
-                raise ValueError(f"reset option state: {name} follows from X and Y here")
-        if self.model != "multi-body" and (state.get("phi") or state.get("phi_dot")):
-            raise ValueError(f"reset option state: the {self.model} model has no roll")
-        return {**state, "s": state.get("X", 0.0), "y": state.get("Y", 0.0)}
-
     def get_state(self) -> dict[str, Any]:
         """A snapshot that `set_state` continues from, bit for bit."""
-        plant = (self.plant.p, self.plant.acting, self.plant.x.copy())
+        plant = (self.plant.p, self.plant.specific_force, self.plant.x.copy())
         return super().get_state() | {"outside": plant, "model": self.model}
 
     def set_state(self, snapshot: Mapping[str, Any]) -> None:
@@ -111,7 +96,7 @@ class OutsideEnv(StabilityEnv):
         if snapshot.get("model") != self.model:
             raise ValueError(f"the snapshot is of {snapshot.get('model')!r}, not {self.model!r}")
         super().set_state(snapshot)
-        self.plant.p, self.plant.acting, x = snapshot["outside"]
+        self.plant.p, self.plant.specific_force, x = snapshot["outside"]
         self.plant.x = x.copy()
 
     def _advance(self, force: npt.NDArray[np.float32], obs: npt.NDArray[np.float32]) -> int:
@@ -275,15 +260,3 @@ _FLAT = Road(0.0, 0.0, 1.0)
 
 def _part(p: npt.NDArray[np.float64], kind: Any, at: int) -> Any:
     return kind(*p[at : at + len(kind._fields)].tolist())
-
-
-def _check(scenario: Scenario) -> None:
-    """ValueError for a scenario that asks for what only our plant has."""
-    defaults = {entry.name: entry.default for entry in dataclasses.fields(Scenario)}
-    for name in _OURS:
-        value = getattr(scenario, name)
-        if value and value != defaults[name]:
-            raise ValueError(
-                f"scenario {scenario.name!r}: {name} {value!r} is of our own plant and road; an "
-                "outside plant is what it is, on a straight and level road"
-            )

@@ -1,0 +1,76 @@
+"""What outside plants cannot do, refused by its name before an episode starts."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+from .scenario import Scenario
+
+CRAWL = 1.0  # m/s: the multi-body model's least speed; below 0.1 it freezes while its wheels spin
+
+# Fields of a scenario that change our own plant or its road: only their defaults will do.
+_OURS = (
+    "curvature",
+    "bank",
+    "grade",
+    "small_angle",
+    "linear_tyres",
+    "vehicle",
+    "friction_right",
+    "tyre_change_time",
+)
+
+
+def check_scenario(scenario: Scenario, model: str) -> None:
+    """ValueError for a scenario that asks for what only our plant has, or this model has not."""
+    name = f"scenario {scenario.name!r}"
+    defaults = {entry.name: entry.default for entry in dataclasses.fields(Scenario)}
+    for field in _OURS:
+        value = getattr(scenario, field)
+        if value and value != defaults[field]:
+            raise ValueError(
+                f"{name}: {field} {value!r} is of our own plant and road; an outside plant is "
+                "what it is, on a straight and level road"
+            )
+    if model != "multi-body":
+        if scenario.wind_height:
+            raise ValueError(
+                f"{name}: wind_height {scenario.wind_height!r} rolls the body; the {model} model "
+                "has no roll"
+            )
+        return
+    if not scenario.roll:
+        raise ValueError(f"{name}: roll False; the multi-body model always rolls")
+    slowest = slowest_of(scenario)
+    if slowest < CRAWL:
+        raise ValueError(
+            f"{name}: its speed comes down to {slowest:.3g} m/s; the multi-body model needs "
+            f"{CRAWL} m/s or more"
+        )
+
+
+def slowest_of(scenario: Scenario) -> float:
+    """The least speed in m/s that a scenario's own changes of speed come down to."""
+    change = scenario.speed_change + (scenario.acceleration or 0.0) * scenario.duration
+    return scenario.range("speed")[0] + min(change, 0.0)
+
+
+def check_options(options: Mapping[str, Any], model: str) -> None:
+    """ValueError for an option of reset that this model cannot follow."""
+    if "vehicle" in options:
+        raise ValueError("reset option vehicle: an outside plant is its own vehicle")
+    if "friction" in options and model == "single-track":
+        raise ValueError(
+            "reset option friction: the single-track model's tyres are linear and know none"
+        )
+    state = options.get("state", {})
+    for name in ("s", "y", "theta"):
+        if name in state:
+            raise ValueError(f"reset option state: {name} follows from X and Y here")
+    if model != "multi-body":
+        if state.get("phi") or state.get("phi_dot"):
+            raise ValueError(f"reset option state: the {model} model has no roll")
+    elif (v_x := state.get("v_x")) is not None and v_x < CRAWL:
+        raise ValueError(
+            f"reset option state: v_x is {v_x!r} m/s; the multi-body model needs {CRAWL} or more"
+        )
