@@ -2,8 +2,9 @@
 
 Defined where the plant is linear (small-angle plant, linear tyres, speed held): then no estimator
 has a smaller mean squared error than the filter that knows the vehicle, the noise and the
-disturbances' statistics. Deterministic wind, biases and parameter steps do not change it: it knows
-them.
+disturbances' statistics. Deterministic wind and biases do not change it: it knows them. A vehicle
+that changes on the way does, and these recursions have one vehicle: for a scenario with a
+tyre_change_time they are no bound.
 """
 
 import math

@@ -9,6 +9,7 @@ import gymnasium as gym
 import numpy as np
 
 from ...agents.rollout import rollout
+from ...envs.manoeuvres import scenario_from
 from ...envs.record import PACKET, Log
 from ...envs.vehicle import Vehicle
 from ...estimators import UnobservableWarning, make_estimator
@@ -40,6 +41,8 @@ class Estimation:
     bound: whether "bound" is wanted, the RMS of the optimal standard deviation of beta. times: that
     many times the seeds, where a ratio is close to its threshold. control_period: ticks between
     rows of the truth; in between it is interpolated.
+
+    Raises ValueError where the bound is wanted of a car whose tyres change on the way.
     """
 
     name: str
@@ -49,6 +52,10 @@ class Estimation:
     bound: bool = False
     times: int = 1
     control_period: int = 10
+
+    def __post_init__(self) -> None:
+        if self.bound and scenario_from(self.scenario).tyre_change_time is not None:
+            raise ValueError(f"{self.name}: no bound is known where the tyres change on the way")
 
     def chunks(self, seeds: int) -> list[tuple[int, ...]]:
         """The seeds of each case."""
