@@ -6,20 +6,27 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
 from .records import true_vehicles
 from .truth import STIFFNESSES, parameters_of, truth_entries
+from .truth import TruthObservation as Single
+from .twin import twin_spec
 
 Observations = npt.NDArray[np.float32]
 
 
-class TruthObservation(VectorWrapper[Observations, Any, Observations, Any, Any]):
+class TruthObservation(
+    VectorWrapper[Observations, Any, Observations, Any, Any], RecordConstructorArgs
+):
     """The vector twin of `sideslip.estimators.truth.TruthObservation`, with the same bits.
 
     It stands outside of `sideslip.estimators.vector.EstimateObservation`. A row is told its new
-    car with the first observation of an episode; `final_obs` holds the old one's.
+    car with the first observation of an episode; `final_obs` holds the old one's. `spec` names the
+    single wrapper: `gym.make_vec(spec)` builds environments that are wrapped one by one.
 
     Raises TypeError where the env tells no layout or no vehicles, ValueError for an unknown name
     or one that stands twice.
@@ -28,7 +35,8 @@ class TruthObservation(VectorWrapper[Observations, Any, Observations, Any, Any])
     def __init__(
         self, env: VectorEnv[Any, Any, Any], parameters: Sequence[str] = STIFFNESSES
     ) -> None:
-        super().__init__(env)
+        RecordConstructorArgs.__init__(self, parameters=list(parameters))
+        VectorWrapper.__init__(self, env)
         if not hasattr(env, "layout"):
             raise TypeError(
                 f"{type(env).__name__} tells no layout; wrap it in "
@@ -42,6 +50,11 @@ class TruthObservation(VectorWrapper[Observations, Any, Observations, Any, Any])
         self._same_step = env.metadata.get("autoreset_mode") == AutoresetMode.SAME_STEP
         self._values = np.zeros((env.num_envs, len(self._parameters)), np.float32)
         self._ended = np.ones(env.num_envs, np.bool_)
+
+    @property
+    def spec(self) -> EnvSpec | None:  # type: ignore[override]  # as in VectorWrapper
+        """The env's with the single wrapper; JSON-able, None where the env has none."""
+        return twin_spec(self.env.spec, Single, self._saved_kwargs)
 
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None

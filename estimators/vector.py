@@ -1,13 +1,12 @@
 """EstimateObservation for vector environments: all rows' estimators in one compiled call."""
 
-import copy
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
-from gymnasium.envs.registration import EnvSpec, VectorizeMode, WrapperSpec
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import ResetNeeded
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
@@ -20,6 +19,8 @@ from .designs import Told
 from .outputs import BETA, NEES, outputs_of
 from .records import Batch, BatchedRecords, SyncRecords, records_of, true_vehicles
 from .truth import as_built, tell_stiffness
+from .truth_vector import TruthObservation as TruthObservation
+from .twin import twin_spec
 from .wrappers import TRUTH
 from .wrappers import EstimateObservation as Single
 
@@ -94,22 +95,7 @@ class EstimateObservation(
     @property
     def spec(self) -> EnvSpec | None:  # type: ignore[override]  # as in VectorWrapper
         """The env's with the single wrapper; JSON-able, None where the env has none."""
-        if self.env.spec is None:
-            return None
-        spec = copy.deepcopy(self.env.spec)
-        name, kwargs = Single.class_name(), copy.deepcopy(self._saved_kwargs)
-        twin = WrapperSpec(name, f"{Single.__module__}:{Single.__name__}", kwargs)
-        spec.additional_wrappers += (twin,)
-        if spec.kwargs.get("vectorization_mode") == VectorizeMode.VECTOR_ENTRY_POINT.value:
-            spec.kwargs["vectorization_mode"] = VectorizeMode.SYNC.value
-            spec.kwargs.pop("info", None)
-            if "autoreset_mode" in spec.kwargs:
-                mode = spec.kwargs.pop("autoreset_mode")
-                spec.kwargs["vector_kwargs"] = {"autoreset_mode": mode}
-        how = spec.kwargs.get("vector_kwargs", {})
-        if isinstance(how.get("autoreset_mode"), AutoresetMode):
-            how["autoreset_mode"] = how["autoreset_mode"].value
-        return spec
+        return twin_spec(self.env.spec, Single, self._saved_kwargs)
 
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None

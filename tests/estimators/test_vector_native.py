@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sideslip.estimators import FILTERS
-from sideslip.estimators.vector import EstimateObservation
+from sideslip.estimators.vector import EstimateObservation, TruthObservation
 from sideslip.estimators.wrappers import EstimateObservation as Single
 from tests.envs.batches import MODES, pair
 from tests.envs.helpers import IDS
@@ -135,3 +135,17 @@ def test_the_spec_builds_environments_wrapped_one_by_one(told: dict[str, Any]) -
     assert again.metadata["autoreset_mode"] == env.metadata["autoreset_mode"]
     one, other = again.reset(seed=4)[0], together.reset(seed=4)[0]
     assert one.tobytes() == other.tobytes()
+
+
+def test_the_spec_tells_of_the_truth_too() -> None:
+    told: dict[str, Any] = {"autoreset_mode": "SameStep", "on_bad_action": "fail"}
+    env = gym.make_vec(VISION, num_envs=2, **told)
+    together = TruthObservation(EstimateObservation(env, "multirate-kf"), ["mass", "friction"])
+    assert together.spec is not None
+    again = gym.make_vec(gym.envs.registration.EnvSpec.from_json(together.spec.to_json()))
+    assert again.single_observation_space == together.single_observation_space
+    assert again.metadata["autoreset_mode"] == env.metadata["autoreset_mode"]
+    same_bits(again.reset(seed=4), together.reset(seed=4))
+    assert drive(again, together, 8) == 1
+    env.spec = None
+    assert together.spec is None

@@ -1,0 +1,32 @@
+"""What a vector wrapper's spec names: the single wrapper around each environment."""
+
+import copy
+from collections.abc import Mapping
+from typing import Any
+
+from gymnasium.envs.registration import EnvSpec, VectorizeMode, WrapperSpec
+from gymnasium.vector import AutoresetMode
+
+
+def twin_spec(spec: EnvSpec | None, single: Any, kwargs: Mapping[str, Any]) -> EnvSpec | None:
+    """The spec of a vector env whose rows wear the wrapper `single(**kwargs)`; None without one.
+
+    JSON-able. `gym.make_vec` of it makes environments that are wrapped one by one: it puts no
+    wrappers around an env that is a vector by itself.
+    """
+    if spec is None:
+        return None
+    spec = copy.deepcopy(spec)
+    entry = f"{single.__module__}:{single.__name__}"
+    twin = WrapperSpec(single.class_name(), entry, copy.deepcopy(dict(kwargs)))
+    spec.additional_wrappers += (twin,)
+    if spec.kwargs.get("vectorization_mode") == VectorizeMode.VECTOR_ENTRY_POINT.value:
+        spec.kwargs["vectorization_mode"] = VectorizeMode.SYNC.value
+        spec.kwargs.pop("info", None)
+        if "autoreset_mode" in spec.kwargs:
+            mode = spec.kwargs.pop("autoreset_mode")
+            spec.kwargs["vector_kwargs"] = {"autoreset_mode": mode}
+    how = spec.kwargs.get("vector_kwargs", {})
+    if isinstance(how.get("autoreset_mode"), AutoresetMode):
+        how["autoreset_mode"] = how["autoreset_mode"].value
+    return spec
