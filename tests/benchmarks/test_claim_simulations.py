@@ -43,6 +43,8 @@ def test_a_car_that_fails_is_no_estimation() -> None:
     scenario = SHORT | {"half_width": 0.3}
     with pytest.raises(RuntimeError, match="narrow: the car of seed 0 failed"):
         Estimation("narrow", VISION, scenario, (Filter("a", "bicycle-kf"),)).measure((0,))
+    with pytest.raises(ValueError, match="soft: no bound is known where the tyres change on the"):
+        Estimation("soft", VISION, "stiffness-step", (), bound=True)
 
 
 def test_options_of_a_contestant_reach_its_agent() -> None:
