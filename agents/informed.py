@@ -95,7 +95,7 @@ class Informed(Lqr):
             wheels, driver, front = inputs[:, :2], inputs[:, 5], inputs[:, -3]
             beta, gamma = inputs[:, 8], inputs[:, 9]
             v = np.maximum(wheels.mean(axis=1), SLOW)
-            slides = 3.0 * friction * self._front_load / front  # rad, where Fiala tyres saturate
+            slides = 3.0 * friction * self._front_load / np.maximum(front, 1.0)  # rad, Fiala's
             straight = beta + self.vehicle.front_arm * gamma / v - driver
             low = np.minimum(straight - slides, 0.0) / self.authority
             high = np.maximum(straight + slides, 0.0) / self.authority

@@ -6,7 +6,7 @@ from pathlib import Path
 from rich.console import Console
 
 from .. import __version__
-from .matrix.ceiling import calibrated_by, refusals_of, tops_of
+from .matrix.ceiling import calibrated_by, judged, refusals_of, tops_of
 from .matrix.contestants import EPISODES, STEERING, YAW, cells
 from .matrix.illustrate import illustrate
 from .matrix.price import DELAYS, SCENARIO, Price, price_of_delay
@@ -66,7 +66,7 @@ def run(
         yard.append(yardsticks(results, env_id, tops[env_id]))
     suite.tables += [*yard, *more]
     share = max(4, round(PRICE_SHARE * episodes))
-    top = tops[YAW].get(SCENARIO) if results.scored(YAW, SCENARIO) else None
+    top = tops[YAW][SCENARIO] if SCENARIO in judged(results, YAW, tops[YAW]) else None
     prices, late = price_of_delay(top, share, salt=salt, jobs=jobs, console=console, keep=keep)
     suite.rows += _price_rows(prices, share, salt)
     suite.tables += _refusals([results, *late])

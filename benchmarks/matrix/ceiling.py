@@ -1,22 +1,55 @@
 """The ceiling of every manoeuvre: the clairvoyant's mean cost, unless a method beats it."""
 
+import numpy as np
+
 from ...envs import FAILURES
-from ..calibrate import FILE, read_calibration
+from ..calibrate import FILE, Entry, read_calibration
 from .results import FAILURE, Results
-from .scores import Ceiling
+from .scores import Array, Ceiling
 
 _OF_THE_CAR = ("none", "spin", "off-road")
+KNOWN = 0.1
+"""Of the way from none to the ceiling: a larger standard error of the ceiling is no yardstick."""
 _ERRORS = 3.0  # standard errors by which a method must win to become the ceiling
 
 
-def ceilings(env_id: str) -> dict[str, Ceiling]:
-    """The calibrated ceiling of each scenario of an id; none where the file is not there."""
+def carried(entry: Entry, none: Array) -> Ceiling:
+    """The clairvoyant's mean cost on other seeds, of which the uncontrolled costs (n,) are known.
+
+    By regression on the uncontrolled cost of the calibration's episodes: a few cars that hardly
+    hold the road decide both means, and are not equally many among any two sets of seeds.
+    """
+    x = np.array([episode.costs["none"] for episode in entry.episodes])
+    y = np.array([episode.cost for episode in entry.episodes])
+    spread = float(((x - x.mean()) ** 2).sum())
+    slope = float(((x - x.mean()) * (y - y.mean())).sum()) / spread if spread > 0.0 else 0.0
+    slope = min(max(slope, 0.0), 1.0)  # nobody does worse than the uncontrolled car
+    ahead = float(none.mean() - x.mean())
+    rest = y - y.mean() - slope * (x - x.mean())
+    share = 1.0 / len(x) + 1.0 / len(none) + (ahead**2 / spread if spread > 0.0 else 0.0)
+    error = float(np.sqrt((rest**2).sum() / (len(x) - 2) * share))
+    return Ceiling(max(float(y.mean()) + slope * ahead, float(y.min())), error)
+
+
+def ceilings(results: Results, env_id: str) -> dict[str, Ceiling]:
+    """The ceiling of each calibrated manoeuvre on the seeds of the results."""
     entries = read_calibration() if FILE.is_file() else {}
+    driven = {cell.scenario for cell in results.found if cell.env_id == env_id}
     return {
-        entry.scenario: Ceiling(entry.clairvoyant, entry.clairvoyant_error)
+        entry.scenario: carried(entry, results.of(env_id, entry.scenario, "none").costs)
         for entry in entries.values()
-        if entry.env_id == env_id
+        if entry.env_id == env_id and entry.scenario in driven
     }
+
+
+def judged(results: Results, env_id: str, tops: dict[str, Ceiling]) -> list[str]:
+    """The manoeuvres that are scored: worth controlling, and what 1 means is known there."""
+    return [
+        name
+        for name, top in tops.items()
+        if results.scored(env_id, name)
+        and top.error < KNOWN * (results.of(env_id, name, "none").costs.mean() - top.mean)
+    ]
 
 
 def calibrated_by() -> str:
@@ -31,7 +64,7 @@ def tops_of(results: Results, env_id: str) -> tuple[dict[str, Ceiling], list[str
 
     The clairvoyant is a local optimum and is calibrated on seeds of its own, so both means err.
     """
-    tops, log = dict(ceilings(env_id)), []
+    tops, log = dict(ceilings(results, env_id)), []
     for cell, result in results.found.items():
         if cell.env_id != env_id or cell.scenario not in tops or result.error:
             continue

@@ -8,6 +8,7 @@ import numpy as np
 
 from ... import __version__
 from ..rows import Row, Table
+from .ceiling import judged
 from .contestants import INFORMED, REFERENCE_CONTROLLER, REFERENCE_FILTER, Cell
 from .drive import NUMBERS, control_period, failed_by, rate_of
 from .results import Result, Results
@@ -53,7 +54,7 @@ def standings(results: Results, env_id: str, tops: dict[str, Ceiling]) -> list[S
     cells = [cell for cell in results.found if cell.env_id == env_id]
     names = list(dict.fromkeys((cell.controller, cell.estimator) for cell in cells))
     scenarios = list(dict.fromkeys(cell.scenario for cell in cells))
-    scored = [s for s in scenarios if s in tops and results.scored(env_id, s)]
+    scored = judged(results, env_id, tops)
     draws: dict[int, Resampled] = {}
     found = []
     for controller, estimator in names:
@@ -225,7 +226,7 @@ def motion_table(title: str, found: list[Standing]) -> Table:
 
 def yardsticks(results: Results, env_id: str, tops: dict[str, Ceiling]) -> Table:
     """What 0 and 1 mean on every manoeuvre, and where a score is given."""
-    cells = []
+    cells, scored = [], judged(results, env_id, tops)
     for scenario in dict.fromkeys(c.scenario for c in results.found if c.env_id == env_id):
         none = results.of(env_id, scenario, "none")
         informed = results.of(env_id, scenario, INFORMED)
@@ -239,14 +240,15 @@ def yardsticks(results: Results, env_id: str, tops: dict[str, Ceiling]) -> Table
                 f"{informed.costs.mean():.3f}",
                 f"{top.mean:.3f}" if top else "",
                 f"{top.error:.3f}" if top else "",
-                "yes" if top and results.scored(env_id, scenario) else "no",
+                "yes" if scenario in scored else "no",
             ]
         )
     return Table(
         f"{env_id}: what 0 and 1 mean (mean cost an episode)",
         ("manoeuvre", "none", "fails / %", "informed", "clairvoyant", "+-", "scored"),
         cells,
-        "A manoeuvre is scored where the uncontrolled car costs more than twice what `informed` "
-        "does and the ceiling is known.",
+        "The clairvoyant's mean is carried over from its calibration seeds by regression on the "
+        "uncontrolled cost. A manoeuvre is scored where the uncontrolled car costs more than twice "
+        "what `informed` does and the ceiling's error is below a tenth of what can be gained.",
         keyed=False,
     )

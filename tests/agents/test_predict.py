@@ -10,6 +10,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 import sideslip
 from sideslip.agents import AGENTS, make_agent
+from sideslip.agents.informed import PARAMETERS
 from sideslip.estimators import EstimateObservation
 from sideslip.estimators.truth import TruthObservation
 from tests.envs.helpers import bits
@@ -29,7 +30,7 @@ def steered() -> gym.Env[Any, Any]:
     """An env with all that any agent needs, whose action steers."""
     env = gym.make("sideslip/AfsYawFusion-v0", scenario="lane-change")
     camera = EstimateObservation(env, "multirate-kf", outputs=["psi", "y_l"])
-    return TruthObservation(EstimateObservation(camera, "dakf", outputs=STATES))
+    return TruthObservation(EstimateObservation(camera, "dakf", outputs=STATES), PARAMETERS)
 
 
 @pytest.mark.parametrize("name", AGENTS)

@@ -10,9 +10,9 @@ import pytest
 from sideslip.agents import make_agent
 from sideslip.agents.rollout import rollout
 from sideslip.benchmarks import control
-from sideslip.benchmarks.calibrate import read_calibration
+from sideslip.benchmarks.calibrate import Entry, Episode, read_calibration
 from sideslip.benchmarks.matrix import contest, drive, results
-from sideslip.benchmarks.matrix.ceiling import refusals_of, tops_of
+from sideslip.benchmarks.matrix.ceiling import carried, judged, refusals_of, tops_of
 from sideslip.benchmarks.matrix.contestants import MANOEUVRES, STEERING, YAW, Cell, cells
 from sideslip.benchmarks.matrix.drive import NUMBERS, Chunk
 from sideslip.benchmarks.matrix.illustrate import _SHOWN, _run
@@ -176,11 +176,45 @@ def test_standings_put_the_best_first_and_rows_hold_them(monkeypatch: pytest.Mon
     rows = rows_of(standing[0], found.salt)
     assert {row.scenario for row in rows} == {*MANOEUVRES[:3], "all"}
     monkeypatch.setattr(
-        "sideslip.benchmarks.matrix.ceiling.ceilings", lambda _: {MANOEUVRES[0]: Ceiling(4.0, 0.01)}
+        "sideslip.benchmarks.matrix.ceiling.ceilings",
+        lambda *_: {MANOEUVRES[0]: Ceiling(4.0, 0.01)},
     )
     raised, log = tops_of(found, YAW)
     assert raised[MANOEUVRES[0]].mean == pytest.approx(2.0, abs=0.02)
     assert len(log) >= 1 and "informed" in log[0]
+
+
+def entry_of(none: np.ndarray, best: np.ndarray) -> Entry:
+    episodes = tuple(
+        Episode(k, float(b), "none", {"none": float(n)}, {}, 1.0)
+        for k, (n, b) in enumerate(zip(none, best, strict=True))
+    )
+    means = float(best.mean()), 0.0, float(none.mean()), 0.0
+    return Entry(YAW, "gust", "", "", "", "", "", *means, "", episodes)
+
+
+def test_a_ceiling_is_carried_to_other_seeds() -> None:
+    """Exactly where it is linear in the uncontrolled cost; else within its error, mostly."""
+    rng = np.random.default_rng(0)
+    none = rng.gamma(1.0, 5.0, 64)
+    other = rng.gamma(1.0, 8.0, 150)
+    sure = carried(entry_of(none, 0.5 + 0.2 * none), other)
+    assert sure.mean == pytest.approx(0.5 + 0.2 * other.mean())
+    assert sure.error == pytest.approx(0.0, abs=1e-12)
+    off = []
+    for _ in range(200):
+        none, other = rng.gamma(1.0, 5.0, 64), rng.gamma(1.0, 5.0, 150)
+        best, there = (5.0 + 0.2 * x + rng.normal(0.0, 1.0, len(x)) for x in (none, other))
+        top = carried(entry_of(none, best), other)
+        off.append((top.mean - there.mean()) / top.error)
+    assert 0.85 < np.std(off) < 1.15 and abs(np.mean(off)) < 0.25
+
+
+def test_an_unsure_ceiling_is_no_yardstick() -> None:
+    asked = [cell for cell in cells(MANOEUVRES[:1]) if cell.env_id == YAW]
+    found = ready(asked)  # none 10
+    assert judged(found, YAW, {MANOEUVRES[0]: Ceiling(1.0, 0.8)}) == [MANOEUVRES[0]]
+    assert judged(found, YAW, {MANOEUVRES[0]: Ceiling(1.0, 1.0)}) == []
 
 
 def test_a_manoeuvre_that_informed_hardly_improves_is_not_scored() -> None:
@@ -202,7 +236,7 @@ def test_a_small_matrix_from_end_to_end(monkeypatch: pytest.MonkeyPatch) -> None
     ]
     top = {SCENARIO: Ceiling(0.1, 0.01)}
     monkeypatch.setattr(control, "cells", lambda: few)
-    monkeypatch.setattr("sideslip.benchmarks.matrix.ceiling.ceilings", lambda _: top)
+    monkeypatch.setattr("sideslip.benchmarks.matrix.ceiling.ceilings", lambda *_: top)
     monkeypatch.setattr("sideslip.benchmarks.matrix.price.DELAYS", (0.0, 0.3))
     monkeypatch.setattr("sideslip.benchmarks.control.DELAYS", (0.0, 0.3))
     monkeypatch.setattr("sideslip.benchmarks.matrix.illustrate.DELAYS", (0.0, 0.3))
