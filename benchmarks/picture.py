@@ -34,7 +34,7 @@ def write_picture(path: str | Path, suites: Sequence[Suite]) -> None:
         )
     ]
     scores = [r for r in rows if r.scenario == "all" and r.metric == "score" and _main(r)]
-    panels.append(("Controlling ten manoeuvres", scores, "score (1: clairvoyant)"))
+    panels.append((f"Controlling, on {REFERENCE_FILTER}", scores, "score (1: clairvoyant)"))
     panels = [panel for panel in panels if panel[1]]
     if not panels:
         raise ValueError("nothing to draw: the picture needs the suites estimation or control")
@@ -74,7 +74,7 @@ def _bars(axis: Any, rows: Sequence[Row], title: str, label: str) -> None:
     """Horizontal bars, the best on top: the smallest error or the highest score."""
     sign = 1.0 if rows[0].metric == "score" else -1.0
     ordered = sorted(rows, key=lambda row: sign * row.value)
-    names = [row.estimator if row.metric == "rmse" else _contestant(row) for row in ordered]
+    names = [row.estimator if row.metric == "rmse" else row.controller for row in ordered]
     scale = 1e3 if METRICS[rows[0].metric] == "rad" else 1.0
     values = [scale * row.value for row in ordered]
     colours = [colour(name) for name in names]
@@ -90,7 +90,3 @@ def _bars(axis: Any, rows: Sequence[Row], title: str, label: str) -> None:
     axis.set_xlabel(label, fontsize=8)
     axis.tick_params(labelsize=8)
     axis.spines[["top", "right"]].set_visible(False)
-
-
-def _contestant(row: Row) -> str:
-    return row.controller if not row.estimator else f"{row.controller} on\n{row.estimator}"
