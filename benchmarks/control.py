@@ -110,10 +110,10 @@ def _price_rows(prices: list[Price], n: int, salt: str) -> list[Row]:
 
 
 def _note(found: list[Standing], episodes: int) -> str:
-    judged = [each for each in found if "score" in each.overall and not each.cell.slow]
-    widest = max((each.overall["score"].half_width for each in judged), default=float("nan"))
+    widths = [s.overall["score"].half_width for s in found if "score" in s.overall]
+    wide = f" The widest interval of a score is +-{max(widths):.3f}." if widths else ""
     return (
-        f"{episodes} episodes a manoeuvre, mpc at most 64. But for it the widest interval of a "
-        f"score is +-{widest:.3f}. better: probability that an episode costs less than one of "
-        "two-dof on exact-kf. A decision is the estimator's step and the controller's, of one car."
+        f"{episodes} episodes a manoeuvre, mpc at most 64.{wide} better: probability that an "
+        "episode costs less than one of two-dof on exact-kf. A decision is the estimator's step "
+        "and the controller's, of one car."
     )

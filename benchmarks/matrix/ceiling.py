@@ -53,10 +53,12 @@ def judged(results: Results, env_id: str, tops: dict[str, Ceiling]) -> list[str]
 
 
 def calibrated_by() -> str:
-    """The commands that made the ceilings."""
+    """How the ceilings were made; their file keeps the command of each."""
     entries = read_calibration() if FILE.is_file() else {}
-    commands = " ".join(f"`{entry.command}`" for entry in entries.values())
-    return f"The ceilings were made by {commands}" if commands else "No ceiling is calibrated."
+    if not entries:
+        return "No ceiling is calibrated."
+    first = next(iter(entries.values())).command
+    return f"Ceilings: `{first}`, and likewise the others, by {FILE.name}."
 
 
 def tops_of(results: Results, env_id: str) -> tuple[dict[str, Ceiling], list[str]]:
