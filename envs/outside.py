@@ -14,6 +14,7 @@ multi-body model's axes are those of its z-down source read as y left: its label
 import dataclasses
 import functools
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from importlib import import_module
 from typing import Any, NamedTuple
@@ -99,7 +100,7 @@ def outside_vehicle() -> Vehicle:
     )
 
 
-class OutsidePlant:
+class OutsidePlant(ABC):
     """One of the models with its state `x` and the newest step's `specific_force`: (a_x, a_y) in
     m/s2 as accelerometers at the centre of gravity feel them at its end.
 
@@ -131,22 +132,22 @@ class OutsidePlant:
         self.specific_force = (0.0, 0.0)
         self.x = np.zeros(0)
 
+    @abstractmethod
     def start(self, motion: Motion) -> None:
         """Put the car at a Motion's velocities, heading and place, wheels rolling."""
-        raise NotImplementedError
 
+    @abstractmethod
     def derivative(self, x: Array, acting: Acting) -> Array:
         """dx/dt of a state, which is left alone (the models themselves change it)."""
-        raise NotImplementedError
 
     @property
+    @abstractmethod
     def motion(self) -> Motion:
         """Where the car is, on a straight road along the ground's x axis."""
-        raise NotImplementedError
 
+    @abstractmethod
     def felt(self, acting: Acting) -> tuple[float, float]:
         """The specific force of the state x under what acts; may raise what the models raise."""
-        raise NotImplementedError
 
     @property
     def finite(self) -> bool:

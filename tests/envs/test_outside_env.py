@@ -1,0 +1,230 @@
+"""The environment around an outside plant: our contract, sensors, failures and refusals."""
+
+import math
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+from sideslip.agents import make_agent
+from sideslip.agents.rollout import rollout
+from sideslip.envs import FAILURES
+from sideslip.envs.layout import Drive, Z
+from sideslip.estimators import EstimateObservation
+
+pytest.importorskip("vehiclemodels")
+from sideslip.envs.outside import Acting, outside_vehicle
+
+from .outside_cars import CALM, MODELS, STEP, V, driven, outside
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_the_environment_keeps_gymnasiums_contract(model: str) -> None:
+    env = outside(model, scenario=STEP | {"duration": 0.3})
+    check_env(env, skip_render_check=True)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_sensors_and_disturbances_draw_what_ours_draw(model: str) -> None:
+    scenario = STEP | {"noise": {}, "duration": 0.2}
+    scenario |= {"disturbance_force": 300.0, "disturbance_moment": 100.0}
+    vehicle = outside_vehicle().to_dict()
+    ours: Any = gym.make("sideslip/YawFusion-v0", scenario=scenario, vehicle=vehicle).unwrapped
+    env = outside(model, scenario=scenario)
+    errors, disturbances = [], []
+    for each in (ours, env):
+        each.reset(seed=5)
+        for _ in range(10):
+            each.step([0.0])
+        errors.append(each.record.fast[-1, 0] - each.motion.gamma)
+        drive = Drive(*each.get_state()["state"][Z.drive : Z.drive + len(Drive._fields)])
+        disturbances.append((drive.F_d, drive.N_d))
+        assert each.ticks_done == 10
+    assert errors[0] == pytest.approx(errors[1], abs=1e-15)
+    assert disturbances[0] == disturbances[1]
+    assert 0.0 not in disturbances[0]
+    assert ours.layout == env.layout
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_a_snapshot_continues_bit_for_bit(model: str) -> None:
+    env = outside(model, scenario=STEP)
+    env.reset(seed=1)
+    env.step([0.3])
+    snapshot = env.get_state()
+    first = [env.step([0.5])[0] for _ in range(5)]
+    env.reset(seed=2)
+    env.set_state(snapshot)
+    np.testing.assert_array_equal([env.step([0.5])[0] for _ in range(5)], first)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_yaw_moment_acts_and_is_told(model: str) -> None:
+    env = outside(model, scenario=CALM | {"lags": False})
+    env.reset(seed=0)
+    for _ in range(10):
+        *_, info = env.step([0.5])
+    assert info["yaw_moment"] == pytest.approx(0.5 * outside_vehicle().yaw_moment_limit, rel=1e-3)
+    assert info["gamma"] > 0.01
+
+
+@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.long
+def test_estimators_and_controllers_run_on_it(model: str) -> None:
+    scenario = {"base": "lane-change", "speed": 20.0, "duration": 3.0, "front_stiffness": 1.0}
+    scenario |= {"rear_stiffness": 1.0, "friction": 1.0, "amplitude": 0.03}
+    env = EstimateObservation(outside(model, scenario=scenario), "exact-kf")
+    drive = rollout(env, make_agent("two-dof", env), 3)
+    assert not drive.failed
+    error, slip = drive["obs_beta_hat"] - drive["beta"], np.sqrt(np.mean(drive["beta"] ** 2))
+    assert slip > 2e-3  # rad
+    assert np.sqrt(np.mean(error**2)) < 0.4 * slip  # the multi-body car's roll is not modelled
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_our_driver_keeps_it_on_a_track(model: str) -> None:
+    track = CALM | {"steering": "driver", "path": "iso-3888-1", "speed": 12.0, "duration": 12.0}
+    env = outside(model, scenario=track | {"half_width": 1.0})
+    env.reset(seed=0)
+    over, left = False, 0.0
+    while not over:
+        *_, terminated, over, _ = env.step([0.0])
+        left = max(left, env.motion.Y)
+        assert not terminated
+    assert left > 3.0
+    assert env.motion.X > 130.0
+
+
+def test_a_spin_ends_the_episode_and_the_rest_is_charged() -> None:
+    env = outside("drift", scenario=CALM)
+    env.reset(seed=0, options={"state": {"v_y": -0.45 * V, "gamma": 2.0}})
+    over, cost = False, 0.0
+    while not over:
+        _, reward, terminated, truncated, info = env.step([0.0])
+        over, cost = terminated or truncated, cost - reward
+    assert FAILURES[info["failure"]] == "spin"
+    assert cost > 100.0 * (2.0 - info["t"]) > 0.0
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_a_state_that_is_no_number_ends_the_episode_with_numbers(model: str) -> None:
+    env = outside(model, scenario=STEP)
+    env.reset(seed=0)
+    env.step([0.0])
+    env.plant.x[3] = np.nan
+    obs, reward, terminated, _, info = env.step([0.0])
+    assert terminated
+    assert FAILURES[info["failure"]] == "not-finite"
+    assert np.isfinite([*obs, reward, *map(float, info.values())]).all()
+    assert np.isfinite(env.record.fast).all()
+
+
+@pytest.mark.parametrize(("place", "value"), [(3, 1e200), (5, -1e200), (3, 0.0), (6, math.inf)])
+@pytest.mark.parametrize("model", MODELS)
+def test_no_state_makes_a_step_raise(model: str, place: int, value: float) -> None:
+    """What is set between ticks: squares that overflow, a car at rest in a turn, no angle."""
+    env = outside(model, scenario=STEP)
+    env.reset(seed=0)
+    env.step([0.0])
+    env.plant.x[5], env.plant.x[place] = 1.0, value
+    obs, reward, terminated, _, info = env.step([0.0])
+    if value != 0.0:
+        assert terminated
+        assert FAILURES[info["failure"]] == "not-finite"
+    assert np.isfinite([*obs, reward, *map(float, info.values())]).all()
+    assert np.isfinite(env.record.fast).all()
+
+
+def test_a_state_whose_squares_are_no_numbers_is_not_finite() -> None:
+    """As in our kernel: the references and sensors take them."""
+    for model, places in (("drift", (3, 5)), ("multi-body", (3, 5, 10))):
+        for place in places:
+            plant = driven(model, Acting(0.0), 0.001)
+            assert plant.finite
+            plant.x[place] = 1e160
+            assert not plant.finite
+
+
+def test_a_force_that_cannot_be_told_makes_the_state_no_number(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The derivative at the end of a step is asked for by the accelerometers alone."""
+    env = outside("multi-body", scenario=STEP)
+    env.reset(seed=0)
+    env.step([0.0])
+
+    def nothing(acting: Acting) -> tuple[float, float]:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(env.plant, "felt", nothing)
+    *_, info = env.step([0.0])
+    assert FAILURES[info["failure"]] == "not-finite"
+    assert np.isfinite(env.record.fast).all()
+
+
+def test_a_wheel_at_rest_in_a_spin_makes_the_state_no_number() -> None:
+    plant = driven("multi-body", Acting(0.0), 0.01)
+    plant.x[3], plant.x[5] = 1.0, 2.0 / plant.p.T_r  # the inner rear wheel stands still
+    plant.step(Acting(0.0), 1e-3)
+    assert not plant.finite
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("curvature", 0.01),
+        ("bank", 0.05),
+        ("grade", 0.05),
+        ("small_angle", True),
+        ("linear_tyres", True),
+        ("vehicle", {"mass": 1500.0}),
+        ("friction_right", 0.3),
+        ("tyre_change_time", 1.0),
+    ],
+)
+def test_a_scenario_of_our_own_plant_is_refused(field: str, value: Any) -> None:
+    with pytest.raises(ValueError, match=f"{field} .* is of our own plant"):
+        outside("drift", scenario={field: value})
+    env = outside("drift", scenario=STEP)
+    with pytest.raises(ValueError, match=field):
+        env.reset(options={"scenario": {field: value}})
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"vehicle": "coms"}, "its own vehicle"),
+        ({"state": {"s": 1.0}}, "s follows from X and Y"),
+        ({"state": {"phi": 0.1}}, "drift model has no roll"),
+        ({"wheels": 3}, "unknown reset option wheels"),
+    ],
+)
+def test_an_option_that_has_no_meaning_is_refused(options: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        outside("drift", scenario=STEP).reset(options=options)
+
+
+def test_unknown_models_and_vehicles_are_refused() -> None:
+    with pytest.raises(ValueError, match="unknown model 'brick'; known: single-track, drift"):
+        outside("brick")
+    with pytest.raises(TypeError, match="its own vehicle"):
+        outside("drift", vehicle="coms")
+    env, other = outside("drift", scenario=STEP), outside("single-track", scenario=STEP)
+    env.reset(seed=0)
+    other.reset(seed=0)
+    with pytest.raises(ValueError, match="'drift', not 'single-track'"):
+        other.set_state(env.get_state())
+
+
+def test_a_bad_action_is_refused_or_fails_as_in_every_environment() -> None:
+    env = outside("drift", scenario=STEP)
+    env.reset(seed=0)
+    before = env.plant.x.copy()
+    with pytest.raises(ValueError, match="not finite; nothing was stepped"):
+        env.step([np.nan])
+    np.testing.assert_array_equal(env.plant.x, before)
+    env = outside("drift", scenario=STEP, on_bad_action="fail")
+    env.reset(seed=0)
+    assert FAILURES[env.step([np.nan])[4]["failure"]] == "bad-action"
