@@ -15,6 +15,7 @@ from ..envs.pace import Pace, acceleration_command
 from ..envs.programme import DRIVER, FOREVER, STEERING_WIDTH, Wind, steering_at, wind_at
 from ..envs.record import TICK
 from ..envs.reference import Target
+from ..envs.scratch import scratch_of
 from ..envs.switches import REPORT, Switches
 
 Array = npt.NDArray[np.float64]
@@ -171,14 +172,15 @@ def _driven(base: Any, snapshot: Any, actions: Array, n: int) -> tuple[Array, Ar
     bounds = np.array([[entry.low, entry.high] for entry in base.layout]).T.copy()
     obs = np.empty(len(base.layout), np.float32)
     rows, packets, report = snapshot["rows"], snapshot["packets"], np.zeros(len(REPORT))
-    switches = snapshot["template"].switches
+    switches, scratch = snapshot["template"].switches, scratch_of(1)
     taken = np.repeat(np.vstack([actions, actions[-1:]]).astype(np.float32), n, axis=0)
     ticks = n * len(actions)
     drive, driver = np.empty((ticks + 1, len(Drive._fields))), np.empty(ticks + 1)
     for tick in range(ticks + 1):
         drive[tick] = z[Z.drive : Z.drive + drive.shape[1]]
         driver[tick] = z[Z.driver]
-        step_vehicle(p, z, switches, taken[tick], 1, bounds, obs, rows, packets, report)
+        told = (bounds, obs, rows, packets, report, scratch)
+        step_vehicle(p, z, switches, taken[tick], 1, *told)
     return np.nan_to_num(drive), np.nan_to_num(driver)  # a car thrown about may leave the numbers
 
 

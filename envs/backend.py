@@ -94,58 +94,114 @@ def _compiled(function: F, options: dict[str, Any]) -> F:
         config.CACHE_DIR = before
 
 
-@jit
 def minimum(a: Any, b: Any) -> Any:
     """The smaller of two numbers."""
     return a if a < b else b
 
 
-@jit
 def maximum(a: Any, b: Any) -> Any:
     """The larger of two numbers."""
     return a if a > b else b
 
 
-@jit
 def absolute(a: Any) -> Any:
     """|a|."""
     return a if a > 0.0 else 0.0 - a
 
 
-@jit
 def floor(a: Any) -> Any:
     """The largest whole number at or below a, as a float."""
     return math.floor(a) * 1.0
 
 
-@jit
 def sqrt(a: Any) -> Any:
     """The square root, correctly rounded."""
     return math.sqrt(a)
 
 
-@jit
 def select(condition: Any, a: Any, b: Any) -> Any:
     """a where the condition holds, else b (both are evaluated)."""
     return a if condition else b
 
 
-@jit
 def to_float(a: Any) -> Any:
     """An integer as a float."""
     return a * 1.0
 
 
-def fixed_tuple(vector: Any, length: int) -> tuple[float, ...]:
-    """The first `length` entries of a vector as a tuple of scalars."""
+def whole(a: Any) -> Any:
+    """A whole number that is a float, as an integer."""
+    return int(a)
+
+
+def anywhere(condition: Any) -> Any:
+    """Whether a condition holds for any of the vehicles that are computed together."""
+    return condition
+
+
+PRIMITIVES: tuple[Callable[..., Any], ...] = (
+    minimum, maximum, absolute, floor, sqrt, select, to_float, whole, anywhere,
+)  # fmt: skip
+"""What the equations use beside + - * /; each kind of number has its own table of these."""
+
+
+def _for_numbers(primitive: Callable[..., Any]) -> None:
+    """The compiler takes a primitive's own text where its arguments are single numbers."""
+
+    @overload(primitive, strict=False)
+    def _of(*args):  # type: ignore[no-untyped-def]
+        alone = all(isinstance(each, numba.types.Number | numba.types.Boolean) for each in args)
+        return primitive if alone else None
+
+
+for _each in PRIMITIVES:
+    _for_numbers(_each)
+
+
+def fixed_tuple(vector: Any, length: int) -> tuple[Any, ...]:
+    """The first `length` entries of a vector as a tuple of numbers.
+
+    Of a matrix (length or more, lanes), whose rows are lanes, it is a tuple of these; so in `at`
+    and `put`, where an array has one axis more than there are indices.
+    """
     return tuple(vector[:length].tolist())
+
+
+def at(array: Any, *index: int) -> Any:
+    """The number of an array at an index."""
+    return float(array[index])
+
+
+def put(array: Any, value: Any, *index: int) -> None:
+    """Write a number into an array."""
+    array[index] = value
+
+
+def of_lane(array: Any, lane: int, *index: int) -> Any:
+    """The number of one of those abreast; of single ones there is but the first."""
+    return float(array[index])
+
+
+def abreast() -> int:
+    """How many numbers `ramp` gives and `put_along` writes at once."""
+    return 1
+
+
+def ramp(first: int) -> Any:
+    """The whole numbers from `first` on, `abreast` of them."""
+    return first
+
+
+def put_along(array: Any, values: Any, i: int, j: int) -> None:
+    """Write numbers into the row i of a matrix from the column j on, `abreast` of them."""
+    array[i, j] = values
 
 
 @overload(fixed_tuple, prefer_literal=True)
 def _fixed_tuple(vector, length):  # type: ignore[no-untyped-def]  # numba compares signatures
     size = getattr(length, "literal_value", None)
-    if size is None:
-        return None  # numba asks again with the literal
+    if size is None or vector.ndim != 1:
+        return None  # without the literal numba asks again
     return lambda vector, length: to_fixed_tuple(vector, size)  # type: ignore[call-arg]
 
 
@@ -157,6 +213,8 @@ ARRAYS: dict[str, Callable[..., Any]] = {
     "sqrt": np.sqrt,
     "select": np.where,
     "to_float": lambda a: np.multiply(a, 1.0),
+    "whole": lambda a: np.asarray(a).astype(np.int64),
+    "anywhere": np.any,
 }
 """The primitives for NumPy arrays, by the names the equations use."""
 

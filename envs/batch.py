@@ -2,12 +2,14 @@
 
 from typing import Any
 
-from .backend import jit
-from .kernel import step_vehicle
+from .backend import abreast, jit
+from .block import step_block
+from .kernel import kind_of, shares_of, step_vehicle
 from .restart import reset_vehicle
 from .switches import REFUSED, REPORT, RUNNING, Switches
 
 _FAIL_BAD = Switches._fields.index("fail_bad")
+_FEW = 2  # up to so many vehicles are stepped one by one
 
 
 @jit
@@ -28,26 +30,70 @@ def step_rows(
     rewards: Any,
     terminated: Any,
     truncated: Any,
+    scratch: Any,
+    block: Any,
 ) -> int:
     """One env-step of every row, and how many episodes ended; every array has a row for each.
 
     over: rows whose episode had ended stand still, with reward 0, and do not end again; then those
     that ended in this step. Returns REFUSED, and steps nothing, where an action that is not to
-    fail its row is not finite.
+    fail its row is not finite. scratch: what `scratch_of` gives. block: what rows that are computed
+    together need, a `Block`.
     """
     for i in range(len(over)):
         if switches[i, _FAIL_BAD] == 0 and not over[i]:
             for share in actions[i]:
                 if float(share) - float(share) != 0.0:
                     return REFUSED
+    every = (params, states, switches, actions, obs, rows, packets, reports)
+    waiting, last = 0, len(over) - 1
+    for m in range(len(over)):
+        i = block.order[m]
+        if not over[i]:
+            share, _ = shares_of(actions[i])
+            if share != share:
+                ticks_done[i] = _step_alone(i, every, n, bounds, scratch)
+                obs[i, :] = 0.0
+            else:
+                block.members[waiting] = i
+                waiting += 1
+        if waiting and (waiting == abreast() or m == last or _kinds_differ(m, every, block)):
+            together = False
+            if waiting > _FEW:
+                together = step_block(waiting, every, n, bounds, block)
+            for lane in range(waiting):
+                row = block.members[lane]
+                ticks_done[row] = n if together else _step_alone(row, every, n, bounds, scratch)
+            waiting = 0
     ended = 0
     for i in range(len(over)):
-        rewards[i], terminated[i], truncated[i] = 0.0, False, False
         if over[i]:
-            over[i] = False
+            rewards[i], terminated[i], truncated[i], over[i] = 0.0, False, False, False
             continue
         report = reports[i]
-        done = step_vehicle(
+        delivered[i] = int(report[REPORT.packets])
+        rewards[i] = -report[REPORT.cost]
+        terminated[i] = report[REPORT.failure] != RUNNING
+        truncated[i] = report[REPORT.ended] == 1.0 and not terminated[i]
+        over[i] = terminated[i] or truncated[i]
+        if over[i]:
+            ended += 1
+    return ended
+
+
+@jit
+def _kinds_differ(m: int, every: Any, block: Any) -> bool:
+    """Whether the next row in order has another text than this one."""
+    params, switches = every[0], every[2]
+    i, j = block.order[m], block.order[m + 1]
+    return bool(kind_of(params[i], switches[i]) != kind_of(params[j], switches[j]))
+
+
+@jit
+def _step_alone(i: int, every: Any, n: int, bounds: Any, scratch: Any) -> int:
+    params, states, switches, actions, obs, rows, packets, reports = every
+    return int(
+        step_vehicle(
             params[i],
             states[i],
             switches[i],
@@ -57,19 +103,10 @@ def step_rows(
             obs[i],
             rows[i],
             packets[i],
-            report,
+            reports[i],
+            scratch,
         )
-        if done <= 0:
-            obs[i, :] = 0.0
-        ticks_done[i] = done
-        delivered[i] = int(report[REPORT.packets])
-        rewards[i] = -report[REPORT.cost]
-        terminated[i] = report[REPORT.failure] != RUNNING
-        truncated[i] = report[REPORT.ended] == 1.0 and not terminated[i]
-        over[i] = terminated[i] or truncated[i]
-        if over[i]:
-            ended += 1
-    return ended
+    )
 
 
 @jit

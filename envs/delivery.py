@@ -3,14 +3,14 @@
 Packets are delivered in the order (captured tick, sensor); what is under way lies in the state.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 from .backend import fixed_tuple, inlined, jit, minimum
 from .dynamics import Road
 from .elementary import exp
 from .layout import P, Z
 from .noise import CHANNELS, normals
-from .record import CAMERA, FAST, GPS, PACKET, PACKET_WIDTH, VALUES
+from .record import CAMERA, GPS, PACKET, PACKET_WIDTH, VALUES
 from .sensors import (
     IN_FLIGHT,
     NEVER,
@@ -26,6 +26,13 @@ from .sensors import (
 FAR = 1e15
 _LINK, _NOISE, _ROAD = len(Link._fields), len(Noise._fields), len(Road._fields)
 _SKY = len(Sky._fields)
+
+
+class Chance(NamedTuple):
+    """The random numbers of a tick, four standard normal ones each."""
+
+    inertial: Any
+    wheels: Any
 
 
 @jit
@@ -96,35 +103,44 @@ def _deliver(z: Any, tick: Any, packets: Any, count: int) -> int:
 
 
 @inlined
-def sense(
-    p: Any,
-    z: Any,
-    motion: Any,
-    small_angle: int,
-    accel: Any,
-    inputs: Any,
-    rows: Any,
-    j: int,
-    packets: Any,
-    count: int,
-    n_fast: Any,
-    wheels: Any,
-) -> int:
-    """Sensors sample the state at the current tick and due packets are delivered.
+def fast_row(motion: Any, accel: Any, acted: Any, d_f: Any, noise: Any, chance: Any) -> Any:
+    """The fast sensors at a tick, columns as in `Fast`.
 
-    accel: (a_x, a_y) specific forces. inputs: what acted, in the order of Fast from `steer` on.
+    accel: (a_x, a_y) specific forces. acted: what acted, in the order of `Fast` from `steer` on.
+    """
+    n, wheels = chance.inertial, chance.wheels
+    half = 0.5 * d_f * motion.gamma
+    return (
+        motion.gamma + noise.gyro_bias + noise.gyro * n[0],
+        accel[1] + noise.accel_y_bias + noise.accel * n[1],
+        accel[0] + noise.accel * n[2],
+        motion.phi_dot + noise.roll_rate * n[3],
+        motion.v_x - half + noise.wheel * wheels[0],
+        motion.v_x + half + noise.wheel * wheels[1],
+        acted[0],
+        acted[1],
+        acted[2],
+        acted[3],
+        acted[4],
+    )
+
+
+@jit
+def due(z: Any, tick: Any) -> bool:
+    """Whether a slow sensor captures or a packet arrives at a tick."""
+    captures = (tick == z[Z.camera + 1]) | (tick == z[Z.gps + 1])
+    return bool(captures | (tick >= z[Z.clock + 5]))
+
+
+@jit
+def sense_slow(
+    p: Any, z: Any, motion: Any, tick: Any, small_angle: int, packets: Any, count: int
+) -> int:
+    """The slow sensors sample the motion at a tick, and due packets are delivered.
+
+    Returns how many packets there are then.
     """
     noise = Noise(*fixed_tuple(p[P.noise :], _NOISE))
-    half = 0.5 * p[P.car + 6] * motion.gamma
-    row = rows[j]
-    row[FAST.gyro] = motion.gamma + noise.gyro_bias + noise.gyro * n_fast[0]
-    row[FAST.accel_y] = accel[1] + noise.accel_y_bias + noise.accel * n_fast[1]
-    row[FAST.accel_x] = accel[0] + noise.accel * n_fast[2]
-    row[FAST.roll_rate] = motion.phi_dot + noise.roll_rate * n_fast[3]
-    row[FAST.wheel_left] = motion.v_x - half + noise.wheel * wheels[0]
-    row[FAST.wheel_right] = motion.v_x + half + noise.wheel * wheels[1]
-    store(row, FAST.steer, inputs)
-    tick = z[Z.clock + 2]
     key = (int(z[Z.clock]), int(z[Z.clock + 1]))
     if tick == z[Z.camera + 1]:
         link = Link(*fixed_tuple(p[P.camera :], _LINK))

@@ -8,6 +8,7 @@ import numpy.typing as npt
 from gymnasium.utils import seeding
 
 from .batch import reset_rows
+from .block import block_of
 from .border import options_of
 from .dynamics import Motion
 from .episode import Each, record_in, slow_in, vehicle_in
@@ -15,6 +16,7 @@ from .layout import Array, P, Z
 from .programme import DRAWS_WIDTH
 from .record import FAST_WIDTH, PACKET_WIDTH, TICK, Record, SlowSensor
 from .scenario import Scenario
+from .scratch import scratch_of
 from .setting import Setting
 from .switches import REPORT, Switches
 from .template import Template
@@ -49,6 +51,8 @@ class Fleet:
         self.final_ticks_done = self.ticks_done.copy()
         self.final_delivered = self.delivered.copy()
         self._drawn = np.zeros(DRAWS_WIDTH)
+        self.scratch = scratch_of(self.control_period)
+        self.block = block_of(N, self.control_period)
         self.templates: list[Template] = [self.setting.base] * N
         self.generators: list[np.random.Generator | None] = [None] * N
         self.seeds: list[int | None] = [None] * N
@@ -106,6 +110,14 @@ class Fleet:
             self.final_ticks_done,
             self.final_delivered,
         )
+        self._sort()
+
+    def _sort(self) -> None:
+        """Rows whose ticks have the same text stand next to each other in the block's order."""
+        lags = self.params[:, [P.motor, P.steer]] > 0.0
+        kinds = np.hstack([self.switches, lags])
+        mixed = (kinds != kinds[0]).any()
+        self.block.order[:] = np.lexsort(kinds.T) if mixed else np.arange(self._count)
 
     def generator(self, i: int) -> np.random.Generator:
         """A row's, which draws one 64-bit key a reset; seeded by chance if it never was."""

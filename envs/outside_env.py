@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from .actuators import Lag, distribute, lagged, slewed, within_stop, yaw_moment
 from .backend import absolute
-from .delivery import sense, store
+from .delivery import Chance, due, fast_row, sense_slow, store
 from .driver import Driver, steered
 from .dynamics import Motion, Road, sideslip_angle
 from .layout import Disturbance, Drive, P, Task, Z
@@ -21,6 +21,7 @@ from .programme import DRIVER, STEERING_WIDTH, Wind, steering_at, wind_at
 from .record import FAST, TICK
 from .reference import COST_CAP, Target, cost_rate, reference
 from .scenario import Scenario
+from .sensors import Noise
 from .stability import StabilityEnv
 from .summary import clip, observe, write_report
 from .switches import NOT_FINITE, OFF_ROAD, REPORT, RUNNING, SPIN
@@ -129,7 +130,10 @@ class OutsideEnv(StabilityEnv):
         if failure != RUNNING:  # the rest of the episode is charged: failing never pays
             cost += COST_CAP * (told.task.duration - z[Z.clock + 2]) * TICK
         self._tell(done, count, refs, obs)
-        write_report(self._report, z, self.motion, beta, refs, steer, moment)
+        write_report(self._report, z)
+        self._report[REPORT.beta] = beta
+        self._report[[REPORT.beta_ref, REPORT.gamma_ref]] = refs
+        self._report[REPORT.steer], self._report[REPORT.yaw_moment] = steer, moment
         self._report[REPORT.cost], self._report[REPORT.reward] = cost, -cost
         self._report[REPORT.packets], self._report[REPORT.ended] = count, float(self._at_end)
         return done
@@ -191,22 +195,12 @@ class OutsideEnv(StabilityEnv):
     def _sense(self, motion: Motion, acted: tuple[float, ...], row: int, count: int) -> int:
         """The sensors at the tick just reached; returns how many packets there are now."""
         force = self.plant.specific_force if self.plant.finite else (0.0, 0.0)
-        fast, wheels = self._normals(CHANNELS.inertial), self._normals(CHANNELS.wheels)
-        return int(
-            sense(
-                self._params,
-                self._state,
-                motion,
-                0,
-                force,
-                acted,
-                self.rows,
-                row,
-                self.packets,
-                count,
-                fast,
-                wheels,
-            )
+        p, z, tick = self._params, self._state, float(self._state[Z.clock + 2])
+        chance = Chance(self._normals(CHANNELS.inertial), self._normals(CHANNELS.wheels))
+        noise, d_f = _part(p, Noise, P.noise), float(p[P.car + 6])
+        self.rows[row] = fast_row(motion, force, acted, d_f, noise, chance)
+        return (
+            int(sense_slow(p, z, motion, tick, 0, self.packets, count)) if due(z, tick) else count
         )
 
     def _failure(self, told: "_Told", motion: Motion, beta: float) -> int:

@@ -2,7 +2,7 @@
 
 from typing import Any, NamedTuple
 
-from .backend import inlined, maximum, minimum, select
+from .backend import anywhere, inlined, maximum, minimum, select
 from .elementary import sincos
 from .record import TICK
 
@@ -31,7 +31,7 @@ def acceleration_command(tick: Any, v_x: Any, integral: Any, pace: Any, limit: A
     ahead = select((tick >= pace.start) & (tick < pace.end), pace.acceleration, 0.0)
     since = (minimum(maximum(tick, pace.start), pace.end) - pace.start) * TICK
     speed = pace.speed + pace.acceleration * since
-    if pace.surge != 0.0:
+    if anywhere(pace.surge != 0.0):
         s, c = sincos(pace.surge_rate * (tick * TICK))
         ahead = ahead + pace.surge * s
         speed = speed + pace.surge / pace.surge_rate * (1.0 - c)

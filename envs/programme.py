@@ -7,7 +7,7 @@ can reset its rows without Python.
 
 from typing import Any, NamedTuple
 
-from .backend import fixed_tuple, floor, jit, maximum, minimum, select
+from .backend import anywhere, fixed_tuple, floor, jit, maximum, minimum, select
 from .elementary import PI, sincos, smoothstep
 from .noise import CHANNELS, uniforms
 from .record import TICK
@@ -84,15 +84,17 @@ def steering_at(tick: Any, programme: Any) -> Any:
         k = 5 * SINES + 3 * i
         angle = angle + programme[k] * smoothstep((tick - programme[k + 1]) / programme[k + 2])
     k = _RAMP_AT
-    if programme[k] != 0.0:
-        share = (tick - programme[k + 1]) / programme[k + 2]
+    used = programme[k] != 0.0
+    if anywhere(used):
+        share = (tick - programme[k + 1]) / select(used, programme[k + 2], 1.0)
         angle = angle + programme[k] * minimum(maximum(share, 0.0), 1.0)
     k = _SWEEP_AT
-    if programme[k] != 0.0:
+    used = programme[k] != 0.0
+    if anywhere(used):
         t = maximum(tick - programme[k + 3], 0.0) * TICK
         grown = minimum(t, programme[k + 4])
         phase = programme[k + 1] * t + programme[k + 2] * (
-            0.5 * grown * grown / programme[k + 4] + (t - grown)
+            0.5 * grown * grown / select(used, programme[k + 4], 1.0) + (t - grown)
         )
         angle = angle + programme[k] * sincos(phase)[0]
     return angle

@@ -3,7 +3,7 @@
 from typing import Any
 
 from .backend import fixed_tuple, jit, select
-from .delivery import FAR, sense, store
+from .delivery import FAR, Chance, fast_row, sense_slow, store
 from .driver import Driver, wanted_angle
 from .dynamics import Car, Motion, Road, gravity_at, sideslip_angle
 from .layout import P, Z
@@ -19,14 +19,14 @@ from .programme import (
 )
 from .record import CAMERA, FAST, PACKET, PACKET_WIDTH
 from .reference import Target, reference
-from .sensors import IN_FLIGHT, NEVER, Link, clock_phase
+from .sensors import IN_FLIGHT, NEVER, Link, Noise, clock_phase
 from .summary import observe, write_report
 from .switches import REPORT
 from .tracks import Path, laid
 from .vehicle import GRAVITY
 
 _CAR, _MOTION, _LINK, _TARGET = (len(each._fields) for each in (Car, Motion, Link, Target))
-_ROAD, _DRIVER, _PATH = (len(each._fields) for each in (Road, Driver, Path))
+_ROAD, _DRIVER, _PATH, _NOISE = (len(each._fields) for each in (Road, Driver, Path, Noise))
 _S = Motion._fields.index("s")
 
 
@@ -116,10 +116,12 @@ def reset_vehicle(
     beta = sideslip_angle(motion.v_x, motion.v_y, switches[0])
     fast = normals(key_low, key_high, 0, CHANNELS.inertial)
     wheels = normals(key_low, key_high, 0, CHANNELS.wheels)
-    inputs = (steer, 0.0, 0.0, steer, 0.0)
+    acted = (steer, 0.0, 0.0, steer, 0.0)
     g_x, g_y = gravity_at(motion, road, switches[0])
     accel = (g_x, g_y + GRAVITY * motion.phi)
-    count = sense(p, z, motion, switches[0], accel, inputs, rows, 0, packets, 0, fast, wheels)
+    noise = Noise(*fixed_tuple(p[P.noise :], _NOISE))
+    store(rows[0], 0, fast_row(motion, accel, acted, p[P.car + 6], noise, Chance(fast, wheels)))
+    count = sense_slow(p, z, motion, 0.0, switches[0], packets, 0)
     v = 0.5 * (rows[0, FAST.wheel_left] + rows[0, FAST.wheel_right])
     refs = reference(steer, v, target, switches[2])
     if switches[4]:  # every sample of the step is asked for: tick 0 stands for all of them
@@ -128,7 +130,11 @@ def reset_vehicle(
         observe(p, z, switches, rows, len(rows), count, packets, refs, bounds, obs)
     else:
         observe(p, z, switches, rows, 1, count, packets, refs, bounds, obs)
-    write_report(report, z, motion, beta, refs, steer, 0.0)
+    write_report(report, z)
+    report[REPORT.beta] = beta
+    report[REPORT.beta_ref], report[REPORT.gamma_ref] = refs
+    report[REPORT.steer] = steer
+    report[REPORT.yaw_moment] = 0.0
     report[REPORT.cost] = 0.0
     report[REPORT.reward] = 0.0
     report[REPORT.packets] = count

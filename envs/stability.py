@@ -19,6 +19,7 @@ from .programme import DRAWS_WIDTH
 from .record import FAST_WIDTH, PACKET_WIDTH, TICK, Record, SlowSensor
 from .restart import reset_vehicle
 from .scenario import Scenario
+from .scratch import scratch_of
 from .setting import Setting
 from .switches import REFUSED, REPORT, RUNNING
 from .vehicle import Vehicle, vehicle_from
@@ -134,6 +135,7 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
         self.observation_space = gym.spaces.Box(low, high, dtype=np.float32)
         self.action_space = gym.spaces.Box(-1.0, 1.0, (self.setting.action_width,), np.float32)
         self._params, self._state = np.zeros(P.end), np.zeros(Z.end)
+        self._scratch = scratch_of(self.control_period)
         self.rows = np.zeros((self.control_period, FAST_WIDTH))
         self.packets = np.zeros((self.setting.room, PACKET_WIDTH))
         self._report = np.zeros(len(REPORT))
@@ -210,6 +212,7 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
             self.rows,
             self.packets,
             self._report,
+            self._scratch,
         )
 
     def _info(self, done: int) -> dict[str, Any]:

@@ -67,16 +67,9 @@ def observe(
 
 
 @jit
-def write_report(
-    report: Any, z: Any, motion: Any, beta: Any, refs: Any, steer: Any, N_z: Any
-) -> None:
-    """Write what `info` tells; cost, reward and packets are the caller's."""
+def write_report(report: Any, z: Any) -> None:
+    """Write what `info` tells of the state; what the step made of it is the caller's."""
     report[REPORT.t] = z[Z.clock + 2] * TICK
-    report[REPORT.beta] = beta
-    report[REPORT.gamma] = motion.gamma
-    report[REPORT.psi] = motion.psi
-    report[REPORT.beta_ref] = refs[0]
-    report[REPORT.gamma_ref] = refs[1]
-    report[REPORT.steer] = steer
-    report[REPORT.yaw_moment] = N_z
+    report[REPORT.gamma] = z[Z.motion + 2]
+    report[REPORT.psi] = z[Z.motion + 3]
     report[REPORT.failure] = z[Z.clock + 3]

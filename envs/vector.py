@@ -156,6 +156,8 @@ class StabilityVectorEnv(Fleet, VectorEnv[Observations, Any, npt.NDArray[Any]]):
             rewards,
             terminated,
             truncated,
+            self.scratch,
+            self.block,
         )
         if ended == REFUSED:
             bad = np.flatnonzero(~np.isfinite(told).all(1) & ~self.over)

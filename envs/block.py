@@ -1,0 +1,101 @@
+"""One env-step of several vehicles of one kind, computed abreast in lanes; compiled."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from .backend import abreast, at, jit
+from .kernel import conclude, drive_on, kind_of, shares_of
+from .lanes import LANES
+from .layout import Array, P, Z
+from .record import FAST_WIDTH
+from .scratch import foresee_abreast, scratch_of
+from .switches import REPORT
+
+_TOLD = len(REPORT)
+_MOVING = Z.camera  # what a tick changes comes first in a state, but for the driver's angle
+
+
+class Block(NamedTuple):
+    """Room for the rows that are computed abreast; the last axis is the lanes'."""
+
+    order: npt.NDArray[np.int64]  # (N,), all rows, those of one kind next to each other
+    members: npt.NDArray[np.int64]  # (lanes,), the rows that are computed now
+    params: Array
+    states: Array
+    shares: Array
+    rows: Array
+    reports: Array
+    scratch: Array
+
+
+def block_of(count: int, n: int) -> Block:
+    """The block of an env of `count` rows and n ticks a step."""
+    return Block(
+        np.arange(count),
+        np.zeros(LANES, np.int64),
+        np.zeros((P.end, LANES)),
+        np.zeros((Z.end, LANES)),
+        np.zeros((2, LANES)),
+        np.zeros((n, FAST_WIDTH, LANES)),
+        np.zeros((_TOLD, LANES)),
+        scratch_of(n, LANES),
+    )
+
+
+@jit
+def step_block(count: int, every: Any, n: int, bounds: Any, block: Any) -> bool:
+    """One env-step of the first `count` of the block's members, of one kind, whose actions are
+    finite; False, and nothing is changed, where not all of them come to the step's end."""
+    params, states, switches, actions, obs, rows, packets, reports = every
+    for lane in range(abreast()):
+        i = block.members[lane if lane < count else 0]  # spare lanes repeat the first
+        for k in range(P.end):
+            block.params[k, lane] = params[i, k]
+        for k in range(_MOVING):
+            block.states[k, lane] = states[i, k]
+        block.states[Z.driver, lane] = states[i, Z.driver]
+        block.shares[0, lane], block.shares[1, lane] = shares_of(actions[i])
+    first = block.members[0]
+    kind = kind_of(params[first], switches[first])
+    foresee_abreast(block.params, block.states, n, kind.follows, block.scratch)
+    done = drive_on(
+        block.params,
+        block.states,
+        kind,
+        at(block.shares, 0),
+        at(block.shares, 1),
+        n,
+        block.rows,
+        block.reports,
+        block.scratch,
+        False,
+    )
+    if done == 0:
+        return False
+    for lane in range(count):
+        i = block.members[lane]
+        for k in range(_MOVING):
+            states[i, k] = block.states[k, lane]
+        states[i, Z.driver] = block.states[Z.driver, lane]
+        for k in range(_TOLD):
+            reports[i, k] = block.reports[k, lane]
+        for j in range(n):
+            for k in range(FAST_WIDTH):
+                rows[i, j, k] = block.rows[j, k, lane]
+        conclude(
+            params[i],
+            states[i],
+            switches[i],
+            n,
+            n,
+            bounds,
+            obs[i],
+            rows[i],
+            packets[i],
+            reports[i],
+            block.scratch,
+            lane,
+        )
+    return True
