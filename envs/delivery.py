@@ -12,7 +12,6 @@ from .layout import P, Z
 from .noise import CHANNELS, normals
 from .record import CAMERA, GPS, PACKET, PACKET_WIDTH, VALUES
 from .sensors import (
-    IN_FLIGHT,
     NEVER,
     Link,
     Noise,
@@ -45,17 +44,10 @@ def store(vector: Any, start: int, values: Any) -> None:
 @jit
 def _push(z: Any, sensor: int, captured: Any, due: Any, quality: Any, frame: Any, v: Any) -> None:
     """Put a captured sample on its way; the arrays' room was checked when the env was built."""
-    for slot in range(IN_FLIGHT):
-        at = Z.queue + (sensor * IN_FLIGHT + slot) * PACKET_WIDTH
-        if z[at + PACKET.arrived] == NEVER:
-            z[at + PACKET.sensor] = sensor
-            z[at + PACKET.captured] = captured
-            z[at + PACKET.arrived] = due
-            z[at + PACKET.quality] = quality
-            z[at + PACKET.sequence] = frame
-            for i in range(VALUES):
-                z[at + PACKET.value + i] = v[i]
-            break
+    slot = int(z[Z.under_way])
+    store(z, Z.queue + slot * PACKET_WIDTH, (sensor * 1.0, captured, due, quality, frame))
+    store(z, Z.queue + slot * PACKET_WIDTH + PACKET.value, v)
+    z[Z.under_way] = slot + 1.0
     z[Z.clock + 5] = minimum(z[Z.clock + 5], due)
 
 
@@ -78,14 +70,15 @@ def _deliver(z: Any, tick: Any, packets: Any, count: int) -> int:
     """Move the packets that arrive at this tick into `packets`; returns the new count."""
     while True:
         best, best_rank, due = -1, FAR, FAR
-        for slot in range(2 * IN_FLIGHT):
+        under_way = int(z[Z.under_way])
+        for slot in range(under_way):
             at = Z.queue + slot * PACKET_WIDTH
             arrived = z[at + PACKET.arrived]
             if arrived == tick:
                 rank = 2.0 * z[at + PACKET.captured] + z[at + PACKET.sensor]
                 if rank < best_rank:
                     best, best_rank = at, rank
-            elif arrived != NEVER:
+            else:
                 due = minimum(due, arrived)
         if best < 0:
             z[Z.clock + 5] = due
@@ -98,7 +91,10 @@ def _deliver(z: Any, tick: Any, packets: Any, count: int) -> int:
             for i in range(VALUES):
                 z[newest + 3 + i] = z[best + PACKET.value + i]
             z[newest + 3 + VALUES] = tick
-        z[best + PACKET.arrived] = NEVER
+        last = Z.queue + (under_way - 1) * PACKET_WIDTH  # it takes the free place
+        for i in range(PACKET_WIDTH):
+            z[best + i] = z[last + i]
+        z[Z.under_way] = under_way - 1.0
         count += 1
 
 

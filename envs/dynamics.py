@@ -13,7 +13,7 @@ force, a_y = v_y' + v_x gamma + g phi, and a road banked by b adds g sin b.
 
 from typing import Any, NamedTuple
 
-from .backend import inlined, jit, maximum, minimum, select
+from .backend import anywhere, inlined, jit, maximum, minimum, select
 from .elementary import atan2, sincos
 from .tyres import SLOW, tyre_forces
 from .vehicle import GRAVITY
@@ -146,7 +146,7 @@ def _roll_acceleration(motion: Any, F_y: Any, N_x: Any, car: Any, per_m: Any) ->
     """
     rest = N_x - car.C_x * motion.phi_dot - car.K_x * motion.phi
     lever = car.S * (F_y * per_m + GRAVITY * motion.phi)
-    return (lever + rest) / (car.I_x - car.S * car.S * per_m)
+    return (lever + rest) * (1.0 / (car.I_x - car.S * car.S * per_m))
 
 
 @inlined
@@ -181,10 +181,14 @@ def derivative(
         dY = v_x * motion.psi + v_y  # tie-vision (5), V_x (psi + beta)
         dy = v_x * (motion.psi - motion.theta) + v_y
         return Motion(dv_x, dv_y, dgamma, gamma, v_x, dY, v_x, dy, v_x * kappa, phi_dot, phi_ddot)
-    turn = motion.theta - frame.theta
+    turn, g_x, g_y = 0.0, 0.0, 0.0
+    s_t, c_t = frame.sin_t, frame.cos_t
+    if anywhere(road.curvature != 0.0):
+        turn = motion.theta - frame.theta
+        s_t, c_t = _turned(s_t, c_t, turn)
     s_r, c_r = _turned(frame.sin_r, frame.cos_r, motion.psi - frame.psi - turn)
-    s_t, c_t = _turned(frame.sin_t, frame.cos_t, turn)
-    g_x, g_y = gravity_felt(road, motion.s, s_r, c_r)
+    if anywhere((road.across != 0.0) | (road.along != 0.0)):
+        g_x, g_y = gravity_felt(road, motion.s, s_r, c_r)
     F_yf, F_yr, F_x, N_z = tyre_forces(motion, load, car, g_y, 0, law, roll)
     F_yc = F_yf * load.cos_d
     F_y = F_yc + F_yr + push.F_d
@@ -197,7 +201,9 @@ def derivative(
     dgamma = (car.l_f * F_yc - car.l_r * F_yr + N_z + push.N_d) * per_I
     along = v_x * c_r - v_y * s_r  # in road axes
     across = v_x * s_r + v_y * c_r
-    ds = along / maximum(1.0 - kappa * motion.y, 0.1)
+    ds = along
+    if anywhere(road.curvature != 0.0):
+        ds = along / maximum(1.0 - kappa * motion.y, 0.1)
     dX = along * c_t - across * s_t
     dY = along * s_t + across * c_t
     return Motion(dv_x, dv_y, dgamma, gamma, dX, dY, ds, across, ds * kappa, phi_dot, phi_ddot)

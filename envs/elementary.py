@@ -6,7 +6,7 @@ only + - * / and correctly rounded square roots. Errors are stated at each funct
 
 from typing import Any
 
-from .backend import absolute, floor, jit, select, sqrt
+from .backend import absolute, floor, jit, maximum, minimum, select, sqrt
 
 _TWO_OVER_PI = 0.6366197723675814
 _PI_2_HIGH = 1.5707963267341256  # the first 33 bits of pi/2, so that k * high is exact
@@ -58,12 +58,8 @@ def quadrant(q: Any, s: Any, c: Any) -> Any:
 
 
 @jit
-def atan(x: Any) -> Any:
-    """arctan x, error below 5e-16: reciprocal above 1, two half-angle steps, then the series."""
-    steep = absolute(x) > 1.0
-    u = select(steep, -1.0, x) / select(steep, x, 1.0)
-    t = u / (1.0 + sqrt(1.0 + u * u))
-    t = t / (1.0 + sqrt(1.0 + t * t))  # |t| < 0.1990
+def _atan_kernel(t: Any) -> Any:
+    """arctan t for |t| < 0.1990, error below 1e-16: the series."""
     z = t * t
     p = 1.0 / 23.0
     p = 1.0 / 21.0 - z * p
@@ -76,15 +72,34 @@ def atan(x: Any) -> Any:
     p = 1.0 / 7.0 - z * p
     p = 1.0 / 5.0 - z * p
     p = 1.0 / 3.0 - z * p
-    return 4.0 * (t - t * (z * p)) + select(steep, select(x > 0.0, 0.5 * PI, -0.5 * PI), 0.0)
+    return t - t * (z * p)
+
+
+@jit
+def atan(x: Any) -> Any:
+    """arctan x, error below 5e-16: reciprocal above 1, two half-angle steps, then the series."""
+    steep = absolute(x) > 1.0
+    u = select(steep, -1.0, x) / select(steep, x, 1.0)
+    t = u / (1.0 + sqrt(1.0 + u * u))
+    t = t / (1.0 + sqrt(1.0 + t * t))
+    return 4.0 * _atan_kernel(t) + select(steep, select(x > 0.0, 0.5 * PI, -0.5 * PI), 0.0)
 
 
 @jit
 def atan2(y: Any, x: Any) -> Any:
-    """The angle of the vector (x, y) in [-pi, pi], error below 1e-15; 0 at the origin."""
-    safe = select(absolute(x) > 1e-300, x, 1e-300)
-    half_turn = select(safe < 0.0, select(y < 0.0, -PI, PI), 0.0)
-    return atan(y / safe) + half_turn
+    """The angle of the vector (x, y) in [-pi, pi], error below 1e-15; 0 at the origin.
+
+    The half-angle steps of `atan` without their quotients: tan(a / 2) = y / (x + |(x, y)|).
+    """
+    wide, high = absolute(x), absolute(y)
+    steep = high > wide
+    far, near = maximum(wide, high), minimum(wide, high)
+    far = far + sqrt(far * far + near * near)
+    far = far + sqrt(far * far + near * near)
+    turn = 4.0 * _atan_kernel(near / maximum(far, 1e-300))
+    turn = select(steep, 0.5 * PI - turn, turn)
+    turn = select(x < 0.0, PI - turn, turn)
+    return select(y < 0.0, 0.0 - turn, turn)
 
 
 @jit

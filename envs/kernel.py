@@ -33,6 +33,7 @@ from .summary import clip, observe, write_report
 from .switches import BAD_ACTION, NOT_FINITE, OFF_ROAD, REFUSED, REPORT, RUNNING, SPIN, Switches
 from .tick import Fixed, Kind, Moving, advance, changed, standing_load
 from .tracks import Path
+from .tyres import shifts
 
 _CAR, _MOTION, _ROAD, _LAG = (len(each._fields) for each in (Car, Motion, Road, Lag))
 _WIND, _PACE, _TARGET = (len(each._fields) for each in (Wind, Pace, Target))
@@ -66,7 +67,9 @@ def kind_of(p: Any, switches: Any) -> Kind:
     """What chooses the text of one vehicle's ticks."""
     lag = int(p[P.motor] > 0.0) + int(p[P.steer] > 0.0)
     follows = int(switches[3] == DRIVER)
-    return Kind(switches[0], switches[1], switches[2], switches[6], follows, lag)
+    small_angle, law, roll = switches[0], switches[1], switches[6]
+    shifting = shifts(small_angle, law, roll)
+    return Kind(small_angle, law, switches[2], roll, follows, lag, shifting)
 
 
 @jit
@@ -94,7 +97,7 @@ def drive_on(
     drive = Drive(*fixed_tuple(z[Z.drive :], _DRIVE))
     tick = at(z, Z.clock + 2)
     car = changed(fixed.car, fixed.change, tick > fixed.change.tick)
-    now = Moving(motion, drive, standing_load(drive, car, kind.small_angle), at(z, Z.driver), car)
+    now = Moving(motion, drive, standing_load(drive, car, kind), at(z, Z.driver), car)
     task = fixed.task
     N_z, added = share * task.yaw_scale, turn * task.authority
     cost = 0.0 * N_z

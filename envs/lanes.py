@@ -23,8 +23,8 @@ from numba.core.typing.templates import AbstractTemplate, infer_global, signatur
 from . import backend
 from .backend import config
 
-LANES = 1 if config.DISABLE_JIT else 8
-_COUNT = 8
+LANES = 1 if config.DISABLE_JIT else 16
+_COUNT = 16
 _DOUBLE, _LONG, _BIT = ir.DoubleType(), ir.IntType(64), ir.IntType(1)
 
 

@@ -127,6 +127,7 @@ _STATE = _offsets(
         "queue": 2 * IN_FLIGHT * PACKET_WIDTH,
         "sky": 1,  # deviation of log HDOP from its median
         "driver": 1,  # rad, the driver's steering command
+        "under_way": 1,  # how many packets are in the queue
     }
 )
 
@@ -165,6 +166,7 @@ class StateAt(NamedTuple):
     queue: int
     sky: int
     driver: int
+    under_way: int
     end: int
 
 

@@ -63,9 +63,9 @@ def cost_rate(e_beta: Any, e_gamma: Any, moment_share: Any, steer_added: Any, ki
 
     c = (e_beta/0.02)^2 + (e_gamma/0.1)^2 + 0.01 (N_z/N_max)^2 + 0.01 (steer/0.05)^2
     """
-    b, s = e_beta / BETA_SCALE, steer_added / STEER_SCALE
+    b, s = e_beta * (1.0 / BETA_SCALE), steer_added * (1.0 / STEER_SCALE)
     c = b * b + EFFORT_WEIGHT * (moment_share * moment_share) + EFFORT_WEIGHT * (s * s)
     if kind != ZERO_SLIP:
-        g = e_gamma / GAMMA_SCALE
+        g = e_gamma * (1.0 / GAMMA_SCALE)
         c = c + g * g
     return minimum(absolute(c), COST_CAP)

@@ -17,9 +17,9 @@ from .programme import (
     whole_ticks,
     write_steering,
 )
-from .record import CAMERA, FAST, PACKET, PACKET_WIDTH
+from .record import CAMERA, FAST
 from .reference import Target, reference
-from .sensors import IN_FLIGHT, NEVER, Link, Noise, clock_phase
+from .sensors import NEVER, Link, Noise, clock_phase
 from .summary import observe, write_report
 from .switches import REPORT
 from .tracks import Path, laid
@@ -86,8 +86,6 @@ def reset_vehicle(
     p[P.pace] = d.speed
     for i in range(Z.end):
         z[i] = 0.0
-    for slot in range(2 * IN_FLIGHT):
-        z[Z.queue + slot * PACKET_WIDTH + PACKET.arrived] = NEVER
     z[Z.motion] = d.speed
     for i in range(_MOTION):
         if start[i] == start[i]:

@@ -17,7 +17,7 @@ from .programme import STEERING_WIDTH, steering_at
 
 CHANCE, AHEAD, TRACK = 0, 8, 9  # its rows: two times four normal numbers, rad, a Motion
 _ROWS = TRACK + len(Motion._fields)
-_WIDEST = 8
+_WIDEST = 16
 
 
 def scratch_of(n: int, *lanes: int) -> Array:

@@ -32,6 +32,7 @@ class Kind(NamedTuple):
     roll: int
     follows: int  # the driver reacts to the car
     lag: int  # how many of motors and steering lag
+    shifting: int  # `tyres.shifts`
 
 
 class Fixed(NamedTuple):
@@ -86,9 +87,11 @@ def changed(car: Any, change: Any, now: Any) -> Any:
 
 
 @jit
-def standing_load(drive: Any, car: Any, small_angle: int) -> Any:
+def standing_load(drive: Any, car: Any, kind: Kind) -> Any:
     """The Load of what the actuators do now."""
-    return load_of(Inputs(drive.delta_f, drive.T_l, drive.T_r), car, small_angle)
+    return load_of(
+        Inputs(drive.delta_f, drive.T_l, drive.T_r), car, kind.small_angle, kind.shifting
+    )
 
 
 @jit
@@ -100,7 +103,7 @@ def _load_at(
     steering_rest: Any,
     motor_rest: Any,
     car: Any,
-    small_angle: int,
+    kind: Kind,
 ) -> Any:
     """The Load once the given rests of the actuators' deviations from their commands are left."""
     inputs = Inputs(
@@ -108,7 +111,7 @@ def _load_at(
         lagged(to_l, drive.T_l, motor_rest),
         lagged(to_r, drive.T_r, motor_rest),
     )
-    return load_of(inputs, car, small_angle)
+    return load_of(inputs, car, kind.small_angle, kind.shifting)
 
 
 @inlined
@@ -117,8 +120,8 @@ def _specific_force(before: Any, after: Any, road: Any, small_angle: int, roll: 
     turn_x = 0.5 * (before.gamma * before.v_y + after.gamma * after.v_y)
     turn_y = 0.5 * (before.gamma * before.v_x + after.gamma * after.v_x)
     turns_x = (small_angle == 0) | (roll == 1)  # tie-vision holds v_x; double-layer-gps (4)
-    a_x = (after.v_x - before.v_x) / TICK - select(turns_x, turn_x, 0.0)
-    a_y = (after.v_y - before.v_y) / TICK + turn_y
+    a_x = (after.v_x - before.v_x) * (1.0 / TICK) - select(turns_x, turn_x, 0.0)
+    a_y = (after.v_y - before.v_y) * (1.0 / TICK) + turn_y
     if roll:
         a_y = a_y + 0.5 * GRAVITY * (before.phi + after.phi)  # double-layer-gps (5)
     if anywhere((road.along != 0.0) | (road.across != 0.0)):
@@ -152,7 +155,7 @@ def advance(
     at_change = tick == fixed.change.tick
     if anywhere(at_change):
         car = changed(car, fixed.change, at_change)
-        start = standing_load(drive, car, small_angle)
+        start = standing_load(drive, car, kind)
     slewing = slewed(drive.slewing, turn, task.slew)
     extra = within_stop(slewing, driver, task.stop)
     command = driver + extra
@@ -160,17 +163,13 @@ def advance(
     a_x, integral = acceleration_command(tick, before.v_x, drive.integral, fixed.pace, limit)
     to_l, to_r = distribute(N_z, a_x, car, task.yaw_first)
     if kind.lag == NO_LAG:
-        start = load_of(Inputs(command, to_l, to_r), car, small_angle)
+        start = load_of(Inputs(command, to_l, to_r), car, small_angle, kind.shifting)
         middle, end = start, start
     else:  # actuators that lag move continuously: a tick starts where the last one ended
         if kind.lag == ONE_LAGS:  # the other one jumps
-            start = _load_at(
-                command, to_l, to_r, drive, steering.start, motor.start, car, small_angle
-            )
-        middle = _load_at(
-            command, to_l, to_r, drive, steering.middle, motor.middle, car, small_angle
-        )
-        end = _load_at(command, to_l, to_r, drive, steering.end, motor.end, car, small_angle)
+            start = _load_at(command, to_l, to_r, drive, steering.start, motor.start, car, kind)
+        middle = _load_at(command, to_l, to_r, drive, steering.middle, motor.middle, car, kind)
+        end = _load_at(command, to_l, to_r, drive, steering.end, motor.end, car, kind)
     F_w, N_w, N_x = wind_at(tick, fixed.wind)
     push = Push(drive.F_d + F_w, drive.N_d + N_w, N_x)
     motion = rk4(before, (start, middle, end), push, car, road, TICK, small_angle, law, roll)
@@ -200,7 +199,7 @@ def advance(
         aside = motion.y - 0.0
     refs = reference(driver, v, fixed.target, kind.reference)
     moment = yaw_moment(left, right, car)
-    effort = moment / task.yaw_scale
+    effort = moment * (1.0 / task.yaw_scale)
     cost = cost_rate(beta - refs[0], motion.gamma - refs[1], effort, added, kind.reference)
     size = motion.v_x * motion.v_x + motion.v_y * motion.v_y + motion.gamma * motion.gamma
     finite = size + motion.psi + motion.Y + motion.phi  # squares: the references take them too

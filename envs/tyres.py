@@ -42,17 +42,26 @@ class Load(NamedTuple):
 
 
 @jit
-def _capacity(limit: Any, drive: Any) -> Any:
-    """Lateral capacity of a tyre in N that also drives: the friction circle, never below 5 %."""
-    return sqrt(maximum(limit * limit - drive * drive, 0.0025 * limit * limit))
+def _squared_capacity(limit: Any, drive: Any) -> Any:
+    """The square of the lateral capacity in N of a tyre that also drives: the friction circle, but
+    the capacity is never below 5 %."""
+    return maximum(limit * limit - drive * drive, 0.0025 * limit * limit)
 
 
 @jit
-def load_of(inputs: Any, car: Any, small_angle: int) -> Any:
+def shifts(small_angle: int, law: int, roll: int) -> int:
+    """1 where roll moves load from side to side: the rear tyres' limits are then those of the
+    motion and not of the inputs alone."""
+    return int(small_angle == 0 and law == FIALA and roll == 1)
+
+
+@jit
+def load_of(inputs: Any, car: Any, small_angle: int, shifting: int = 0) -> Any:
     """The Load of the Inputs of one instant.
 
     The road may grip less on one side: each rear tyre has its own, which its motor feels; the
-    front tyres share the mean.
+    front tyres share the mean. shifting: what `shifts` says; with 1 the rear tyres' limits and
+    slopes, drive force and moment are those of the inputs without any friction.
     """
     weight = car.m * GRAVITY / (2.0 * (car.l_f + car.l_r))
     front = 0.5 * (car.mu + car.mu_r) * weight * car.l_r
@@ -61,10 +70,11 @@ def load_of(inputs: Any, car: Any, small_angle: int) -> Any:
     F_l, F_r = asked_l, asked_r
     s, c = sincos(inputs.delta_f)
     left, right = rear_l, rear_r
-    if not small_angle:
+    if not small_angle and not shifting:
         F_l = minimum(maximum(F_l, 0.0 - rear_l), rear_l)
         F_r = minimum(maximum(F_r, 0.0 - rear_r), rear_r)
-        left, right = _capacity(rear_l, F_l), _capacity(rear_r, F_r)
+        left = sqrt(_squared_capacity(rear_l, F_l))
+        right = sqrt(_squared_capacity(rear_r, F_r))
     return Load(
         s,
         c,
@@ -99,18 +109,25 @@ def lateral_force(tangent: Any, limit: Any, slope: Any, law: int) -> Any:
 
 
 @jit
-def slips(motion: Any, load: Any, car: Any, small_angle: int, law: int) -> Any:
-    """Tangents of the front and rear slip angle (the angles themselves for linear tyres)."""
+def _slip_ratios(motion: Any, load: Any, car: Any, small_angle: int) -> Any:
+    """Numerator and denominator of the tangent of the front slip angle, and of the rear one."""
     front = motion.v_y + car.l_f * motion.gamma
     rear = motion.v_y - car.l_r * motion.gamma
     if small_angle:
         v = maximum(motion.v_x, SLOW)
         # delta_f - beta - l_f gamma / V_x and l_r gamma / V_x - beta of tie-vision (1)
-        return (motion.v_x * load.steer - front) / v, (0.0 - rear) / v
+        return motion.v_x * load.steer - front, v, 0.0 - rear, v
     along = maximum(absolute(motion.v_x * load.cos_d + front * load.sin_d), SLOW)
-    t_f = (motion.v_x * load.sin_d - front * load.cos_d) / along
-    t_r = (0.0 - rear) / maximum(absolute(motion.v_x), SLOW)
-    if law == LINEAR:
+    across = motion.v_x * load.sin_d - front * load.cos_d
+    return across, along, 0.0 - rear, maximum(absolute(motion.v_x), SLOW)
+
+
+@jit
+def slips(motion: Any, load: Any, car: Any, small_angle: int, law: int) -> Any:
+    """Tangents of the front and rear slip angle (the angles themselves for linear tyres)."""
+    across_f, along_f, across_r, along_r = _slip_ratios(motion, load, car, small_angle)
+    t_f, t_r = across_f / along_f, across_r / along_r
+    if law == LINEAR and not small_angle:
         return atan(t_f), atan(t_r)
     return t_f, t_r
 
@@ -141,25 +158,38 @@ def tyre_forces(
     g_y: m/s2, what the car feels of the road's bank. Roll moves load from side to side, which
     matters to Fiala tyres only, and is left out of the small-angle plant.
     """
+    if shifts(small_angle, law, roll):
+        return _shifted_forces(motion, load, car, g_y)
     t_f, t_r = slips(motion, load, car, small_angle, law)
-    if roll and law == FIALA and not small_angle:
-        e_f, e_r = load_transfer(motion, car, g_y)
-        narrow, wide = 1.0 - e_f, 1.0 + e_f
-        per = load.slope_f / (narrow * wide)
-        F_yf = lateral_force(t_f, load.limit_f * narrow, per * wide, law) + lateral_force(
-            t_f, load.limit_f * wide, per * narrow, law
-        )
-        rear_l, rear_r = load.rear_l * (1.0 - e_r), load.rear_r * (1.0 + e_r)
-        F_l = minimum(maximum(load.F_l, 0.0 - rear_l), rear_l)
-        F_r = minimum(maximum(load.F_r, 0.0 - rear_r), rear_r)
-        left, right = _capacity(rear_l, F_l), _capacity(rear_r, F_r)
-        per = car.C_r / (3.0 * left * right)
-        F_yr = lateral_force(t_r, left, per * right, law) + lateral_force(
-            t_r, right, per * left, law
-        )
-        return F_yf, F_yr, F_l + F_r, 0.5 * car.d_r * (F_r - F_l)
     F_yf = 2.0 * lateral_force(t_f, load.limit_f, load.slope_f, law)
     F_yr = lateral_force(t_r, load.limit_l, load.slope_l, law) + lateral_force(
         t_r, load.limit_r, load.slope_r, law
     )
     return F_yf, F_yr, load.F_x, load.N_z
+
+
+@inlined
+def _shifted_forces(motion: Any, load: Any, car: Any, g_y: Any) -> Any:
+    """`tyre_forces` of Fiala tyres whose load roll moves from side to side.
+
+    A quotient costs ten products: the slips' and the slopes' are all taken from one.
+    """
+    across_f, along_f, across_r, along_r = _slip_ratios(motion, load, car, 0)
+    e_f, e_r = load_transfer(motion, car, g_y)
+    narrow, wide = 1.0 - e_f, 1.0 + e_f
+    rear_l, rear_r = load.rear_l * (1.0 - e_r), load.rear_r * (1.0 + e_r)
+    F_l = minimum(maximum(load.F_l, 0.0 - rear_l), rear_l)
+    F_r = minimum(maximum(load.F_r, 0.0 - rear_r), rear_r)
+    square_l, square_r = _squared_capacity(rear_l, F_l), _squared_capacity(rear_r, F_r)
+    left, right = sqrt(square_l), sqrt(square_r)
+    sides, squares = narrow * wide, square_l * square_r
+    per = 1.0 / (along_f * along_r * (sides * squares))
+    front = load.slope_f * (along_r * squares * per)  # C_f / 3 F_max of the standing tyre, 1/along
+    rear = car.C_r * (1.0 / 3.0) * (along_f * sides * per)
+    F_yf = lateral_force(across_f, load.limit_f * narrow, front * wide, FIALA) + lateral_force(
+        across_f, load.limit_f * wide, front * narrow, FIALA
+    )
+    F_yr = lateral_force(across_r, left, rear * square_r * left, FIALA) + lateral_force(
+        across_r, right, rear * square_l * right, FIALA
+    )
+    return F_yf, F_yr, F_l + F_r, 0.5 * car.d_r * (F_r - F_l)
