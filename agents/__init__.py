@@ -8,9 +8,11 @@ from .esc import Esc
 from .given import AnyEnv
 from .informed import Informed
 from .lane_keeping import LaneKeeping
+from .learned import Learned
 from .lqr import Lqr
 from .model_following import ModelFollowing
 from .mpc import Mpc
+from .policy_file import is_policy
 from .sliding_mode import SlidingMode
 from .two_dof import Feedforward, TwoDof
 
@@ -25,6 +27,7 @@ AGENTS: dict[str, Callable[..., Controller]] = {
     "mpc": Mpc,
     "lane-keeping": LaneKeeping,
     "informed": Informed,
+    "learned": Learned,
 }
 
 __all__ = [
@@ -34,6 +37,7 @@ __all__ = [
     "Feedforward",
     "Informed",
     "LaneKeeping",
+    "Learned",
     "Lqr",
     "ModelFollowing",
     "Mpc",
@@ -47,10 +51,13 @@ __all__ = [
 def make_agent(name: str, env: AnyEnv, **options: Any) -> Controller:
     """A controller designed for an env, single or vector, from the env's nominal vehicle.
 
-    name: a key of `AGENTS`. options: arguments of that controller.
+    name: a key of `AGENTS`, a shipped policy, or the path of one (`.../NAME.safetensors`).
+    options: arguments of that controller.
     Raises ValueError for an unknown name or an observation without what the controller needs,
     TypeError for an unknown option.
     """
+    if name not in AGENTS and is_policy(name):
+        return Learned(env, policy=name, **options)
     if name not in AGENTS:
         raise ValueError(f"unknown agent {name!r}; known: {', '.join(AGENTS)}")
     return AGENTS[name](env, **options)

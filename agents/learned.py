@@ -1,0 +1,54 @@
+"""A learned policy as one more controller: weights from a file, run by NumPy."""
+
+from pathlib import Path
+
+from .controller import Array, Controller
+from .given import AnyEnv, given
+from .policy_file import Policy, load_policy
+
+DEFAULT = "ppo-yaw-vision"
+
+
+class Learned(Controller):
+    """The deterministic action of a policy's network, clipped to [-1, 1]; it remembers nothing.
+
+    It reads the entries of its training by name, so a wider observation serves as well; what never
+    varied in training is not read. Where the env steers and the policy does not, the steering is
+    left alone. Single and batch agree to rounding in double precision, before the action becomes
+    single precision (`Network`).
+
+    policy: a shipped name, a file's path, or a `Policy`.
+
+    Raises ValueError for an env without an entry that the policy reads or with another unit of it,
+    with another control period, or whose action is narrower; and what `load_policy` raises.
+    """
+
+    def __init__(self, env: AnyEnv, policy: str | Path | Policy = DEFAULT) -> None:
+        self.policy = policy if isinstance(policy, Policy) else load_policy(policy)
+        name, card, told = self.policy.name, self.policy.card, given(env)
+        reads = self.policy.reads
+        entries = [entry for entry, read in zip(card.observation, reads, strict=True) if read]
+        units = {entry.name: entry.unit for entry in told.layout}
+        wrong = [
+            f"{each} in {unit} (here {units[each]})"
+            for each, unit in entries
+            if units.get(each, unit) != unit
+        ]
+        if wrong:
+            raise ValueError(f"policy {name} was trained on {', '.join(wrong)}")
+        if told.control_period != card.control_period:
+            raise ValueError(
+                f"policy {name} was trained with a control period of {card.control_period} ticks, "
+                f"this env has {told.control_period}"
+            )
+        if told.width < self.policy.network.width:
+            raise ValueError(
+                f"policy {name} gives {self.policy.network.width} numbers, "
+                f"the env's action has {told.width}"
+            )
+        self.needs = tuple(each for each, _ in entries)
+        super().__init__(env)
+        self.network = self.policy.network.reading(reads)
+
+    def _law(self, inputs: Array, state: Array, action: Array) -> None:
+        action[:, : self.network.width] = self.network(inputs)
