@@ -25,9 +25,10 @@ def network_from_sb3(model: Any, normaliser: Any = None) -> Network:
         raise ModuleNotFoundError(
             "networks come from stable-baselines3: pip install 'sideslip[train]'", name=error.name
         ) from error
-    bounds = model.action_space
-    if not (np.all(bounds.low == -1.0) and np.all(bounds.high == 1.0)):
-        raise ValueError(f"an action lies within [-1, 1], got {bounds}")
+    space = model.action_space
+    bounds = getattr(space, "low", 0.0), getattr(space, "high", 0.0)
+    if not (np.all(bounds[0] == -1.0) and np.all(bounds[1] == 1.0)):
+        raise ValueError(f"an action lies within [-1, 1], got {space}")
     layers, squashed, extractor = _actor(model.policy)
     if not isinstance(extractor, FlattenExtractor):
         raise ValueError(f"the observation goes through {type(extractor).__name__}, not as it is")
