@@ -57,6 +57,13 @@ def is_policy(name: str) -> bool:
     return name.endswith(ENDING) or name in shipped()
 
 
+def stamp(name: str) -> str:
+    """A hash of a policy's file, "" for a name that is no policy's."""
+    path = FOLDER / f"{name}{ENDING}" if name in shipped() else Path(name)
+    there = is_policy(name) and path.is_file()
+    return hashlib.sha256(path.read_bytes()).hexdigest() if there else ""
+
+
 def save_policy(path: str | Path, network: Network, card: Card) -> None:
     """Write the whole file or none; a save that is stopped leaves an older file as it was.
 

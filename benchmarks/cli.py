@@ -1,10 +1,6 @@
-"""The command line: list, run, bench, replay, tune, calibrate."""
+"""The command line: list, run, bench, replay, enjoy, tune, calibrate."""
 
-import platform
-import shlex
 import sys
-from collections.abc import Sequence
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -15,8 +11,9 @@ from rich.markup import escape
 
 from .. import __version__
 from .calibrate_command import calibrate_command
-from .rows import Row, Suite, check_writable, write_json, write_parquet, write_whole
-from .screen import print_suite
+from .enjoy_command import enjoy_command
+from .giving import give, show_episode
+from .rows import check_writable
 from .suites import SUITES, Wish
 from .tune_command import tune_app
 
@@ -27,6 +24,7 @@ app = typer.Typer(
 )
 app.add_typer(tune_app, name="tune")
 app.command("calibrate")(calibrate_command)
+app.command("enjoy")(enjoy_command)
 console = Console()
 
 Quick = Annotated[bool, typer.Option("--quick", help="Few seeds: a first look in seconds.")]
@@ -38,8 +36,6 @@ Mapping = Annotated[
     typer.Option("--map", help="NAME_UNIT=COLUMN of the log (yaw_rate_degps=r); repeatable."),
 ]
 Jobs = Annotated[int | None, typer.Option("--jobs", "-j", min=1, help="Processes.")]
-
-_SHOWN = ("numpy", "scipy", "numba", "gymnasium", "control", "plotly")
 
 
 def main() -> None:
@@ -70,10 +66,11 @@ def face(
 
 @app.command("list")
 def list_names() -> None:
-    """What there is: environments, scenarios, vehicles, estimators, agents, suites."""
+    """What there is: environments, scenarios, vehicles, estimators, agents, policies, suites."""
     import gymnasium as gym
 
     from ..agents import AGENTS
+    from ..agents.policy_file import shipped
     from ..envs import SCENARIOS, VEHICLES
     from ..estimators import FILTERS
 
@@ -83,6 +80,7 @@ def list_names() -> None:
         "vehicles": list(VEHICLES),
         "estimators": list(FILTERS),
         "agents": list(AGENTS),
+        "policies": shipped(),
         "suites": list(SUITES),
     }.items():
         console.print(f"[bold]{title}[/]: {', '.join(names)}", highlight=False)
@@ -91,7 +89,7 @@ def list_names() -> None:
 @app.command()
 def run(
     env_id: Annotated[str, typer.Argument(help="An environment's id.")] = "sideslip/YawVision-v0",
-    agent: Annotated[str, typer.Option(help="An agent's name.")] = "none",
+    agent: Annotated[str, typer.Option(help="An agent's name, a policy's or its path.")] = "none",
     estimator: Annotated[str | None, typer.Option(help="An estimator's name.")] = None,
     scenario: Annotated[str | None, typer.Option(help="A scenario's name.")] = None,
     seed: Annotated[int, typer.Option(help="Seed of the episode.")] = 0,
@@ -102,12 +100,10 @@ def run(
 ) -> None:
     """Drive one episode, print its score, draw it."""
     import gymnasium as gym
-    import numpy as np
 
     from ..agents import make_agent
     from ..agents.rollout import rollout
     from ..estimators import EstimateObservation
-    from .kml import track_kml
 
     check_writable(plot, parquet, kml)
     options: dict[str, Any] = {} if scenario is None else {"scenario": scenario}
@@ -115,19 +111,7 @@ def run(
     if estimator is not None:
         env = EstimateObservation(env, estimator)
     drive = rollout(env, make_agent(agent, env), seed)
-    slip = drive["beta"]
-    console.print(
-        f"{drive.log.name}: {drive['t'][-1]:.2f} s, cost {drive.cost:.4g}, "
-        f"RMS slip {1e3 * np.sqrt(np.mean(slip**2)):.2f} mrad, "
-        f"peak {1e3 * np.max(np.abs(slip)):.2f} mrad" + (", FAILED" if drive.failed else ""),
-        highlight=False,
-    )
-    if plot is not None:
-        drive.plot().savefig(plot, dpi=120)
-    if parquet is not None:
-        drive.to_parquet(parquet)
-    if kml is not None:
-        write_whole(kml, track_kml(drive.log.name, {agent: (drive["X"], drive["Y"])}))
+    show_episode(console, drive, agent, plot, parquet, kml)
 
 
 @app.command()
@@ -164,47 +148,12 @@ def bench(
     done += [SUITES[name](wish) for name in names]
     order = [*names, "replay"]
     done.sort(key=lambda suite: order.index(suite.name))
-    _give(done, html, json, parquet)
+    give(console, done, html, json, parquet)
     if picture is not None:
         from .picture import write_picture
 
         write_picture(picture, done)
         console.print(f"picture: {picture}", highlight=False)
-
-
-def _give(
-    suites: Sequence[Suite], html: Path | None, json: Path | None, parquet: Path | None
-) -> None:
-    """Print the tables and write what was asked for."""
-    for suite in suites:
-        print_suite(console, suite)
-    rows: list[Row] = [row for suite in suites for row in suite.rows]
-    if json is not None:
-        write_json(json, rows)
-        console.print(f"rows: {json}", highlight=False)
-    if parquet is not None:
-        write_parquet(parquet, rows)
-        console.print(f"rows: {parquet}", highlight=False)
-    if html is not None:
-        from .report import write_report
-
-        write_report(html, list(suites), _command(), environment())
-        console.print(f"report: {html}", highlight=False)
-
-
-def _command() -> str:
-    return shlex.join(["sideslip", *sys.argv[1:]])
-
-
-def environment() -> dict[str, str]:
-    """Versions that the numbers depend on."""
-    found = {"sideslip": __version__, "Python": platform.python_version()}
-    for name in _SHOWN:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            continue
-    return found
 
 
 @app.command()
@@ -235,4 +184,4 @@ def replay(
         bias_deg=course_bias,
         gyro_bias_degps=gyro_bias,
     )
-    _give([suite], html, json, parquet)
+    give(console, [suite], html, json, parquet)

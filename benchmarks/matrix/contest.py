@@ -11,6 +11,7 @@ from gymnasium.vector import VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
 from ...agents import make_agent
+from ...agents.policy_file import is_policy, load_policy
 from ...envs import Entry
 from ...estimators import FILTERS, UnobservableWarning
 from ...estimators.vector import EstimateObservation
@@ -54,6 +55,15 @@ def outputs_for(estimator: str) -> tuple[str, ...]:
     return ("beta", "gamma", *_DISTURBANCES.get(FILTERS[estimator].disturbances, ()))
 
 
+def estimate_options(cell: Cell) -> dict[str, Any]:
+    """Of `EstimateObservation` for a cell; a policy gets the estimate it was trained on."""
+    if is_policy(cell.controller):
+        card = load_policy(cell.controller).card
+        if card.estimator == cell.estimator:
+            return card.estimator_options
+    return {"outputs": outputs_for(cell.estimator), "std": False}
+
+
 def make_contest(cell: Cell, cars: int) -> tuple[VectorEnv[Any, Any, Any], Any]:
     """(vector env of `cars` rows with the cell's estimator, its agent)."""
     options = {"scenario": cell.scenario, "on_bad_action": "fail"} | cell.options
@@ -70,7 +80,5 @@ def make_contest(cell: Cell, cars: int) -> tuple[VectorEnv[Any, Any, Any], Any]:
     elif cell.estimator:
         with warnings.catch_warnings():  # what dakf cannot see is told elsewhere
             warnings.simplefilter("ignore", UnobservableWarning)
-            env = EstimateObservation(
-                env, cell.estimator, outputs=outputs_for(cell.estimator), std=False
-            )
+            env = EstimateObservation(env, cell.estimator, **estimate_options(cell))
     return env, make_agent(cell.controller, env, **agent_options)

@@ -46,6 +46,12 @@ SEEING = ("esc", REFERENCE_CONTROLLER, "sliding-mode", "lqr")
 STEERING_CONTROLLERS = ("model-following", "lqr", "two-dof", "esc")
 INFORMED = "informed"
 SLOW_CONTROLLERS = ("mpc",)
+LEARNED: dict[str, tuple[tuple[str, str], ...]] = {
+    YAW: (("", "ppo-yaw-vision"),),
+    STEERING: (("", "ppo-yaw-vision"),),
+}
+"""(estimator, policy) in each table, a policy by its shipped name or path. One that was trained on
+fewer sensors reads what it knows by name."""
 
 EPISODES, QUICK_EPISODES, SLOW_EPISODES = 1000, 16, 64
 
@@ -55,7 +61,8 @@ class Cell:
     """One square of the matrix.
 
     estimator: a name of `make_estimator`, "truth", or "" where the controller reads none (or
-    brings its own). options: of the env; cells are equal whatever theirs are.
+    brings its own). controller: what `make_agent` takes. options: of the env; cells are equal
+    whatever theirs are.
     """
 
     env_id: str
@@ -80,6 +87,8 @@ def cells(manoeuvres: tuple[str, ...] = MANOEUVRES) -> Iterator[Cell]:
     for scenario in manoeuvres:
         for controller in (*BLIND, INFORMED):
             yield Cell(YAW, scenario, "", controller)
+        for estimator, policy in LEARNED[YAW]:
+            yield Cell(YAW, scenario, estimator, policy)
         for controller in SEEING:
             for estimator in ESTIMATORS:
                 yield Cell(YAW, scenario, estimator, controller)
@@ -89,6 +98,8 @@ def cells(manoeuvres: tuple[str, ...] = MANOEUVRES) -> Iterator[Cell]:
             yield Cell(YAW, scenario, REFERENCE_FILTER, controller)
         for controller in (*BLIND, INFORMED):
             yield Cell(STEERING, scenario, "", controller)
+        for estimator, policy in LEARNED[STEERING]:
+            yield Cell(STEERING, scenario, estimator, policy)
         for controller in STEERING_CONTROLLERS:
             yield Cell(STEERING, scenario, REFERENCE_FILTER, controller)
         yield Cell(STEERING, scenario, "dakf", "model-following")  # the paper's own pair

@@ -1,6 +1,7 @@
 """The matrix's figures: heat maps, any cell's time series, price of delay, runs in motion."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -15,7 +16,7 @@ from ..colours import INK, colour
 from ..explorer import Explorer, Panel
 from ..kml import track_kml
 from ..rows import Suite
-from .contest import outputs_for
+from .contest import estimate_options
 from .contestants import STEERING, YAW, Cell
 from .drive import SIGNALS
 from .price import DELAYS, Price, lines
@@ -50,13 +51,15 @@ def illustrate(
 
     seed: of the runs in motion.
     """
-    drives = {m: {cell.label: _run(cell, m, seed) for cell in _SHOWN} for m in _MOVING}
+    drives = {
+        m: {cell.label: run_of(replace(cell, scenario=m), seed) for cell in _SHOWN} for m in _MOVING
+    }
     for manoeuvre, runs in drives.items():
         tracks = {name: (run["X"], run["Y"]) for name, run in runs.items()}
         text = track_kml(manoeuvre, tracks, {name: colour(name) for name in tracks})
         suite.files.append((f"{manoeuvre}.kml", "application/vnd.google-earth.kml+xml", text))
     try:
-        from .pictures import animation, curves
+        from .pictures import curves
     except ModuleNotFoundError:
         return
     suite.explorers.append(_time_series(results))
@@ -74,18 +77,22 @@ def illustrate(
                     "for each delay; dividing by its cost leaves what a method loses by it.",
                 )
             )
-    size = (VEHICLES["coms"].wheelbase, VEHICLES["coms"].front_track)
     for manoeuvre, runs in drives.items():
-        t = max((run["t"] for run in runs.values()), key=len)
-        paths = {name: (run["X"], run["Y"], run["psi"]) for name, run in runs.items()}
-        suite.figures.append(
-            (
-                f"In motion: {manoeuvre}, first test seed",
-                animation(t, paths, size),
-                "A rectangle has the wheelbase and track of the car, drawn at its centre of "
-                "gravity. A car whose episode ended stays where it was.",
-            )
-        )
+        suite.figures.append(in_motion(f"In motion: {manoeuvre}, first test seed", runs))
+
+
+def in_motion(title: str, runs: Mapping[str, Rollout]) -> tuple[str, Any, str]:
+    """A figure of a suite: cars from above; runs: by name. Needs plotly."""
+    from .pictures import animation
+
+    size = (VEHICLES["coms"].wheelbase, VEHICLES["coms"].front_track)
+    t = max((run["t"] for run in runs.values()), key=len)
+    paths = {name: (run["X"], run["Y"], run["psi"]) for name, run in runs.items()}
+    caption = (
+        "A rectangle has the wheelbase and track of the car, drawn at its centre of gravity. A car "
+        "whose episode ended stays where it was."
+    )
+    return title, animation(t, paths, size), caption
 
 
 def _maps(env_id: str, standings: Sequence[Standing]) -> list[tuple[str, Any, str]]:
@@ -115,27 +122,31 @@ def _maps(env_id: str, standings: Sequence[Standing]) -> list[tuple[str, Any, st
 def _time_series(results: Results) -> Explorer:
     """Every cell's first test seed."""
     tables = {YAW: "yaw moment", STEERING: "yaw moment and steering"}
+    series: dict[tuple[str, ...], Array] = {
+        (tables[cell.env_id], cell.scenario, cell.controller, cell.estimator): result.series
+        for cell, result in results.found.items()
+        if result.series is not None
+    }
+    menus = ("action", "manoeuvre", "controller", "estimator")
+    return over_time("Any cell over time (its first test seed)", menus, series)
+
+
+def over_time(
+    title: str, menus: Sequence[str], series: Mapping[tuple[str, ...], Array]
+) -> Explorer:
+    """Episodes to choose from; series: key (one name a menu) to what `Driven` keeps of one."""
     cells = {}
-    for cell, result in results.found.items():
-        if result.series is None:
-            continue
-        signals = dict(zip(("t", *SIGNALS), result.series.T, strict=True))
-        scaled = {name: _SCALES.get(name, 1.0) * values for name, values in signals.items()}
-        key = (tables[cell.env_id], cell.scenario, cell.controller, cell.estimator)
-        cells[key] = scaled
-    return Explorer(
-        "Any cell over time (its first test seed)",
-        ("action", "manoeuvre", "controller", "estimator"),
-        cells,
-        _PANELS,
-        "The same seed in every cell; thinned to 250 samples.",
-    )
+    for key, values in series.items():
+        signals = dict(zip(("t", *SIGNALS), values.T, strict=True))
+        cells[key] = {name: _SCALES.get(name, 1.0) * each for name, each in signals.items()}
+    caption = "The same seed in every cell; thinned to 250 samples."
+    return Explorer(title, menus, cells, _PANELS, caption)
 
 
-def _run(cell: Cell, manoeuvre: str, seed: int) -> Rollout:
+def run_of(cell: Cell, seed: int) -> Rollout:
     """One episode of a contestant in a single env."""
-    env: gym.Env[Any, Any] = gym.make(cell.env_id, scenario=manoeuvre, on_bad_action="fail")
+    options = {"scenario": cell.scenario, "on_bad_action": "fail"} | cell.options
+    env: gym.Env[Any, Any] = gym.make(cell.env_id, **options)
     if cell.estimator:
-        outputs = outputs_for(cell.estimator)
-        env = EstimateObservation(env, cell.estimator, outputs=outputs, std=False)
+        env = EstimateObservation(env, cell.estimator, **estimate_options(cell))
     return rollout(env, make_agent(cell.controller, env), seed)

@@ -10,6 +10,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 
+from ...agents.policy_file import stamp
 from ...envs.backend import source_stamp
 from .drive import Chunk, Driven, drive
 
@@ -21,7 +22,7 @@ class Kept:
     """`drive` that looks in a folder first and leaves its result there.
 
     folder: None keeps nothing. salt: of the seeds. Results of other sources, plant and matrix
-    included, are not taken for ours.
+    included, or of a policy's other weights, are not taken for ours.
     """
 
     folder: Path | None
@@ -42,7 +43,8 @@ class Kept:
 
     def _path(self, chunk: Chunk) -> Path:
         assert self.folder is not None
-        text = json.dumps([self.salt, sources(), asdict(chunk)], sort_keys=True)
+        weights = stamp(chunk.cell.controller)
+        text = json.dumps([self.salt, sources(), weights, asdict(chunk)], sort_keys=True)
         return self.folder / f"{hashlib.sha256(text.encode()).hexdigest()[:_LENGTH]}.npz"
 
 

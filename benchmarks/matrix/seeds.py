@@ -6,18 +6,20 @@ from pathlib import Path
 import numpy as np
 
 from ... import __version__
+from ...agents.policy_file import ENDING
 
 _PACKAGE = Path(__file__).resolve().parents[2]
-_CONTESTANTS = ("estimators", "agents")
+_CONTESTANTS = {"estimators": (".py", ".toml"), "agents": (".py",), "agents/policies": (ENDING,)}
 _LENGTH = 16
 
 
 def salt_of(*more: str) -> str:
-    """The salt: a hash of the contestants' files, the env's version and further texts."""
+    """The salt: a hash of the contestants' files, weights included, the env's version and further
+    texts."""
     digest = hashlib.sha256(__version__.encode())
-    for folder in _CONTESTANTS:
+    for folder, endings in _CONTESTANTS.items():
         for path in sorted((_PACKAGE / folder).iterdir()):
-            if path.suffix in (".py", ".toml"):
+            if path.suffix in endings:
                 digest.update(path.name.encode() + path.read_bytes())
     for text in more:
         digest.update(text.encode())

@@ -34,7 +34,7 @@ def observations(env: VecNormalize) -> np.ndarray:
     """Raw ones of a drive."""
     rng = np.random.default_rng(1)
     env.reset()
-    seen = [env.get_original_obs()]
+    seen: list[Any] = [env.get_original_obs()]
     for _ in range(200):
         env.step(rng.uniform(-1.0, 1.0, (2, 1)))
         seen.append(env.get_original_obs())
@@ -83,7 +83,7 @@ def test_it_is_torchs_function_where_torch_is_in_double_precision(name: str) -> 
     """For observations of any size, where single precision rounds more than 1e-6 away."""
     env = normalised(norm_obs=False)
     model = made(name, env)
-    x = np.random.default_rng(0).normal(size=(200, env.observation_space.shape[0])) * 10.0
+    x = np.random.default_rng(0).normal(size=(200, 22)) * 10.0
     ours = network_from_sb3(model, env)(x)
     policy = model.policy
     if name.startswith(("ppo", "a2c")):

@@ -103,7 +103,7 @@ def test_an_entry_that_never_varied_is_not_read(policy: Policy) -> None:
 
 
 def test_a_policy_of_an_estimate_needs_it() -> None:
-    options = {"outputs": ["beta", "gamma"], "std": False}
+    options: dict[str, Any] = {"outputs": ["beta", "gamma"], "std": False}
     card = Card.of(VISION, {}, "multirate-kf", options)
     assert card.observation[-2:] == (("beta_hat", "rad"), ("gamma_hat", "rad/s"))
     policy = a_policy(card)

@@ -15,7 +15,7 @@ from sideslip.benchmarks.matrix import contest, drive, results
 from sideslip.benchmarks.matrix.ceiling import carried, judged, refusals_of, tops_of
 from sideslip.benchmarks.matrix.contestants import MANOEUVRES, STEERING, YAW, Cell, cells
 from sideslip.benchmarks.matrix.drive import NUMBERS, Chunk
-from sideslip.benchmarks.matrix.illustrate import _SHOWN, _run
+from sideslip.benchmarks.matrix.illustrate import _SHOWN, run_of
 from sideslip.benchmarks.matrix.kept import Kept
 from sideslip.benchmarks.matrix.price import SCENARIO
 from sideslip.benchmarks.matrix.results import measure
@@ -255,7 +255,7 @@ def test_the_run_in_motion_is_the_cells_own(monkeypatch: pytest.MonkeyPatch) -> 
     for cell in _SHOWN:
         same = Cell(cell.env_id, "sine-with-dwell", cell.estimator, cell.controller)
         driven = drive.drive(Chunk(same, (5,)))
-        alone = _run(cell, "sine-with-dwell", 5)
+        alone = run_of(same, 5)
         assert alone.cost == pytest.approx(number(driven, "cost")[0], rel=1e-12)
 
 

@@ -1,0 +1,179 @@
+"""Question: what does a learned policy cost, against no control and the best classical line?
+
+All drive the same seeds in the env that the policy was trained on, which are made from its weights:
+nobody can have trained on them.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from .. import __version__
+from ..agents.policy_card import JsonMap
+from ..agents.policy_file import Policy, load_policy
+from .matrix.contestants import REFERENCE_FILTER, Cell
+from .matrix.drive import NUMBERS, Array, Chunk, Driven, drive
+from .matrix.scores import improvement
+from .matrix.seeds import salted_seeds
+from .matrix.tables import spec_of
+from .rows import Row, Suite, Table
+from .stats import interval
+
+CLASSICAL = "lqr"
+_SHOWN = {"RMS slip": "rms_slip", "peak slip": "peak_slip"}
+
+
+@dataclass
+class Enjoyed:
+    """The contestants' episodes on the same seeds: the policy's first.
+
+    driven: by contestant. left_out: why a contestant is not among them. salt: of the seeds, ""
+    where they were given.
+    """
+
+    policy: Policy
+    salt: str
+    seeds: list[int]
+    cells: dict[str, Cell]
+    driven: dict[str, Driven]
+    left_out: dict[str, str]
+
+    def costs(self, name: str) -> Array:
+        """(seeds,) of a contestant."""
+        return self.numbers(name, "cost")
+
+    def numbers(self, name: str, what: str) -> Array:
+        """(seeds,) one of NUMBERS."""
+        return self.driven[name].numbers[:, NUMBERS.index(what)]
+
+
+def enjoy(
+    policy: str,
+    episodes: int = 256,
+    *,
+    env_id: str | None = None,
+    scenario: str | None = None,
+    seed: int | None = None,
+) -> Enjoyed:
+    """Drive a policy, the uncontrolled car, and the classical line.
+
+    policy: a shipped name or a path. env_id: another env than the policy's own, with that id's
+    options. scenario: a name, instead of the env's own. seed: of the first episode, the next ones
+    count up; default: seeds made from the weights.
+
+    Raises ValueError where the policy cannot drive the env, and what `load_policy` raises.
+    """
+    loaded = load_policy(policy)
+    home, shown, options = _task(loaded, env_id, scenario)
+    salt = loaded.salt if seed is None else ""
+    seeds = salted_seeds(salt, episodes) if seed is None else list(range(seed, seed + episodes))
+    contestants = {
+        loaded.name: (loaded.card.estimator, policy),
+        f"{CLASSICAL} on {REFERENCE_FILTER}": (REFERENCE_FILTER, CLASSICAL),
+        "none": ("", "none"),
+    }
+    cells = {
+        name: Cell(home, shown, estimator, who, options)
+        for name, (estimator, who) in contestants.items()
+    }
+    driven = {name: drive(Chunk(cell, tuple(seeds), keep=True)) for name, cell in cells.items()}
+    errors = {name: each.error for name, each in driven.items() if each.error}
+    for needed in (loaded.name, "none"):
+        if needed in errors:
+            raise ValueError(f"{needed} cannot drive {home}: {errors[needed]}")
+    there = {name: each for name, each in driven.items() if name not in errors}
+    return Enjoyed(loaded, salt, seeds, cells, there, errors)
+
+
+def _task(policy: Policy, env_id: str | None, scenario: str | None) -> tuple[str, str, JsonMap]:
+    """(env's id, what its scenario is called, its options)."""
+    card = policy.card
+    options = dict(card.env_options) if env_id in (None, card.env_id) else {}
+    if scenario is not None:
+        options["scenario"] = scenario
+    home = env_id or card.env_id
+    base: Any = gym.make(home, **options).unwrapped
+    return home, base.scenario.name, options
+
+
+def evaluation(found: Enjoyed) -> dict[str, Any]:
+    """For a card: the seeds' salt, and each contestant's mean cost with its 95 % interval."""
+    costs = {}
+    for name in found.driven:
+        mean, low, high = (round(each, 6) for each in interval(found.costs(name)))
+        costs[name] = {"mean": mean, "low": low, "high": high}
+    return {"salt": found.salt, "episodes": len(found.seeds), "cost": costs}
+
+
+def suite_of(found: Enjoyed) -> Suite:
+    """Table and rows; the first episode over time and in motion, where plotly is there."""
+    name, card = found.policy.name, found.policy.card
+    cell = found.cells[name]
+    text = (
+        f"{len(found.seeds)} episodes of {cell.scenario}, the same seeds for all. {name} was "
+        f"trained by {card.algorithm or 'an unnamed algorithm'} on {card.steps} steps of "
+        f"{card.env_id} in {card.cpu_seconds:.0f} CPU-s."
+    )
+    suite = Suite("enjoy", f"{name} on {cell.env_id}", text, _rows(found), [_table(found)])
+    from .matrix.illustrate import in_motion, over_time, run_of
+
+    runs = {who: run_of(found.cells[who], found.seeds[0]) for who in found.driven}
+    try:
+        suite.figures.append(in_motion(f"In motion: {cell.scenario}, first seed", runs))
+    except ModuleNotFoundError:
+        return suite
+    series: dict[tuple[str, ...], Array] = {
+        (who,): each.series for who, each in found.driven.items() if each.series is not None
+    }
+    suite.explorers.append(over_time("The first seed over time", ("controller",), series))
+    return suite
+
+
+def _table(found: Enjoyed) -> Table:
+    first = found.policy.name
+    own, none = found.costs(first), found.costs("none")
+    header = ("controller", "cost", "95 % interval", "of none", "better", *_SHOWN, "fails")
+    cells = []
+    for name in found.driven:
+        costs = found.costs(name)
+        cost, low, high = interval(costs)
+        cells.append(
+            [
+                name,
+                f"{cost:.3f}",
+                f"{low:.3f} .. {high:.3f}",
+                f"{100.0 * cost / none.mean():.1f} %",
+                "" if name == first else f"{100.0 * improvement(own, costs):.0f} %",
+                *(f"{1e3 * found.numbers(name, each).mean():.2f}" for each in _SHOWN.values()),
+                f"{100.0 * np.mean(found.numbers(name, 'failure') != 0.0):.1f} %",
+            ]
+        )
+    note = (
+        "Mean cost of an episode. of none: share of the uncontrolled car's. better: probability that "
+        f"an episode of {first} costs less than one of this one. Slip in mrad."
+    )
+    left_out = [f"{name} was not driven: {error}." for name, error in found.left_out.items()]
+    return Table("What it costs", header, cells, " ".join([note, *left_out]))
+
+
+def _rows(found: Enjoyed) -> list[Row]:
+    rows = []
+    for name, cell in found.cells.items():
+        if name not in found.driven:
+            continue
+        common: dict[str, Any] = {
+            "suite": "enjoy",
+            "scenario": cell.scenario,
+            "estimator": cell.estimator,
+            "controller": found.policy.name if name == found.policy.name else cell.controller,
+            "n": len(found.seeds),
+            "salt": found.salt,
+            "env_version": f"{cell.env_id} {__version__}",
+            "spec": spec_of(cell),
+        }
+        for metric in ("cost", *_SHOWN.values(), "effort"):
+            value, low, high = interval(found.numbers(name, metric))
+            rows.append(Row(metric=metric, value=value, low=low, high=high, **common))
+    return rows

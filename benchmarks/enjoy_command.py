@@ -1,0 +1,67 @@
+"""`sideslip enjoy`: a learned policy at work, and what it costs against others."""
+
+from dataclasses import asdict
+from json import dumps
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich import box
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from .giving import give, show_episode
+from .rows import check_writable
+
+if TYPE_CHECKING:
+    from ..agents.policy_file import Policy
+
+
+def enjoy_command(
+    policy: Annotated[str, typer.Argument(help="A shipped policy's name or a file's path.")],
+    env: Annotated[str | None, typer.Option(help="Another id than the policy's own.")] = None,
+    episodes: Annotated[int, typer.Option(min=1, help="How many.")] = 256,
+    scenario: Annotated[str | None, typer.Option(help="A scenario's name.")] = None,
+    seed: Annotated[
+        int | None,
+        typer.Option(help="Of the first episode; default: test seeds made from the weights."),
+    ] = None,
+    html: Annotated[Path | None, typer.Option("--html", help="Write a report.")] = None,
+    json: Annotated[Path | None, typer.Option("--json", help="Write the rows.")] = None,
+    parquet: Annotated[Path | None, typer.Option("--parquet", help="Write the rows.")] = None,
+    plot: Annotated[Path | None, typer.Option(help="Write the first episode as a PNG.")] = None,
+    card: Annotated[bool, typer.Option("--card", help="Show the policy's card, no more.")] = False,
+) -> None:
+    """Drive a learned policy: its cost against no control and the best classical line."""
+    from ..agents.policy_file import load_policy
+    from .enjoy import enjoy, suite_of
+    from .matrix.illustrate import run_of
+
+    console = Console()
+    if card:
+        _show_card(console, load_policy(policy))
+        return
+    check_writable(html, json, parquet, plot)
+    found = enjoy(policy, episodes, env_id=env, scenario=scenario, seed=seed)
+    give(console, [suite_of(found)], html, json, parquet)
+    first = found.cells[found.policy.name]
+    show_episode(console, run_of(first, found.seeds[0]), found.policy.name, plot)
+
+
+def _show_card(console: Console, policy: "Policy") -> None:
+    """A line a field of the card, and what the file says of the network."""
+    network = policy.network
+    sizes = " x ".join(map(str, (network.inputs, *network.hidden, network.width)))
+    unread = [name for (name, _), read in zip(policy.card.observation, policy.reads, strict=True)
+              if not read]  # fmt: skip
+    told = asdict(policy.card) | {
+        "observation": ", ".join(f"{name} / {unit}" for name, unit in policy.card.observation),
+        "not read": ", ".join(unread) or "none",
+        "network": f"{sizes}, {network.activation}, {network.output} output",
+        "observation clipped at": network.clip,
+    }
+    table = Table("field", "value", box=box.SIMPLE_HEAD, title=policy.name, title_justify="left")
+    for name, value in told.items():
+        table.add_row(name, escape(value if isinstance(value, str) else dumps(value)))
+    console.print(table)

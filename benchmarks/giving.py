@@ -1,0 +1,87 @@
+"""What a command gives: tables and lines on the screen, and the files that were asked for."""
+
+import platform
+import shlex
+import sys
+from collections.abc import Sequence
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from rich.console import Console
+
+from .. import __version__
+from .rows import Row, Suite, write_json, write_parquet, write_whole
+from .screen import print_suite
+
+if TYPE_CHECKING:
+    from ..agents.rollout import Rollout
+
+_SHOWN = ("numpy", "scipy", "numba", "gymnasium", "control", "plotly")
+
+
+def show_episode(
+    console: Console,
+    drive: "Rollout",
+    who: str,
+    plot: Path | None = None,
+    parquet: Path | None = None,
+    kml: Path | None = None,
+) -> None:
+    """Say an episode's score in a line and draw it; who: drove it."""
+    from .kml import track_kml
+
+    slip = drive["beta"]
+    console.print(
+        f"{drive.log.name}: {drive['t'][-1]:.2f} s, cost {drive.cost:.4g}, "
+        f"RMS slip {1e3 * np.sqrt(np.mean(slip**2)):.2f} mrad, "
+        f"peak {1e3 * np.max(np.abs(slip)):.2f} mrad" + (", FAILED" if drive.failed else ""),
+        highlight=False,
+    )
+    if plot is not None:
+        drive.plot().savefig(plot, dpi=120)
+    if parquet is not None:
+        drive.to_parquet(parquet)
+    if kml is not None:
+        write_whole(kml, track_kml(drive.log.name, {who: (drive["X"], drive["Y"])}))
+
+
+def give(
+    console: Console,
+    suites: Sequence[Suite],
+    html: Path | None = None,
+    json: Path | None = None,
+    parquet: Path | None = None,
+) -> None:
+    """Print the tables and write what was asked for."""
+    for suite in suites:
+        print_suite(console, suite)
+    rows: list[Row] = [row for suite in suites for row in suite.rows]
+    if json is not None:
+        write_json(json, rows)
+        console.print(f"rows: {json}", highlight=False)
+    if parquet is not None:
+        write_parquet(parquet, rows)
+        console.print(f"rows: {parquet}", highlight=False)
+    if html is not None:
+        from .report import write_report
+
+        write_report(html, list(suites), command_line(), environment())
+        console.print(f"report: {html}", highlight=False)
+
+
+def command_line() -> str:
+    """What was typed."""
+    return shlex.join(["sideslip", *sys.argv[1:]])
+
+
+def environment() -> dict[str, str]:
+    """Versions that the numbers depend on."""
+    found = {"sideslip": __version__, "Python": platform.python_version()}
+    for name in _SHOWN:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return found
