@@ -20,7 +20,8 @@ class Card:
 
     env_id, env_options: of `gym.make`. estimator, estimator_options: of `EstimateObservation`
     around it, "" for none. observation: (name, unit) of each entry that the network takes.
-    control_period: ticks. algorithm, algorithm_options: how it was trained. command: the line that
+    control_period: ticks. reference: of `envs.reference.REFERENCES`, by which it was judged.
+    algorithm, algorithm_options: how it was trained. command: the line that
     made it. seeds: by purpose ("training", ...). steps: of the environment. cpu_seconds: of the
     training. sideslip: the version. evaluation: of `sideslip.benchmarks.enjoy`: seeds, and mean
     costs of the policy, of none and of the best classical line on them.
@@ -31,6 +32,7 @@ class Card:
     env_id: str
     observation: tuple[tuple[str, str], ...]
     control_period: int
+    reference: str
     env_options: JsonMap = field(default_factory=dict)
     estimator: str = ""
     estimator_options: JsonMap = field(default_factory=dict)
@@ -80,7 +82,8 @@ class Card:
         seen = given(env)
         env.close()
         entries = tuple((entry.name, entry.unit) for entry in seen.layout)
-        return cls(observation=entries, control_period=seen.control_period, **told, **rest)
+        task = {"control_period": int(seen.control_period), "reference": seen.reference}
+        return cls(observation=entries, **task, **told, **rest)
 
     @classmethod
     def from_mapping(cls, told: Any) -> "Card":

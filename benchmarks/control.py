@@ -6,8 +6,9 @@ from pathlib import Path
 from rich.console import Console
 
 from .. import __version__
+from ..agents.policy_file import is_policy, load_policy
 from .matrix.ceiling import calibrated_by, judged, refusals_of, tops_of
-from .matrix.contestants import EPISODES, STEERING, YAW, cells
+from .matrix.contestants import EPISODES, LEARNED, STEERING, YAW, cells
 from .matrix.illustrate import illustrate
 from .matrix.price import DELAYS, SCENARIO, Price, price_of_delay
 from .matrix.results import Results, measure
@@ -60,7 +61,7 @@ def run(
             if not any(result.error for result in each.results.values()):
                 each.us = decision_time(each.cell)
             suite.rows += rows_of(each, salt)
-        note = " ".join([_note(found[env_id], episodes), *log])
+        note = " ".join([_note(found[env_id], episodes), *_learned(env_id), *log])
         suite.tables.append(main_table(f"{title} ({env_id})", found[env_id], note))
         more.append(motion_table(f"{title}: the motion", found[env_id]))
         yard.append(yardsticks(results, env_id, tops[env_id]))
@@ -74,6 +75,16 @@ def run(
     spent = sum(cell.seconds for each in (results, *late) for cell in each.found.values())
     suite.text += f"\n\nDriven in {spent / 60.0:.1f} CPU-minutes. {calibrated_by()}"
     return suite
+
+
+def _learned(env_id: str) -> list[str]:
+    """What the policies of a table were trained on."""
+    cards = {name: load_policy(name).card for _, name in LEARNED[env_id] if is_policy(name)}
+    return [
+        f"{name}: {card.algorithm}, {card.steps:.2g} steps of {card.env_id} alone, "
+        f"for the reference {card.reference}."
+        for name, card in cards.items()
+    ]
 
 
 def _refusals(all_results: list[Results]) -> list[Table]:

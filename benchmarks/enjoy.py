@@ -4,7 +4,8 @@ All drive the same seeds in the env that the policy was trained on, which are ma
 nobody can have trained on them.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -12,7 +13,7 @@ import numpy as np
 
 from .. import __version__
 from ..agents.policy_card import JsonMap
-from ..agents.policy_file import Policy, load_policy
+from ..agents.policy_file import Policy, load_policy, save_policy
 from .matrix.contestants import REFERENCE_FILTER, Cell
 from .matrix.drive import NUMBERS, Array, Chunk, Driven, drive
 from .matrix.scores import improvement
@@ -22,20 +23,20 @@ from .rows import Row, Suite, Table
 from .stats import interval
 
 CLASSICAL = "lqr"
-_SHOWN = {"RMS slip": "rms_slip", "peak slip": "peak_slip"}
 
 
 @dataclass
 class Enjoyed:
     """The contestants' episodes on the same seeds: the policy's first.
 
-    driven: by contestant. left_out: why a contestant is not among them. salt: of the seeds, ""
-    where they were given.
+    salt: of the seeds, "" where they were given. reference: of the env. driven: by contestant.
+    left_out: why a contestant is not among them.
     """
 
     policy: Policy
     salt: str
     seeds: list[int]
+    reference: str
     cells: dict[str, Cell]
     driven: dict[str, Driven]
     left_out: dict[str, str]
@@ -66,7 +67,7 @@ def enjoy(
     Raises ValueError where the policy cannot drive the env, and what `load_policy` raises.
     """
     loaded = load_policy(policy)
-    home, shown, options = _task(loaded, env_id, scenario)
+    home, shown, reference, options = _task(loaded, env_id, scenario)
     salt = loaded.salt if seed is None else ""
     seeds = salted_seeds(salt, episodes) if seed is None else list(range(seed, seed + episodes))
     contestants = {
@@ -84,18 +85,20 @@ def enjoy(
         if needed in errors:
             raise ValueError(f"{needed} cannot drive {home}: {errors[needed]}")
     there = {name: each for name, each in driven.items() if name not in errors}
-    return Enjoyed(loaded, salt, seeds, cells, there, errors)
+    return Enjoyed(loaded, salt, seeds, reference, cells, there, errors)
 
 
-def _task(policy: Policy, env_id: str | None, scenario: str | None) -> tuple[str, str, JsonMap]:
-    """(env's id, what its scenario is called, its options)."""
+def _task(
+    policy: Policy, env_id: str | None, scenario: str | None
+) -> tuple[str, str, str, JsonMap]:
+    """(env's id, what its scenario is called, its reference, its options)."""
     card = policy.card
     options = dict(card.env_options) if env_id in (None, card.env_id) else {}
     if scenario is not None:
         options["scenario"] = scenario
     home = env_id or card.env_id
     base: Any = gym.make(home, **options).unwrapped
-    return home, base.scenario.name, options
+    return home, base.scenario.name, base.reference, options
 
 
 def evaluation(found: Enjoyed) -> dict[str, Any]:
@@ -107,6 +110,14 @@ def evaluation(found: Enjoyed) -> dict[str, Any]:
     return {"salt": found.salt, "episodes": len(found.seeds), "cost": costs}
 
 
+def evaluate(path: str | Path, episodes: int = 256) -> Enjoyed:
+    """Drive a policy's test seeds in its own env and write what it costs into its card."""
+    found = enjoy(str(path), episodes)
+    policy = found.policy
+    save_policy(path, policy.network, replace(policy.card, evaluation=evaluation(found)))
+    return found
+
+
 def suite_of(found: Enjoyed) -> Suite:
     """Table and rows; the first episode over time and in motion, where plotly is there."""
     name, card = found.policy.name, found.policy.card
@@ -114,8 +125,11 @@ def suite_of(found: Enjoyed) -> Suite:
     text = (
         f"{len(found.seeds)} episodes of {cell.scenario}, the same seeds for all. {name} was "
         f"trained by {card.algorithm or 'an unnamed algorithm'} on {card.steps} steps of "
-        f"{card.env_id} in {card.cpu_seconds:.0f} CPU-s."
+        f"{card.env_id} (reference: {card.reference}) in {card.cpu_seconds:.0f} CPU-s."
     )
+    judged = found.reference
+    if judged != card.reference:
+        text += f" Here it is judged by another reference, {judged}: by another cost."
     suite = Suite("enjoy", f"{name} on {cell.env_id}", text, _rows(found), [_table(found)])
     from .matrix.illustrate import in_motion, over_time, run_of
 
@@ -134,7 +148,16 @@ def suite_of(found: Enjoyed) -> Suite:
 def _table(found: Enjoyed) -> Table:
     first = found.policy.name
     own, none = found.costs(first), found.costs("none")
-    header = ("controller", "cost", "95 % interval", "of none", "better", *_SHOWN, "fails")
+    header = (
+        "controller",
+        "cost",
+        "95 % interval",
+        "of none",
+        "better",
+        "RMS slip",
+        "step",
+        "fails",
+    )
     cells = []
     for name in found.driven:
         costs = found.costs(name)
@@ -146,13 +169,15 @@ def _table(found: Enjoyed) -> Table:
                 f"{low:.3f} .. {high:.3f}",
                 f"{100.0 * cost / none.mean():.1f} %",
                 "" if name == first else f"{100.0 * improvement(own, costs):.0f} %",
-                *(f"{1e3 * found.numbers(name, each).mean():.2f}" for each in _SHOWN.values()),
+                f"{1e3 * found.numbers(name, 'rms_slip').mean():.2f}",
+                f"{found.numbers(name, 'largest_step').mean():.0f}",
                 f"{100.0 * np.mean(found.numbers(name, 'failure') != 0.0):.1f} %",
             ]
         )
     note = (
-        "Mean cost of an episode. of none: share of the uncontrolled car's. better: probability that "
-        f"an episode of {first} costs less than one of this one. Slip in mrad."
+        "Mean cost of an episode. of none: share of the uncontrolled car's. better: probability "
+        f"that an episode of {first} costs less than one of this one. Slip in mrad. step: "
+        "the largest between two decisions, in N m."
     )
     left_out = [f"{name} was not driven: {error}." for name, error in found.left_out.items()]
     return Table("What it costs", header, cells, " ".join([note, *left_out]))
@@ -173,7 +198,7 @@ def _rows(found: Enjoyed) -> list[Row]:
             "env_version": f"{cell.env_id} {__version__}",
             "spec": spec_of(cell),
         }
-        for metric in ("cost", *_SHOWN.values(), "effort"):
+        for metric in ("cost", "rms_slip", "peak_slip", "effort", "largest_step"):
             value, low, high = interval(found.numbers(name, metric))
             rows.append(Row(metric=metric, value=value, low=low, high=high, **common))
     return rows

@@ -152,8 +152,8 @@ def _row(scenario: str, metric: str, each: Estimate, common: dict[str, Any]) -> 
 
 def spec_of(cell: Cell) -> str:
     """The env as JSON: what `gym.make` needs to build it again."""
-    spec = gym.spec(cell.env_id)
-    env = gym.make(spec, scenario=cell.scenario, on_bad_action="fail", **cell.options)
+    options = {"scenario": cell.scenario, "on_bad_action": "fail"} | cell.options
+    env = gym.make(gym.spec(cell.env_id), **options)
     return env.spec.to_json() if env.spec is not None else ""
 
 

@@ -24,6 +24,7 @@ CARD = Card(
     "sideslip/YawVision-v0",
     (("gyro", "rad/s"), ("camera_psi", "rad"), ("beta_ref", "rad")),
     10,
+    "zero-slip",
     env_options={"scenario": {"base": "gust", "speed": 12.0}},
     algorithm="ppo",
     command="sideslip train --algo ppo",
@@ -93,7 +94,7 @@ def test_shipped_policies_can_be_read(name: str) -> None:
     card = policy.card
     assert policy.name == name and card.command and card.steps > 0 and card.cpu_seconds > 0.0
     again = Card.of(card.env_id, card.env_options, card.estimator, card.estimator_options)
-    assert again.observation == card.observation and again.control_period == card.control_period
+    assert again.observation == card.observation and again.reference == card.reference
     assert card.evaluation["salt"] == policy.salt
     assert {"none", "lqr on exact-kf", name} <= card.evaluation["cost"].keys()
 

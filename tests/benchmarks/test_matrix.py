@@ -25,7 +25,12 @@ from sideslip.envs import FAILURES, SCENARIOS
 from sideslip.estimators import EstimateObservation
 
 SEEDS = (3, 4, 2**32 - 1)
-PAIRS = (("", "none"), ("multirate-residual-kf", "two-dof"), ("exact-kf", "lqr"))
+PAIRS = (
+    ("", "none"),
+    ("multirate-residual-kf", "two-dof"),
+    ("exact-kf", "lqr"),
+    ("", "ppo-yaw-vision"),
+)
 
 
 def number(driven: Any, name: str) -> np.ndarray:

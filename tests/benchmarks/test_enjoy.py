@@ -1,0 +1,174 @@
+"""A policy against others: the same seeds for all, written into its card, a cell of the matrix."""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import sideslip
+from sideslip.agents import make_agent
+from sideslip.agents.network import Network
+from sideslip.agents.policy_card import Card
+from sideslip.agents.policy_file import load_policy, save_policy, shipped
+from sideslip.agents.schedule import gain_table
+from sideslip.benchmarks import control
+from sideslip.benchmarks.enjoy import enjoy, evaluate, evaluation, suite_of
+from sideslip.benchmarks.matrix import seeds
+from sideslip.benchmarks.matrix.contest import estimate_options, make_contest
+from sideslip.benchmarks.matrix.contestants import LEARNED, MANOEUVRES, STEERING, YAW, Cell, cells
+from sideslip.benchmarks.matrix.drive import Chunk
+from sideslip.benchmarks.matrix.kept import Kept
+from sideslip.benchmarks.matrix.seeds import salt_of, salted_seeds
+from tests.benchmarks.test_cli import Run, run
+
+__all__ = ["run"]  # a fixture
+
+SHORT = {"base": "random-steering", "duration": 1.5}
+HERE = "sideslip/YawVision-v0"
+
+
+def a_file(folder: Path, estimator: str = "", **options: Any) -> Path:
+    """A damper: the yaw moment opposes the gyro."""
+    card = Card.of(HERE, {"scenario": SHORT}, estimator, options, steps=1, command="by hand")
+    names = [name for name, _ in card.observation]
+    scale = np.array([float(name == "gyro") for name in names])
+    network = Network(np.zeros(len(names)), scale, [-0.3 * scale[None]], [np.zeros(1)])
+    path = folder / "damper.safetensors"
+    save_policy(path, network, card)
+    return path
+
+
+def test_everybody_drives_the_same_seeds_which_the_weights_make(tmp_path: Path) -> None:
+    path = a_file(tmp_path)
+    found = enjoy(str(path), 6)
+    assert list(found.driven) == ["damper", "lqr on exact-kf", "none"] and found.left_out == {}
+    assert found.salt == load_policy(path).salt
+    assert found.seeds == salted_seeds(found.salt, 6)
+    env = gym.make(HERE, scenario=SHORT)
+    for name, agent in (("damper", make_agent(str(path), env)), ("none", None)):
+        alone = [sideslip.rollout(env, agent, seed).cost for seed in found.seeds]
+        assert found.costs(name) == pytest.approx(alone, rel=1e-12)
+    assert found.costs("lqr on exact-kf").mean() < found.costs("none").mean()
+    assert enjoy(str(path), 3, seed=7).seeds == [7, 8, 9]
+
+
+def test_the_evaluation_goes_into_the_card_and_leaves_the_weights(tmp_path: Path) -> None:
+    path = a_file(tmp_path)
+    before = load_policy(path)
+    found = evaluate(path, 5)
+    after = load_policy(path)
+    assert after.salt == before.salt
+    assert after.card == replace(before.card, evaluation=evaluation(found))
+    told = after.card.evaluation
+    assert told["episodes"] == 5 and told["salt"] == before.salt
+    for name, costs in told["cost"].items():
+        assert costs["mean"] == pytest.approx(found.costs(name).mean(), abs=1e-6)
+        assert costs["low"] <= costs["mean"] <= costs["high"]
+
+
+def test_the_suite_tells_it_in_rows_table_and_pictures(tmp_path: Path) -> None:
+    found = enjoy(str(a_file(tmp_path)), 4, env_id="sideslip/YawFusion-v0", scenario="gust")
+    suite = suite_of(found)
+    (table,) = suite.tables
+    assert [line[0] for line in table.cells] == ["damper", "lqr on exact-kf", "none"]
+    assert all(len(line) == len(table.header) for line in table.cells)
+    assert table.cells[2][3] == "100.0 %"
+    costs = {row.controller: row.value for row in suite.rows if row.metric == "cost"}
+    assert costs["damper"] == pytest.approx(found.costs("damper").mean())
+    assert {row.scenario for row in suite.rows} == {"gust"}
+    assert "another reference, model" in suite.text  # it was trained for zero slip
+    assert len(suite.explorers) == 1 and len(suite.figures) == 1
+
+
+def test_without_the_classical_line_the_rest_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gain_table.cache_clear()
+    monkeypatch.setitem(sys.modules, "control", None)
+    found = enjoy(str(a_file(tmp_path)), 2)
+    assert list(found.driven) == ["damper", "none"]
+    assert "lqr on exact-kf was not driven" in suite_of(found).tables[0].note
+
+
+@pytest.mark.parametrize("name", shipped())
+def test_what_a_shipped_card_says_is_so(name: str) -> None:
+    """The first of its test seeds again: the uncontrolled mean is that of all of them."""
+    told = load_policy(name).card.evaluation
+    found = enjoy(name, 16)
+    assert found.salt == told["salt"]
+    none = found.costs("none")
+    error = none.std(ddof=1) / 4.0
+    assert abs(none.mean() - told["cost"]["none"]["mean"]) < 5.0 * error
+    assert found.costs(name).mean() < 0.5 * none.mean()
+    assert told["cost"][name]["high"] < told["cost"]["none"]["low"]
+
+
+def test_the_matrix_has_a_cell_of_each_policy_on_every_manoeuvre() -> None:
+    there = set(cells())
+    for env_id in (YAW, STEERING):
+        assert LEARNED[env_id]
+        for estimator, policy in LEARNED[env_id]:
+            assert policy in shipped()
+            for scenario in MANOEUVRES:
+                assert Cell(env_id, scenario, estimator, policy) in there
+        (note, *_) = control._learned(env_id)
+        assert load_policy(policy).card.env_id in note and "reference" in note
+
+
+def test_a_policy_in_a_cell_gets_the_estimate_it_was_trained_on(tmp_path: Path) -> None:
+    path = a_file(tmp_path, "multirate-kf", outputs=["beta"], std=True)
+    cell = Cell(YAW, "gust", "multirate-kf", str(path))
+    assert estimate_options(cell) == {"outputs": ["beta"], "std": True}
+    env, agent = make_contest(cell, 2)
+    assert [entry.name for entry in env.layout[-2:]] == ["beta_hat", "beta_std"]  # type: ignore[attr-defined]
+    assert agent.needs == ("gyro",)
+
+
+def test_seeds_and_kept_cases_are_of_these_weights(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = a_file(tmp_path)
+    cell = Cell(YAW, "gust", "", str(path), {"scenario": SHORT})
+    kept = Kept(tmp_path / "kept", "salt")
+    first = kept(Chunk(cell, (1, 2)))
+    assert np.array_equal(kept(Chunk(cell, (1, 2))).numbers, first.numbers)
+    policy = load_policy(path)
+    other = replace(policy.network, biases=[np.ones(1)])
+    save_policy(path, other, policy.card)
+    assert not np.array_equal(kept(Chunk(cell, (1, 2))).numbers, first.numbers)
+    salt = salt_of()
+    monkeypatch.setattr(seeds, "_CONTESTANTS", {"estimators": (".py", ".toml"), "agents": (".py",)})
+    assert salt_of() != salt
+
+
+def test_the_command_shows_writes_and_tells_the_card(run: Run, tmp_path: Path) -> None:
+    path, html, plot = a_file(tmp_path), tmp_path / "report.html", tmp_path / "drive.png"
+    status, out, _ = run("enjoy", path, "--episodes", 3, "--html", html, "--plot", plot)
+    assert status == 0 and "lqr on exact-kf" in out and "random-steering" in out
+    assert plot.read_bytes()[:4] == b"\x89PNG" and "damper" in html.read_text()
+    status, out, _ = run("enjoy", path, "--card")
+    assert status == 0
+    for word in (HERE, "by hand", "zero-slip", "22 x 1", "beta_ref"):
+        assert word in out
+    status, out, _ = run("run", HERE, "--agent", path, "--scenario", "lane-change")
+    assert status == 0 and "lane-change" in out
+    assert "ppo-yaw-vision" in run("list")[1]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("nobody",), "policy nobody does not exist; shipped policies: ppo-yaw-vision"),
+        (("ppo-yaw-vision", "--env", "sideslip/YawGps-v0", "--episodes", 2), "camera_psi"),
+        (("ppo-yaw-vision", "--scenario", "moon"), "unknown scenario 'moon'"),
+        (("ppo-yaw-vision", "--html", "nowhere/report.html"), "no such folder"),
+        (("ppo-yaw-vision", "--episodes", 0), "greater than or equal to 1"),
+    ],
+)
+def test_a_mistake_is_told(run: Run, arguments: tuple[object, ...], said: str) -> None:
+    status, _, err = run("enjoy", *arguments)
+    assert status == 2 and said in " ".join(err.split())
