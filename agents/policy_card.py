@@ -82,8 +82,8 @@ class Card:
         seen = given(env)
         env.close()
         entries = tuple((entry.name, entry.unit) for entry in seen.layout)
-        task = {"control_period": int(seen.control_period), "reference": seen.reference}
-        return cls(observation=entries, **task, **told, **rest)
+        told |= {"control_period": int(seen.control_period), "reference": seen.reference}
+        return cls(observation=entries, **told, **rest)
 
     @classmethod
     def from_mapping(cls, told: Any) -> "Card":
