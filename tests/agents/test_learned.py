@@ -1,5 +1,6 @@
 """Learned policies: torch's numbers without torch, read by name, refused where they do not fit."""
 
+import os
 import subprocess
 import sys
 from dataclasses import replace
@@ -154,5 +155,7 @@ def test_no_torch_is_loaded(policy: Policy, tmp_path: Any) -> None:
         "print(agent.predict(env.reset(seed=0)[0])[0].shape)\n"
         "print({'torch', 'stable_baselines3'} & set(sys.modules))\n"
     )
-    done = subprocess.run([sys.executable, "-c", code, str(path)], capture_output=True, text=True)
+    command = [sys.executable, "-c", code, str(path)]
+    env = os.environ | {"PYTHONPATH": ":".join(sys.path)}
+    done = subprocess.run(command, capture_output=True, text=True, env=env)
     assert done.stdout.split("\n")[:2] == ["(1,)", "set()"], done.stderr

@@ -1,6 +1,7 @@
 """A policy's file: what is read is what was saved, and every bad file is refused by name."""
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -109,7 +110,9 @@ def test_a_kill_during_a_save_keeps_the_old_file(file: Path) -> None:
         "os.fsync = lambda _: os.kill(os.getpid(), signal.SIGKILL)\n"
         "save_policy(sys.argv[1], policy.network.reading(policy.reads), policy.card)\n"
     )
-    done = subprocess.run([sys.executable, "-c", code, str(file)], capture_output=True, text=True)
+    command = [sys.executable, "-c", code, str(file)]
+    env = os.environ | {"PYTHONPATH": ":".join(sys.path)}
+    done = subprocess.run(command, capture_output=True, text=True, env=env)
     assert done.returncode == -signal.SIGKILL, done.stderr
     assert file.read_bytes() == before
     assert load_policy(file).card == CARD
