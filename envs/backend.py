@@ -9,7 +9,7 @@ import hashlib
 import math
 import os
 import shutil
-import types
+import types as python_types
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
@@ -17,8 +17,8 @@ from typing import Any, TypeVar
 import numba
 import numpy as np
 from numba.core.dispatcher import Dispatcher
-from numba.extending import overload
-from numba.np.unsafe.ndarray import to_fixed_tuple
+from numba.core import cgutils, types
+from numba.extending import intrinsic, overload
 
 _PACKAGE = Path(__file__).resolve().parent.parent
 _PREFIX = __name__.removesuffix("envs.backend")
@@ -68,7 +68,7 @@ _kept_folder = functools.cache(_cache_folder)
 
 def jit(function: F) -> F:
     """Compile with numba: IEEE arithmetic in the order written, cached on disk where possible."""
-    return _compiled(function, {"error_model": "numpy", "fastmath": False})
+    return _compiled(function, {"error_model": "numpy", "fastmath": False, "_nrt": False})
 
 
 def inlined(function: F) -> F:
@@ -77,7 +77,9 @@ def inlined(function: F) -> F:
     A call of a plant's function passes some sixty numbers through memory, which costs as much as
     the function itself.
     """
-    return _compiled(function, {"error_model": "numpy", "fastmath": False, "forceinline": True})
+    return _compiled(
+        function, {"error_model": "numpy", "fastmath": False, "_nrt": False, "forceinline": True}
+    )
 
 
 def _compiled(function: F, options: dict[str, Any]) -> F:
@@ -150,12 +152,19 @@ def _for_numbers(primitive: Callable[..., Any]) -> None:
 
     @overload(primitive, strict=False)
     def _of(*args):  # type: ignore[no-untyped-def]
-        alone = all(isinstance(each, numba.types.Number | numba.types.Boolean) for each in args)
+        alone = all(isinstance(each, types.Number | types.Boolean) for each in args)
         return primitive if alone else None
 
 
 for _each in PRIMITIVES:
     _for_numbers(_each)
+
+
+@jit
+def copied(source: Any, target: Any) -> None:
+    """Copy a vector's numbers into another one; a slice's assignment would allocate."""
+    for i in range(len(source)):
+        target[i] = source[i]
 
 
 def fixed_tuple(vector: Any, length: int) -> tuple[Any, ...]:
@@ -175,6 +184,12 @@ def at(array: Any, *index: int) -> Any:
 def put(array: Any, value: Any, *index: int) -> None:
     """Write a number into an array."""
     array[index] = value
+
+
+def put_all(array: Any, values: Any, axis: int, *index: int) -> None:
+    """Write a tuple of numbers into an array, from an index on along an axis."""
+    for k, value in enumerate(values):
+        array[tuple(i + k * (a == axis) for a, i in enumerate(index))] = value
 
 
 def of_lane(array: Any, lane: int, *index: int) -> Any:
@@ -197,12 +212,30 @@ def put_along(array: Any, values: Any, i: int, j: int) -> None:
     array[i, j] = values
 
 
+@intrinsic(prefer_literal=True)
+def _entries(typingctx, vector, length):  # type: ignore[no-untyped-def]
+    size = getattr(length, "literal_value", None)
+    if size is None:
+        return None  # numba asks again with the literal
+
+    def code(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        kind = sig.args[0]
+        made = context.make_array(kind)(context, builder, args[0])
+        values = []
+        for i in range(size):
+            index = [context.get_constant(types.intp, i)]
+            where = cgutils.get_item_pointer(context, builder, kind, made, index)
+            values.append(context.unpack_value(builder, kind.dtype, where))
+        return context.make_tuple(builder, sig.return_type, values)
+
+    return types.UniTuple(vector.dtype, size)(vector, length), code
+
+
 @overload(fixed_tuple, prefer_literal=True)
 def _fixed_tuple(vector, length):  # type: ignore[no-untyped-def]  # numba compares signatures
-    size = getattr(length, "literal_value", None)
-    if size is None or vector.ndim != 1:
-        return None  # without the literal numba asks again
-    return lambda vector, length: to_fixed_tuple(vector, size)  # type: ignore[call-arg]
+    if not hasattr(length, "literal_value") or vector.ndim != 1:
+        return None
+    return lambda vector, length: _entries(vector, length)
 
 
 ARRAYS: dict[str, Callable[..., Any]] = {
@@ -237,13 +270,15 @@ def _rebuild(function: Any, table: dict[str, Any], done: dict[Any, Any]) -> Any:
     if source in done:
         return done[source]
     names: dict[str, Any] = dict(source.__globals__)
-    rebuilt = types.FunctionType(source.__code__, names, source.__name__, source.__defaults__)
+    rebuilt = python_types.FunctionType(
+        source.__code__, names, source.__name__, source.__defaults__
+    )
     done[source] = rebuilt
     for name in source.__code__.co_names:
         callee = names.get(name)
-        ours = isinstance(callee, types.FunctionType) and (callee.__module__ or "").startswith(
-            __name__.rpartition(".envs")[0]
-        )
+        ours = isinstance(callee, python_types.FunctionType) and (
+            callee.__module__ or ""
+        ).startswith(__name__.rpartition(".envs")[0])
         if isinstance(callee, Dispatcher) or ours:
             names[name] = _rebuild(callee, table, done)
     return rebuilt

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from .backend import abreast, jit
+from .backend import abreast, copied, jit
 from .block import step_block
 from .kernel import kind_of, shares_of, step_vehicle
 from .restart import reset_vehicle
@@ -143,11 +143,11 @@ def reset_rows(
     for m in range(len(chosen)):
         i, t = chosen[m], of[m]
         for j in range(ticks_done[i]):
-            final_rows[i, j, :] = rows[i, j, :]
+            copied(rows[i, j], final_rows[i, j])
         for j in range(delivered[i]):
-            final_packets[i, j, :] = packets[i, j, :]
+            copied(packets[i, j], final_packets[i, j])
         final_ticks_done[i], final_delivered[i] = ticks_done[i], delivered[i]
-        switches[i, :] = kinds[t, :]
+        copied(kinds[t], switches[i])
         reset_vehicle(
             templates[t],
             low[t],

@@ -5,7 +5,7 @@ Packets are delivered in the order (captured tick, sensor); what is under way li
 
 from typing import Any, NamedTuple
 
-from .backend import fixed_tuple, inlined, jit, minimum
+from .backend import fixed_tuple, inlined, jit, minimum, put_all
 from .dynamics import Road
 from .elementary import exp
 from .layout import P, Z
@@ -37,8 +37,7 @@ class Chance(NamedTuple):
 @jit
 def store(vector: Any, start: int, values: Any) -> None:
     """Write a tuple into a vector from `start` on."""
-    for i in range(len(values)):
-        vector[start + i] = values[i]
+    put_all(vector, values, 0, start)
 
 
 @jit

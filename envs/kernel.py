@@ -14,9 +14,11 @@ from .actuators import Lag
 from .backend import (
     anywhere,
     at,
+    copied,
     fixed_tuple,
     jit,
     put,
+    put_all,
     select,
 )
 from .delivery import due, sense_slow
@@ -25,7 +27,7 @@ from .dynamics import Car, Motion, Road
 from .layout import Change, Disturbance, Drive, P, Task, Z
 from .pace import Pace
 from .programme import DRIVER, Wind
-from .record import FAST_WIDTH, TICK
+from .record import TICK
 from .reference import COST_CAP, Target
 from .scratch import AHEAD, TRACK, chance_at, foresee, motion_at
 from .sensors import Noise
@@ -107,10 +109,8 @@ def drive_on(
         now, seen = advance(fixed, N_z, added, now, tick, chance, ahead, kind)
         tick = tick + 1.0
         cost = cost + seen.cost * TICK
-        for i in range(FAST_WIDTH):
-            put(rows, seen.row[i], j, i)
-        for i in range(_MOTION):
-            put(scratch, now.motion[i], TRACK + i, j)
+        put_all(rows, seen.row, 1, j, 0)
+        put_all(scratch, now.motion, 0, TRACK, j)
         failed = anywhere(seen.lost | seen.spun | seen.off)
         ended = failed | anywhere(tick >= task.duration)
         if ended or j + 1 == n:
@@ -119,10 +119,8 @@ def drive_on(
             motion, beta, refs = now.motion, seen.beta, seen.refs
             if anywhere(seen.lost):  # the last that is fit for `info`
                 motion, beta, refs = before, 0.0 * cost, (0.0 * cost, 0.0 * cost)
-            for i in range(_MOTION):
-                put(z, motion[i], Z.motion + i)
-            for i in range(_DRIVE):
-                put(z, now.drive[i], Z.drive + i)
+            put_all(z, motion, 0, Z.motion)
+            put_all(z, now.drive, 0, Z.drive)
             put(z, now.driver, Z.driver)
             put(z, tick, Z.clock + 2)
             failure = select(seen.spun, SPIN * 1.0, select(seen.off, OFF_ROAD * 1.0, 0.0))
@@ -166,7 +164,7 @@ def conclude(
     refs = (report[REPORT.beta_ref], report[REPORT.gamma_ref])
     if switches[4] and done < n:  # an early end: the last sample stands for the missing ones
         for j in range(done, n):
-            rows[j, :] = rows[done - 1, :]
+            copied(rows[done - 1], rows[j])
         observe(p, z, switches, rows, n, count, packets, refs, bounds, obs)
     else:
         observe(p, z, switches, rows, done, count, packets, refs, bounds, obs)

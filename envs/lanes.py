@@ -340,6 +340,40 @@ def _put(array, value, *index):  # type: ignore[no-untyped-def]
     return lambda array, value, *index: _store(array, value, index)
 
 
+@intrinsic(prefer_literal=True)
+def _store_all(typingctx, array, values, axis, index):  # type: ignore[no-untyped-def]
+    if not hasattr(axis, "literal_value"):
+        return None  # numba asks again with the literal
+    lanes = array.ndim == len(index) + 1
+
+    def code(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        kind, told = sig.args[0], sig.args[1]
+        index = cgutils.unpack_tuple(builder, args[3])
+        made = context.make_array(kind)(context, builder, args[0])
+        for k, value in enumerate(cgutils.unpack_tuple(builder, args[1])):
+            here = list(index)
+            here[axis.literal_value] = builder.add(here[axis.literal_value], ir.Constant(_LONG, k))
+            if lanes:
+                value = context.cast(builder, value, told[k], FLOATS)
+                where = _pointer(context, builder, kind, args[0], here)
+                builder.store(value, where, align=8)
+            else:
+                value = context.cast(builder, value, told[k], kind.dtype)
+                where = cgutils.get_item_pointer(context, builder, kind, made, here)
+                context.pack_value(builder, kind.dtype, value, where)
+        return context.get_dummy_value()
+
+    whole = types.UniTuple(types.intp, len(index))
+    return types.void(array, values, axis, whole), code
+
+
+@overload(backend.put_all, prefer_literal=True)
+def _put_all(array, values, axis, *index):  # type: ignore[no-untyped-def]
+    if not hasattr(axis, "literal_value"):
+        return None
+    return lambda array, values, axis, *index: _store_all(array, values, axis, index)
+
+
 @overload(backend.abreast)
 def _abreast():  # type: ignore[no-untyped-def]
     return lambda: _COUNT

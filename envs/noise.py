@@ -38,7 +38,8 @@ CHANNELS = Channels()
 @jit
 def philox(key_low: int, key_high: int, a: int, b: int, c: int = 0, d: int = 0) -> Any:
     """Four random 32-bit words (non-negative integers) for a counter (a, b, c, d)."""
-    k0, k1 = key_low, key_high
+    k0, k1 = key_low & _MASK, key_high & _MASK  # tells compilers that products fit
+    a, b, c, d = a & _MASK, b & _MASK, c & _MASK, d & _MASK
     for _ in range(10):
         p0 = _M0 * a
         p1 = _M1 * c

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from .backend import fixed_tuple, jit, select
+from .backend import copied, fixed_tuple, jit, select
 from .delivery import FAR, Chance, fast_row, sense_slow, store
 from .driver import Driver, wanted_angle
 from .dynamics import Car, Motion, Road, gravity_at, sideslip_angle
@@ -124,7 +124,7 @@ def reset_vehicle(
     refs = reference(steer, v, target, switches[2])
     if switches[4]:  # every sample of the step is asked for: tick 0 stands for all of them
         for j in range(1, len(rows)):
-            rows[j, :] = rows[0, :]
+            copied(rows[0], rows[j])
         observe(p, z, switches, rows, len(rows), count, packets, refs, bounds, obs)
     else:
         observe(p, z, switches, rows, 1, count, packets, refs, bounds, obs)

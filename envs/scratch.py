@@ -8,7 +8,19 @@ from typing import Any
 
 import numpy as np
 
-from .backend import abreast, at, fixed_tuple, jit, of_lane, put, put_along, ramp, to_float, whole
+from .backend import (
+    abreast,
+    at,
+    fixed_tuple,
+    jit,
+    of_lane,
+    put,
+    put_all,
+    put_along,
+    ramp,
+    to_float,
+    whole,
+)
 from .delivery import Chance
 from .dynamics import Motion
 from .layout import Array, P, Z
@@ -37,9 +49,14 @@ def foresee(p: Any, z: Any, n: int, follows: int, scratch: Any) -> None:
         ticks = ramp(first + j)
         inertial = normals(key_low, key_high, ticks, CHANNELS.inertial)
         wheels = normals(key_low, key_high, ticks, CHANNELS.wheels)
-        for i in range(4):
-            put_along(scratch, inertial[i], CHANCE + i, j)
-            put_along(scratch, wheels[i], CHANCE + 4 + i, j)
+        put_along(scratch, inertial[0], CHANCE, j)
+        put_along(scratch, inertial[1], CHANCE + 1, j)
+        put_along(scratch, inertial[2], CHANCE + 2, j)
+        put_along(scratch, inertial[3], CHANCE + 3, j)
+        put_along(scratch, wheels[0], CHANCE + 4, j)
+        put_along(scratch, wheels[1], CHANCE + 5, j)
+        put_along(scratch, wheels[2], CHANCE + 6, j)
+        put_along(scratch, wheels[3], CHANCE + 7, j)
         if not follows:
             put_along(scratch, steering_at(to_float(ticks), programme), AHEAD, j)
 
@@ -53,9 +70,8 @@ def foresee_abreast(p: Any, z: Any, n: int, follows: int, scratch: Any) -> None:
         tick = at(z, Z.clock + 2) + (j + 1)
         inertial = normals(key_low, key_high, whole(tick), CHANNELS.inertial)
         wheels = normals(key_low, key_high, whole(tick), CHANNELS.wheels)
-        for i in range(4):
-            put(scratch, inertial[i], CHANCE + i, j)
-            put(scratch, wheels[i], CHANCE + 4 + i, j)
+        put_all(scratch, inertial, 0, CHANCE, j)
+        put_all(scratch, wheels, 0, CHANCE + 4, j)
         if not follows:
             put(scratch, steering_at(tick, programme), AHEAD, j)
 
