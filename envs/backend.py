@@ -68,7 +68,7 @@ _kept_folder = functools.cache(_cache_folder)
 
 def jit(function: F) -> F:
     """Compile with numba: IEEE arithmetic in the order written, cached on disk where possible."""
-    return _compiled(function, {"error_model": "numpy", "fastmath": False, "_nrt": False})
+    return _compiled(function)
 
 
 def inlined(function: F) -> F:
@@ -77,13 +77,14 @@ def inlined(function: F) -> F:
     A call of a plant's function passes some sixty numbers through memory, which costs as much as
     the function itself.
     """
-    return _compiled(
-        function, {"error_model": "numpy", "fastmath": False, "_nrt": False, "forceinline": True}
-    )
+    return _compiled(function, forceinline=True)
 
 
-def _compiled(function: F, options: dict[str, Any]) -> F:
+def _compiled(function: F, **more: bool) -> F:
     layer = function.__module__.removeprefix(_PREFIX).partition(".")[0]
+    options: dict[str, Any] = {"error_model": "numpy", "fastmath": False, **more}
+    if layer == "envs":  # allocates nothing; counting references costs as much as an observation
+        options["_nrt"] = False
     folder = (
         None if config.DISABLE_JIT else _kept_folder(layer if layer in _LAYERS else _LAYERS[-1])
     )

@@ -14,6 +14,8 @@ Actions = npt.NDArray[np.float32]
 NAMED = 8  # rows that a message lists
 _NO_NUMBERS = (TypeError, ValueError, OverflowError)  # what numpy raises where it finds none
 
+_FLOAT32 = np.dtype(np.float32)
+
 
 def count_of(num_envs: Any) -> int:
     """How many environments; TypeError for what is no whole number, ValueError below one."""
@@ -95,6 +97,8 @@ def options_of(options: Mapping[str, Any], count: int) -> list[dict[str, Any]]:
 def action_of(action: Any, width: int, fail: bool) -> Actions:
     """One action (width,) as float32; what has another shape or is no numbers raises ValueError,
     with `fail` it is NaN."""
+    if type(action) is np.ndarray and action.dtype is _FLOAT32 and action.shape == (width,):
+        return action if action.flags.c_contiguous else action.copy()  # it is only read
     try:
         return _action_of(action, width)
     except ValueError as error:
