@@ -20,7 +20,15 @@ except ModuleNotFoundError as error:
         "figures need plotly: pip install 'sideslip[report]'", name=error.name
     ) from error
 
-__all__ = ["COLOURS", "bars_with_interval", "colour", "error_series", "time_series", "track"]
+__all__ = [
+    "COLOURS",
+    "bars_with_interval",
+    "colour",
+    "curves",
+    "error_series",
+    "time_series",
+    "track",
+]
 
 Array = npt.NDArray[np.floating[Any]]
 
@@ -112,6 +120,23 @@ def error_series(
         figure.data = (figure.data[-1], *figure.data[:-1])
         figure.update_layout(showlegend=True)
     return figure
+
+
+def curves(title: str, x: Array, series: Mapping[str, Array], y_label: str, x_label: str) -> Any:
+    """Lines with dots over logarithmic axes, for costs that range over decades.
+
+    x: (n,), positive. series: name to (n,), positive. Raises ValueError for a series that is not
+    as long as x.
+    """
+    figure = go.Figure()
+    for name, pen in line_styles(series).items():
+        if len(series[name]) != len(x):
+            raise ValueError(f"series {name!r} has {len(series[name])} values, x {len(x)}")
+        trace = _line(name, np.asarray(x, float), np.asarray(series[name], float), *pen)
+        figure.add_trace(trace.update(mode="lines+markers"))
+    figure.update_xaxes(type="log", dtick=1)
+    figure.update_yaxes(type="log", dtick=1)
+    return _finish(figure, title, x_label, y_label, 380, hovermode="x unified")
 
 
 def track(

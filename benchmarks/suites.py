@@ -63,9 +63,9 @@ def _procedures(wish: Wish) -> Suite:
 
 
 def _speed(wish: Wish) -> Suite:
-    from . import speed
+    from .speed import suite
 
-    return speed.run()
+    return suite.run(wish.quick, wish.console)
 
 
 SUITES: dict[str, Callable[[Wish], Suite]] = {

@@ -1,78 +1,251 @@
 """The speed suite: contestants that do the same work, and a row for each. No time is asserted."""
 
-import math
+import shutil
 import sys
+from typing import Any
 
 import numpy as np
 import pytest
 
-from sideslip.benchmarks import speed, speed_filters, timing
-from sideslip.benchmarks.rivals import Rival, four_states, six_states
 from sideslip.benchmarks.rows import Suite
+from sideslip.benchmarks.speed import (
+    env_steps,
+    field,
+    first_use,
+    learning,
+    plant,
+    scaling,
+    suite,
+    targets,
+    timing,
+    yardstick,
+)
+
+SHORT = timing.Effort(rounds=1, seconds=0.0)
+compiler = pytest.mark.skipif(
+    not any(map(shutil.which, ("gcc", "clang", "cc"))), reason="there is no C compiler"
+)
 
 
 @pytest.fixture(autouse=True)
 def short(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(timing, "ROUNDS", 1)
-    monkeypatch.setattr(speed_filters, "TICKS", 400)
-    monkeypatch.setattr(speed_filters, "BATCH", 3)
+    monkeypatch.setattr(env_steps, "COUNT", 3)
+    monkeypatch.setattr(env_steps, "EPISODE", 5)
+    monkeypatch.setattr(scaling, "COUNT", 3)
+    monkeypatch.setattr(scaling, "WORK", 3)
+    monkeypatch.setattr(plant, "CARS", 16)
 
 
-@pytest.mark.parametrize("delay", [0.0, 0.030, 0.129])
-@pytest.mark.parametrize(
-    ("name", "states"), [("multirate-kf", four_states), ("exact-kf", six_states)]
-)
-def test_filterpy_and_ours_give_the_same_estimates(name: str, states: object, delay: float) -> None:
-    """FilterPy with its rewind by hand is what ours is measured against: the same filter."""
-    pytest.importorskip("filterpy")
-    drive = speed_filters.drive(delay)
-    assert len(drive.log.record.packets) >= 8
-    car = drive.told["vehicle"]
-    kf = states(car, drive.told["speed"], drive.told["dt"])  # type: ignore[operator]
-    theirs = Rival(kf, car, round(delay * 1e3)).run(drive.log.record)
-    ours = speed_filters.ours(name, drive).run(drive.log)
-    scale = np.abs(ours.x).max(axis=0)
-    np.testing.assert_allclose(theirs / scale, ours.x / scale, rtol=0.0, atol=1e-10)
+def without(monkeypatch: pytest.MonkeyPatch, *packages: str) -> None:
+    for name in packages:
+        monkeypatch.setitem(sys.modules, name, None)
 
 
-def test_rows_name_every_contestant() -> None:
-    suite = speed.run()
-    assert {row.metric for row in suite.rows} == {"us_per_step", "us_per_tick", "ratio"}
-    assert all(0.0 < row.low <= row.value <= row.high for row in suite.rows)
-    named = {row.scenario for row in suite.rows} | {row.estimator for row in suite.rows}
-    assert {"sideslip/YawVision-v0", "CartPole-v1", "lane-keeping-v0 (highway-env)"} <= named
-    assert {speed_filters.FOUR, speed_filters.SIX, speed_filters.REWIND} <= named
-    assert "n = 6, 3 filters a call" in named
-    assert {f"clone, {frames} frames under way" for frames in speed_filters.FRAMES} <= named
-    assert len(suite.tables) == 3 and len(suite.figures) == 1
+def test_env_steps_are_measured_and_the_absent_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without the optional packages: the suite needs none of them."""
+    without(monkeypatch, "highway_env", "envpool")
+    measured = Suite("speed", "", "")
+    taken, absent = env_steps.add(measured, SHORT)
+    assert {env_steps.FUSION, env_steps.AT_ONCE, env_steps.FULL_COVARIANCE} <= set(taken)
+    assert {env_steps.CARTPOLE, env_steps.CARTPOLES, env_steps.PENDULUM} <= set(taken)
+    assert absent == {
+        env_steps.LANE: "highway-env is not installed",
+        env_steps.PENDULUMS: "envpool is not installed",
+    }
+    rows = {(row.scenario, row.metric) for row in measured.rows}
+    assert rows == {(name, m) for name in taken for m in ("us_per_step", "wall_us_per_step")}
+    assert all(0.0 < row.low <= row.value <= row.high for row in measured.rows)
+    (table,) = measured.tables
+    assert all(f"{name} ({why})" in table.note for name, why in absent.items())
 
 
-def test_the_suite_runs_without_filterpy(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "filterpy.kalman", None)
-    suite = Suite("speed", "", "")
-    speed_filters.add(suite)
-    assert [table.title for table in suite.tables] == ["Cost of using late samples exactly"]
-    with pytest.raises(ModuleNotFoundError, match=r"sideslip\[bench\]"):
-        speed_filters.contestants()
+def test_the_lane_keeping_environment_runs() -> None:
+    pytest.importorskip("highway_env")
+    contestants = field.Field()
+    contestants.add(env_steps.LANE, env_steps._lane_keeping, "highway-env")
+    contestants.contestants[env_steps.LANE].work()
+    assert contestants.absent == {}
 
 
-@pytest.mark.parametrize("frames", speed_filters.FRAMES)
-def test_delays_keep_so_many_frames_under_way(frames: int) -> None:
-    assert math.ceil(speed_filters.delay_of(frames) / 0.033 - 1e-9) == frames
+def test_poles_stay_up_so_that_no_reset_is_measured() -> None:
+    """The rival's episodes are long: its resets are dear."""
+    import gymnasium as gym
+
+    env: Any = gym.make("CartPole-v1")
+    obs, _ = env.reset(seed=0)
+    for _ in range(400):
+        obs, _, terminated, _, _ = env.step(int(env_steps.upright(obs)))
+        assert not terminated
 
 
-def test_rounds_are_interleaved_and_the_first_does_not_count() -> None:
+@compiler
+def test_the_plant_in_c_is_ours() -> None:
+    """To rounding, over half a second of cars that slide, roll, brake and turn."""
+    mine = plant.cars_of(32, seed=3)
+    mine.motions[1] += np.linspace(-3.0, 3.0, 32)  # m/s of v_y: beyond the tyres' peak
+    mine.roads[:] = np.array([[0.01], [0.5], [2.0], [0.3], [0.2]])
+    theirs = mine.twin()
+    plant.ours(mine, 500)
+    plant.in_c()(theirs, 500)
+    assert np.isfinite(mine.motions).all()
+    scale = np.abs(mine.motions).max(axis=1, keepdims=True)
+    np.testing.assert_allclose(theirs.motions / scale, mine.motions / scale, rtol=0.0, atol=1e-11)
+    np.testing.assert_allclose(theirs.acting, mine.acting, rtol=1e-13)
+
+
+@compiler
+def test_another_plant_in_c_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    other = yardstick.source().replace("GRAVITY = 9.81", "GRAVITY = 9.8")
+    monkeypatch.setattr(yardstick, "source", lambda: other)
+    with pytest.raises(RuntimeError, match="the plant in C is not ours"):
+        plant.in_c()
+
+
+@compiler
+def test_a_compiler_that_fails_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(yardstick, "source", lambda: "no C at all")
+    with pytest.raises(field.AbsentError, match=r"does not compile it: .*error"):
+        plant.in_c()
+
+
+def test_without_a_compiler_or_commonroad_the_lines_are_absent(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("PATH", "")
+    monkeypatch.delenv("CC", raising=False)
+    without(monkeypatch, "vehiclemodels.vehicle_dynamics_st")
+    measured = Suite("speed", "", "")
+    taken, absent = plant.add(measured, SHORT)
+    assert set(taken) == {plant.OURS}
+    assert absent == {
+        plant.C: "no C compiler",
+        plant.SINGLE_TRACK: "commonroad-vehicle-models is not installed",
+    }
+    assert "no C compiler" in measured.tables[0].note
+
+
+def test_commonroads_single_track_runs() -> None:
+    pytest.importorskip("vehiclemodels")
+    (taken,) = timing.interleaved({"": plant.single_track()}, SHORT).values()
+    assert len(taken.cpu) == 1
+
+
+def test_learning_without_torch_is_absent(monkeypatch: pytest.MonkeyPatch) -> None:
+    without(monkeypatch, "torch", "stable_baselines3")
+    monkeypatch.delitem(sys.modules, "sideslip.agents.vec_env", raising=False)
+    measured = Suite("speed", "", "")
+    taken, absent = learning.add(measured, SHORT)
+    assert taken == {} and measured.tables == []
+    assert absent[learning.PENDULUM] == "stable-baselines3 is not installed"
+
+
+def test_scaling_has_a_row_and_a_point_for_each_size() -> None:
+    measured = Suite("speed", "", "")
+    scaling.against_count(measured, SHORT, (1, 8))
+    scaling.against_ticks(measured, SHORT)
+    timed = [row.scenario for row in measured.rows if row.metric == "us_per_step"]
+    assert len(timed) == len(set(timed)) == 2 + 2 * len(scaling.TICKS)
+    for (_, figure, _), points in zip(measured.figures, (2, len(scaling.TICKS)), strict=True):
+        assert all(len(trace.x) == points for trace in figure.data)
+        assert figure.layout.xaxis.type == figure.layout.yaxis.type == "log"
+        assert "us" in figure.layout.yaxis.title.text
+
+
+def test_memory_is_asked_before_it_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    row = scaling.bytes_per_row()
+    env: Any = env_steps._vector(env_steps.FUSION)
+    arrays = (env.params, env.states, env.rows, env.packets)
+    assert sum(array.nbytes for array in arrays) / 3 < row < 100_000
+    monkeypatch.setattr(scaling, "free_memory", lambda: 10.0 * row / scaling.SHARE)
+    measured = Suite("speed", "", "")
+    scaling.against_count(measured, SHORT, (1, 8, 64))
+    (table,) = measured.tables
+    assert [cells[0] for cells in table.cells] == ["1", "8"]
+    assert "64 at once" in table.note and "are free" in table.note
+
+
+def test_compilation_is_counted_at_the_top_alone() -> None:
+    code = """
+import numba
+@numba.njit
+def inner(x):
+    return x + 1
+@numba.njit
+def outer(x):
+    return inner(x) * 2
+outer(1); outer(1.0); inner(1)
+"""
+    found = first_use.cold(code)
+    assert [name for name, _ in found] == ["outer", "outer"]
+    assert all(seconds > 0.0 for _, seconds in found)
+    with pytest.raises(RuntimeError, match="no such thing"):
+        first_use.cold("raise ValueError('no such thing')")
+
+
+def test_ratios_are_taken_round_by_round() -> None:
+    """Their median is not the ratio of the medians."""
+    target = targets.TARGETS[0]
+    taken = {
+        target.over: timing.Taken([20.0, 300.0, 80.0]),
+        target.ours: timing.Taken([1.0, 10.0, 2.0]),
+    }
+    measured = Suite("speed", "", "")
+    targets.add(measured, taken, {}, {})
+    (row,) = measured.rows
+    assert (row.scenario, row.metric) == (target.name, "ratio")
+    assert (row.value, row.low, row.high, row.n) == (30.0, 20.0, 40.0, 3)
+    cells = measured.tables[0].cells[0]
+    assert cells[1:] == [">= 25 x", "30", "20 .. 40", "met"]
+
+
+def test_every_target_stands_in_the_table() -> None:
+    measured = Suite("speed", "", "")
+    targets.add(measured, {}, {first_use.FIRST: [0.6]}, {env_steps.LANE: "it rains"})
+    (table,) = measured.tables
+    assert [(cells[0], cells[1]) for cells in table.cells] == [
+        ("gym.make step, lane-keeping over ours", ">= 25 x"),
+        ("gym.make step, CartPole over ours", ">= 1.2 x"),
+        ("1024 at once, lane-keeping over ours", ">= 300 x"),
+        ("1024 at once, CartPole over ours", ">= 0.2 x"),
+        ("plant, C over ours", ">= 0.85 x"),
+        ("delay at the tick over none", "<= 1.1 x"),
+        ("full-covariance filter in the loop, Pendulum over ours", ">= 2.5 x"),
+        ("learned env-step, PPO on Pendulum over ours", ">= 15 x"),
+        ("gym.make to the first step, kernels on disk", "<= 0.5 CPU-s"),
+        ("cold compile of the dearest kernel", "<= 5 CPU-s"),
+    ]
+    said = [cells[-1] for cells in table.cells]
+    assert "it rains" in said[0] and "not run" in said[1] and said[-2] == "not met"
+
+
+def test_a_price_is_met_from_below() -> None:
+    price = next(target for target in targets.TARGETS if target.most is not None)
+    assert price.met(1.05) and not price.met(1.15)
+    goal = targets.TARGETS[0]
+    assert goal.met(26.0) and not goal.met(24.0)
+
+
+def test_rounds_are_interleaved_and_the_first_calls_do_not_count() -> None:
     order: list[str] = []
-
-    def contestant(name: str, cost: float) -> timing.Contestant:
-        def work() -> float:
-            order.append(name)
-            return cost + len(order)
-
-        return work
-
-    taken = timing.interleaved({"a": contestant("a", 0.0), "b": contestant("b", 10.0)}, rounds=3)
-    assert order == ["a", "b"] * 4
-    assert taken == {"a": [3.0, 5.0, 7.0], "b": [14.0, 16.0, 18.0]}
+    contestants = {
+        "a": timing.Contestant(lambda: order.append("a"), 1),
+        "b": timing.Contestant(lambda: order.append("b"), 2, lambda: order.append("start of b")),
+    }
+    taken = timing.interleaved(contestants, timing.Effort(3, 0.0))
+    b = ["start of b", "b"]
+    assert order == ["a", "a", *b, *b] + ["a", *b] * 3
+    assert {name: (len(each.cpu), len(each.wall)) for name, each in taken.items()} == {
+        "a": (3, 3),
+        "b": (3, 3),
+    }
     assert timing.spread([3.0, 1.0, 2.0]) == (2.0, 1.0, 3.0)
     assert timing.ratios([4.0, 9.0], [2.0, 3.0]) == [2.0, 3.0]
+
+
+@pytest.mark.long
+def test_the_quick_form_gives_all_tables(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(suite, "QUICK", SHORT)
+    found = suite.run(quick=True)
+    assert found.tables[0].title == "Targets" and len(found.tables) >= 8
+    names = [(row.scenario, row.estimator, row.metric) for row in found.rows]
+    assert len(names) == len(set(names))

@@ -1,20 +1,19 @@
 """What a filter's tick costs beside FilterPy's, and what late samples add to it."""
 
 import math
-from collections.abc import Callable
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
-from ..agents.rollout import rollout
-from ..envs.record import PACKET, Record
-from ..estimators import Estimator, make_estimator
-from ..estimators.batch import make_batch
-from . import timing
+from ...agents.rollout import rollout
+from ...envs.record import PACKET, Record
+from ...estimators import Estimator, make_estimator
+from ...estimators.batch import make_batch
+from ..rows import Row, Suite, Table
+from ..tune_task import Drive, told_by
 from .rivals import OURS, Rival, four_states, six_states
-from .rows import Row, Suite, Table
-from .tune_task import Drive, told_by
+from .timing import Contestant, Effort, interleaved, ratios, spread
 
 TICKS = 3000  # of the drive
 LATE = 0.030  # s
@@ -42,17 +41,17 @@ def ours(name: str, drive: Drive, **options: Any) -> Estimator:
     return make_estimator(name, **drive.told, gains="covariance", **OURS[name], **options)
 
 
-def _whole(estimator: Estimator, record: Record) -> timing.Contestant:
+def _whole(estimator: Estimator, record: Record) -> Contestant:
     """The log in one call."""
 
     def work() -> None:
         for _ in range(REPEATS):
             estimator.run(record)
 
-    return lambda: timing.microseconds(work, REPEATS * len(record.fast))
+    return Contestant(work, REPEATS * len(record.fast))
 
 
-def _single(estimator: Estimator, record: Record, checked: bool = True) -> timing.Contestant:
+def _single(estimator: Estimator, record: Record, checked: bool = True) -> Contestant:
     """A tick a call, as on the road; unchecked as `take` has it, which the wrappers use."""
     arrived = record.packets[:, PACKET.arrived]
     cuts = np.searchsorted(arrived, record.ticks)
@@ -69,10 +68,10 @@ def _single(estimator: Estimator, record: Record, checked: bool = True) -> timin
             for row, here in steps:
                 estimator.take(row, 1, here, len(here))
 
-    return lambda: timing.microseconds(work, len(steps))
+    return Contestant(work, len(steps))
 
 
-def _batch(name: str, drive: Drive) -> timing.Contestant:
+def _batch(name: str, drive: Drive) -> Contestant:
     """A control period of many filters a call, each with its own covariance."""
     batch = make_batch(name, BATCH, gains="covariance", **drive.told, **OURS[name])
     record = drive.log.record
@@ -84,22 +83,19 @@ def _batch(name: str, drive: Drive) -> timing.Contestant:
         blocks.append([np.repeat(rows[None], BATCH, axis=0) for rows in (fast, packets)])
 
     def work() -> None:
+        batch.reset()
         for fast, packets in blocks:
             batch.step(fast, packets)
 
-    def contestant() -> float:
-        batch.reset()
-        return timing.microseconds(work, BATCH * BLOCK * len(blocks))
-
-    return contestant
+    return Contestant(work, BATCH * BLOCK * len(blocks))
 
 
-def _rival(kf: Any, drive: Drive, late: int = 0) -> timing.Contestant:
+def _rival(kf: Any, drive: Drive, late: int = 0) -> Contestant:
     rival, record = Rival(kf, drive.told["vehicle"], late), drive.log.record
-    return lambda: timing.microseconds(lambda: rival.run(record), len(record.fast))
+    return Contestant(lambda: rival.run(record), len(record.fast))
 
 
-def contestants() -> dict[str, tuple[timing.Contestant, str]]:
+def contestants() -> dict[str, tuple[Contestant, str]]:
     """Name to contestant and the FilterPy filter it is compared with; FilterPy's own first."""
     prompt, late = drive(0.0), drive(LATE)
     car = (prompt.told["vehicle"], prompt.told["speed"], prompt.told["dt"])
@@ -120,19 +116,24 @@ def contestants() -> dict[str, tuple[timing.Contestant, str]]:
     }
 
 
-def add(suite: Suite) -> None:
+def _interleaved(contestants: dict[str, Contestant], effort: Effort) -> dict[str, list[float]]:
+    """CPU time alone."""
+    return {name: taken.cpu for name, taken in interleaved(contestants, effort).items()}
+
+
+def add(suite: Suite, effort: Effort) -> None:
     """Rows, tables and figures of the filters."""
     try:
-        _beside_filterpy(suite)
+        _beside_filterpy(suite, effort)
     except ModuleNotFoundError as missing:  # shown where it is installed
         if missing.name != "filterpy":
             raise
-    _against_frames(suite)
+    _against_frames(suite, effort)
 
 
 def _row(suite: Suite, estimator: str, metric: str, values: list[float]) -> list[str]:
     """A row of the suite; median and range as text."""
-    middle, low, high = timing.spread(values)
+    middle, low, high = spread(values)
     suite.rows.append(
         Row(
             suite.name,
@@ -148,14 +149,14 @@ def _row(suite: Suite, estimator: str, metric: str, values: list[float]) -> list
     return [f"{middle:.3g}", f"{low:.3g} .. {high:.3g}"]
 
 
-def _beside_filterpy(suite: Suite) -> None:
+def _beside_filterpy(suite: Suite, effort: Effort) -> None:
     pairs = contestants()
-    rounds = timing.interleaved({name: contestant for name, (contestant, _) in pairs.items()})
+    rounds = _interleaved({name: contestant for name, (contestant, _) in pairs.items()}, effort)
     cells = []
     for name, (_, rival) in pairs.items():
         text = [name, *_row(suite, name, "us_per_tick", rounds[name])]
         if name != rival:
-            faster = timing.ratios(rounds[rival], rounds[name])
+            faster = ratios(rounds[rival], rounds[name])
             text += _row(suite, f"{rival} over {name}", "ratio", faster)
         else:
             text += ["", ""]
@@ -177,9 +178,9 @@ def delay_of(frames: int) -> float:
     return max(0.0, frames * 0.033 - 0.003)
 
 
-def _against_frames(suite: Suite) -> None:
+def _against_frames(suite: Suite, effort: Effort) -> None:
     """Cost of exactness against frames under way, for each rule that there is."""
-    pairs: dict[tuple[str, int], Callable[[], float]] = {}
+    pairs: dict[tuple[str, int], Contestant] = {}
     for frames in FRAMES:
         late = drive(delay_of(frames))
         for rule in RULES:
@@ -191,7 +192,7 @@ def _against_frames(suite: Suite) -> None:
                 continue
     rules = [rule for rule in RULES if (rule, 0) in pairs]
     labels = {pair: f"{pair[0]}, {pair[1]} frames under way" for pair in pairs}
-    rounds = timing.interleaved({labels[pair]: work for pair, work in pairs.items()})
+    rounds = _interleaved({labels[pair]: work for pair, work in pairs.items()}, effort)
     cells, lines = [], {rule: list[float]() for rule in rules}
     for frames in FRAMES:
         text = [str(frames), f"{1e3 * delay_of(frames):.0f}"]
@@ -202,9 +203,9 @@ def _against_frames(suite: Suite) -> None:
                 continue
             taken, prompt = rounds[labels[rule, frames]], rounds[labels[rule, 0]]
             text += _row(suite, labels[rule, frames], "us_per_tick", taken)[:1]
-            more = timing.ratios(taken, prompt)
+            more = ratios(taken, prompt)
             text += _row(suite, f"{labels[rule, frames]}, over none", "ratio", more)[:1]
-            lines[rule].append(timing.spread(more)[0])
+            lines[rule].append(spread(more)[0])
         cells.append(text)
     header = ["frames under way", "ms late"]
     for rule in rules:
@@ -223,7 +224,7 @@ def _against_frames(suite: Suite) -> None:
 def _draw(suite: Suite, lines: dict[str, list[float]]) -> None:
     """The curve; nothing where plotly is not installed."""
     try:
-        from .figures import time_series
+        from ..figures import time_series
     except ModuleNotFoundError:
         return
     figure = time_series(

@@ -1,0 +1,168 @@
+"""What an env-step costs: ours with full sensors, single and in batches, beside others'.
+
+Ours is 10 ms of driving, ten ticks of plant and sensors, infos included. Singles run episodes from
+`gym.make`, reset included; batches run on, and reset their rows themselves.
+"""
+
+import warnings
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from ...estimators import EstimateObservation
+from ...estimators.vector import EstimateObservation as EstimateObservations
+from ..rows import Suite
+from .field import Field, add_costs
+from .timing import Contestant, Effort, Taken, interleaved
+
+COUNT = 1024  # environments at once
+EPISODE = 500  # steps, the most
+STEPS = 10  # of a batch, in one call
+
+FUSION, VISION = "sideslip/YawFusion-v0", "sideslip/YawVision-v0"
+PROMPT: dict[str, Any] = {"camera": {"delays": [0.0]}}
+FILTERS: dict[str, tuple[str, dict[str, Any]]] = {
+    "multirate-kf": ("multirate-kf", {}),
+    "exact-kf, covariance": ("exact-kf", {"gains": "covariance"}),
+    "exact-kf, covariance, adaptive": ("exact-kf", {"gains": "covariance", "adapt": 0.02}),
+}
+FULL_COVARIANCE = f"{FUSION} with exact-kf, covariance"
+AT_ONCE = f"{FUSION}, {COUNT} at once"
+AT_ENDS = f"{AT_ONCE}, infos at ends"
+LATE, NONE_LATE = f"{VISION}, {COUNT} at once", f"{VISION}, no delay, {COUNT} at once"
+CARTPOLE, PENDULUM, LANE = "CartPole-v1", "Pendulum-v1", "lane-keeping-v0 (highway-env)"
+CARTPOLES = f"{CARTPOLE}, {COUNT} at once"
+PENDULUMS = f"{PENDULUM}, {COUNT} at once (EnvPool)"
+
+Policy = Callable[[Any], Any]
+
+
+def upright(obs: Any) -> Any:
+    """Keeps a cart's pole up, so that its episodes are long."""
+    return (obs[..., 2] + 0.3 * obs[..., 3] > 0.0).astype(int)
+
+
+def episode(env: gym.Env[Any, Any], policy: Policy | None = None) -> Contestant:
+    """One episode a call, of at most `EPISODE` steps, always the same one.
+
+    policy: what acts (None: action 0, or the one that does nothing); it runs once, its actions are
+    replayed.
+    """
+    idle = env.action_space.sample() * 0
+    obs, _ = env.reset(seed=0)
+    actions, over = list[Any](), False
+    while not over and len(actions) < EPISODE:
+        actions.append(idle if policy is None else int(policy(obs)))
+        obs, _, terminated, truncated, _ = env.step(actions[-1])
+        over = terminated or truncated
+
+    def work() -> None:
+        env.reset(seed=0)
+        for action in actions:
+            env.step(action)
+
+    return Contestant(work, len(actions))
+
+
+def batch(env: Any, steps: int = STEPS) -> Contestant:
+    """Steps of a batch in which nothing is done."""
+    env.reset(seed=0)
+    idle = np.zeros(env.action_space.shape, env.action_space.dtype)
+
+    def work() -> None:
+        for _ in range(steps):
+            env.step(idle)
+
+    return Contestant(work, steps * env.num_envs)
+
+
+def _cartpoles() -> Contestant:
+    """Gymnasium's own batch of carts, each call from a reset on, with poles kept up."""
+    env: Any = gym.make_vec(CARTPOLE, COUNT, vectorization_mode="vector_entry_point")
+    obs, _ = env.reset(seed=0)
+    actions = []
+    for _ in range(EPISODE // 5):
+        actions.append(upright(obs))
+        obs, *_ = env.step(actions[-1])
+
+    def work() -> None:
+        env.reset(seed=0)
+        for action in actions:
+            env.step(action)
+
+    return Contestant(work, len(actions) * COUNT)
+
+
+def _pendulums() -> Contestant:
+    import envpool
+
+    env: Any = envpool.make(PENDULUM, env_type="gymnasium", num_envs=COUNT, num_threads=1)
+    env.reset()
+    idle = np.zeros((COUNT, 1), np.float32)
+
+    def work() -> None:
+        for _ in range(STEPS):
+            env.step(idle)
+
+    return Contestant(work, STEPS * COUNT)
+
+
+def _lane_keeping() -> Contestant:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return episode(gym.make("highway_env:lane-keeping-v0"))
+
+
+def _vector(env_id: str, **arguments: Any) -> Any:
+    return gym.make_vec(env_id, COUNT, **arguments)
+
+
+def _filtered(label: str) -> Contestant:
+    name, options = FILTERS[label]
+    return episode(EstimateObservation(gym.make(FUSION), name, options=options))
+
+
+def _all_filtered(label: str) -> Contestant:
+    name, options = FILTERS[label]
+    return batch(EstimateObservations(_vector(FUSION), name, options=options))
+
+
+def contestants() -> Field:
+    """All environments; those of packages that are not installed are absent."""
+    field = Field()
+    field.add(FUSION, lambda: episode(gym.make(FUSION)))
+    field.add(AT_ONCE, lambda: batch(_vector(FUSION)))
+    field.add(AT_ENDS, lambda: batch(_vector(FUSION, info="ends")))
+    for label in FILTERS:
+        field.add(f"{FUSION} with {label}", partial(_filtered, label))
+        field.add(f"{AT_ONCE} with {label}", partial(_all_filtered, label))
+    field.add(VISION, lambda: episode(gym.make(VISION)))
+    field.add(f"{VISION}, no delay", lambda: episode(gym.make(VISION, **PROMPT)))
+    field.add(LATE, lambda: batch(_vector(VISION)))
+    field.add(NONE_LATE, lambda: batch(_vector(VISION, **PROMPT)))
+    field.add(CARTPOLE, lambda: episode(gym.make(CARTPOLE), upright))
+    field.add(PENDULUM, lambda: episode(gym.make(PENDULUM)))
+    field.add(LANE, _lane_keeping, "highway-env")
+    field.add(CARTPOLES, _cartpoles)
+    field.add(PENDULUMS, _pendulums, "envpool")
+    return field
+
+
+def add(suite: Suite, effort: Effort) -> tuple[dict[str, Taken], dict[str, str]]:
+    """Rows and a table; what each contestant took, and why others are absent."""
+    field = contestants()
+    taken = interleaved(field.contestants, effort)
+    add_costs(
+        suite,
+        "Cost of an env-step",
+        "step",
+        taken,
+        "Ours: 10 ms of driving, ten ticks of plant and sensors, with infos. Singles through "
+        f"gym.make, episodes of at most {EPISODE} steps with their reset; of a batch of {COUNT}, "
+        "a step of one environment. The filters' own cost is the difference to the line without.",
+        field.absent,
+    )
+    return taken, field.absent

@@ -1,0 +1,80 @@
+"""What a learned env-step costs: PPO of stable-baselines3 through our bridge, and on Pendulum-v1.
+
+Both learn as they go: a call is one rollout and the gradient steps on it. On Pendulum-v1 PPO has
+its defaults, as its users start; through the bridge a rollout comes from many environments, so
+that batches are large and few.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Any
+
+from ..rows import Suite
+from .field import Field, add_costs
+from .timing import Contestant, Effort, Taken, interleaved
+
+OURS = "PPO on sideslip/YawFusion-v0 through the bridge"
+PENDULUM = "PPO on Pendulum-v1, defaults"
+
+COUNT = 1024  # environments of the bridge
+LARGE: dict[str, Any] = {"n_steps": 16, "batch_size": 4096, "n_epochs": 4}
+DEFAULTS = 2048  # steps of a rollout with the defaults
+ROUNDS = 5  # at most: a round takes seconds
+
+
+def _learner(env: Any, steps: int, **settings: Any) -> Contestant:
+    from stable_baselines3 import PPO
+
+    model = PPO("MlpPolicy", env, seed=0, device="cpu", **settings)
+
+    def work() -> None:
+        model.learn(steps, reset_num_timesteps=False)
+
+    return Contestant(work, steps)
+
+
+def _ours() -> Contestant:
+    from ...agents.vec_env import make_vec_env
+
+    env = make_vec_env("sideslip/YawFusion-v0", COUNT, seed=0)
+    return _learner(env, COUNT * LARGE["n_steps"], **LARGE)
+
+
+@contextmanager
+def _torch_on_one_thread() -> Iterator[None]:
+    try:
+        import torch
+    except ModuleNotFoundError:
+        yield
+        return
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def add(suite: Suite, effort: Effort) -> tuple[dict[str, Taken], dict[str, str]]:
+    """Rows and a table; what each contestant took, and why others are absent."""
+    field = Field()
+    field.add(OURS, _ours, "stable-baselines3")
+    field.add(PENDULUM, lambda: _learner("Pendulum-v1", DEFAULTS), "stable-baselines3")
+    if not field.contestants:
+        return {}, field.absent
+    with _torch_on_one_thread():
+        taken = interleaved(
+            field.contestants, replace(effort, rounds=min(effort.rounds // 2, ROUNDS))
+        )
+    settings = ", ".join(f"{name} = {value}" for name, value in LARGE.items())
+    add_costs(
+        suite,
+        "Cost of a learned env-step",
+        "step",
+        taken,
+        f"Rollout and gradient steps, on one thread. Through the bridge: {COUNT} environments, "
+        f"{settings}; the rest, and all on Pendulum-v1, is stable-baselines3's default.",
+        field.absent,
+    )
+    return taken, field.absent

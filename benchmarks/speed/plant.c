@@ -1,0 +1,285 @@
+/* The plant of YawFusion-v0 in plain C: the yardstick that ours is measured against.
+ *
+ * One tick is what `plant.py` compiles: the actuators' lag, two loads, Fiala tyres, roll, and the
+ * classical Runge-Kutta method, operation by operation in the order of `envs`. Blocks of eight
+ * cars, structures of arrays, so that the compiler makes vectors of it. What does not change
+ * within a call is computed once a block.
+ *
+ * gcc -O3 -march=native -ffp-contract=off (-fno-math-errno -fno-trapping-math -fopenmp-simd let it
+ * make vectors of square roots, of floor and of choices; none of them changes a number).
+ */
+#include <math.h>
+
+#define BLOCK 8
+#define INLINE static inline __attribute__((always_inline))
+
+/* Fields in the order of the rows of the arrays (fields, cars). */
+#define CAR(DO) \
+    DO(m) DO(I) DO(l_f) DO(l_r) DO(C_f) DO(C_r) DO(d_f) DO(d_r) DO(r) DO(T_max) DO(mu) DO(l_pre) \
+    DO(S) DO(I_x) DO(K_x) DO(C_x) DO(h) DO(ahead) DO(left) DO(mu_r)
+#define ROAD(DO) DO(curvature) DO(start) DO(ramp) DO(across) DO(along)
+#define PUSH(DO) DO(F_d) DO(N_d) DO(N_x)
+#define INPUTS(DO) DO(delta) DO(T_l) DO(T_r)
+#define MOTION(DO) \
+    DO(v_x) DO(v_y) DO(gamma) DO(psi) DO(X) DO(Y) DO(s) DO(y) DO(theta) DO(phi) DO(phi_dot)
+/* What a car's numbers give once and for all. */
+#define FIXED(DO) \
+    DO(per_m) DO(per_I) DO(front) DO(rear_l) DO(rear_r) DO(slope_f) DO(per_front) DO(per_rear) \
+    DO(direct) DO(lean) DO(per_r) DO(per_ramp) DO(half_track)
+#define LOAD(DO) DO(sin_d) DO(cos_d) DO(F_l) DO(F_r)
+
+#define DOUBLE(k) double k;
+#define IN_BLOCK(k) double k[BLOCK];
+typedef struct { CAR(DOUBLE) } car;
+typedef struct { ROAD(DOUBLE) } road;
+typedef struct { PUSH(DOUBLE) } push;
+typedef struct { INPUTS(DOUBLE) } inputs;
+typedef struct { MOTION(DOUBLE) } motion;
+typedef struct { FIXED(DOUBLE) } fixed;
+typedef struct { LOAD(DOUBLE) } load;
+typedef struct { double sin_t, cos_t, sin_r, cos_r; } frame;
+typedef struct {
+    struct { CAR(IN_BLOCK) } car;
+    struct { ROAD(IN_BLOCK) } road;
+    struct { PUSH(IN_BLOCK) } push;
+    struct { INPUTS(IN_BLOCK) } command, now;
+    struct { MOTION(IN_BLOCK) } motion;
+    struct { FIXED(IN_BLOCK) } fixed;
+    struct { LOAD(IN_BLOCK) } load;
+} block;
+
+static const double GRAVITY = 9.81, SLOW = 0.5;
+
+INLINE double least(double a, double b) { return a < b ? a : b; }
+INLINE double most(double a, double b) { return a > b ? a : b; }
+INLINE double size(double a) { return a > 0.0 ? a : 0.0 - a; }
+INLINE double within(double a, double low, double high) { return least(most(a, low), high); }
+
+INLINE void sincos_of(double x, double *sine, double *cosine)
+{
+    double k = floor(x * 0.6366197723675814 + 0.5);
+    double r = (x - k * 1.5707963267341256) - k * 6.077100506506192e-11;
+    double z = r * r, p, s, c, q;
+    p = 1.58969099521155010221e-10;
+    p = p * z - 2.50507602534068634195e-08;
+    p = p * z + 2.75573137070700676789e-06;
+    p = p * z - 1.98412698298579493134e-04;
+    p = p * z + 8.33333333332248946124e-03;
+    p = p * z - 1.66666666666666324348e-01;
+    s = r + r * (z * p);
+    p = -1.13596475577881948265e-11;
+    p = p * z + 2.08757232129817482790e-09;
+    p = p * z - 2.75573143513906633035e-07;
+    p = p * z + 2.48015872894767294178e-05;
+    p = p * z - 1.38888888888741095749e-03;
+    p = p * z + 4.16666666666666019037e-02;
+    c = 1.0 - 0.5 * z + z * (z * p);
+    q = k - 4.0 * floor(0.25 * k);
+    double odd_s = (q == 1.0) | (q == 3.0) ? c : s, odd_c = (q == 1.0) | (q == 3.0) ? s : c;
+    *sine = (q > 1.5 ? -1.0 : 1.0) * odd_s;
+    *cosine = ((q == 1.0) | (q == 2.0) ? -1.0 : 1.0) * odd_c;
+}
+
+INLINE fixed fixed_of(car c, road r)
+{
+    fixed f;
+    double weight = c.m * GRAVITY / (2.0 * (c.l_f + c.l_r)), half_weight = 0.5 * c.m * GRAVITY;
+    f.per_m = 1.0 / c.m;
+    f.per_I = 1.0 / c.I;
+    f.front = 0.5 * (c.mu + c.mu_r) * weight * c.l_r;
+    f.rear_l = c.mu * weight * c.l_f;
+    f.rear_r = c.mu_r * weight * c.l_f;
+    f.slope_f = c.C_f / (3.0 * f.front);
+    f.per_front = 1.0 / (half_weight * c.d_f);
+    f.per_rear = 1.0 / (half_weight * c.d_r);
+    f.direct = c.m * c.h - c.S;
+    f.lean = c.I_x - c.S * c.S * f.per_m;
+    f.per_r = 1.0 / c.r;
+    f.per_ramp = 1.0 / r.ramp;
+    f.half_track = 0.5 * c.d_r;
+    return f;
+}
+
+INLINE load load_of(inputs now, double per_r)
+{
+    load l;
+    sincos_of(now.delta, &l.sin_d, &l.cos_d);
+    l.F_l = now.T_l * per_r;
+    l.F_r = now.T_r * per_r;
+    return l;
+}
+
+INLINE double capacity(double limit, double drive)
+{
+    return sqrt(most(limit * limit - drive * drive, 0.0025 * limit * limit));
+}
+
+INLINE double lateral(double tangent, double limit, double slope)
+{
+    double z = within(slope * tangent, -1.0, 1.0);
+    return limit * z * (3.0 - 3.0 * size(z) + z * z);
+}
+
+INLINE void turned(double sine, double cosine, double angle, double *s_out, double *c_out)
+{
+    double z = angle * angle;
+    double s = angle * (1.0 - z * (1.0 / 6.0 - z * (1.0 / 120.0)));
+    double c = 1.0 - z * (0.5 - z * (1.0 / 24.0 - z * (1.0 / 720.0)));
+    *s_out = sine * c + cosine * s;
+    *c_out = cosine * c - sine * s;
+}
+
+INLINE motion derivative(motion at, load l, push p, car c, road r, fixed f, frame start, double psi,
+                         double theta)
+{
+    motion rate;
+    double share = within((at.s - r.start) * f.per_ramp, 0.0, 1.0), kappa = r.curvature * share;
+    double turn = at.theta - theta, s_r, c_r, s_t, c_t;
+    turned(start.sin_r, start.cos_r, at.psi - psi - turn, &s_r, &c_r);
+    turned(start.sin_t, start.cos_t, turn, &s_t, &c_t);
+    double along = r.along * share, across = r.across * share;
+    double g_x = along * c_r + across * s_r, g_y = across * c_r - along * s_r;
+
+    double front = at.v_y + c.l_f * at.gamma, rear = at.v_y - c.l_r * at.gamma;
+    double t_f = (at.v_x * l.sin_d - front * l.cos_d) /
+                 most(size(at.v_x * l.cos_d + front * l.sin_d), SLOW);
+    double t_r = (0.0 - rear) / most(size(at.v_x), SLOW);
+    double direct = f.direct * (at.v_x * at.gamma + g_y);
+    double moment = c.K_x * at.phi + c.C_x * at.phi_dot + direct;
+    double e_f = within(moment * f.per_front, -0.9, 0.9);
+    double e_r = within(moment * f.per_rear, -0.9, 0.9);
+    double narrow = 1.0 - e_f, wide = 1.0 + e_f, per = f.slope_f / (narrow * wide);
+    double F_yf =
+        lateral(t_f, f.front * narrow, per * wide) + lateral(t_f, f.front * wide, per * narrow);
+    double rear_l = f.rear_l * (1.0 - e_r), rear_r = f.rear_r * (1.0 + e_r);
+    double F_l = within(l.F_l, 0.0 - rear_l, rear_l), F_r = within(l.F_r, 0.0 - rear_r, rear_r);
+    double left = capacity(rear_l, F_l), right = capacity(rear_r, F_r);
+    per = c.C_r / (3.0 * left * right);
+    double F_yr = lateral(t_r, left, per * right) + lateral(t_r, right, per * left);
+
+    double F_yc = F_yf * l.cos_d, F_y = F_yc + F_yr + p.F_d, N_z = f.half_track * (F_r - F_l);
+    double lever = c.S * (F_y * f.per_m + GRAVITY * at.phi);
+    rate.phi = at.phi_dot;
+    rate.phi_dot = (lever + (p.N_x - c.C_x * at.phi_dot - c.K_x * at.phi)) / f.lean;
+    F_y = F_y + c.S * rate.phi_dot;
+    rate.v_x = (F_l + F_r - F_yf * l.sin_d) * f.per_m + at.v_y * at.gamma - g_x;
+    rate.v_y = F_y * f.per_m - at.v_x * at.gamma - g_y;
+    rate.gamma = (c.l_f * F_yc - c.l_r * F_yr + N_z + p.N_d) * f.per_I;
+    rate.psi = at.gamma;
+    along = at.v_x * c_r - at.v_y * s_r;
+    rate.y = at.v_x * s_r + at.v_y * c_r;
+    rate.s = along / most(1.0 - kappa * at.y, 0.1);
+    rate.X = along * c_t - rate.y * s_t;
+    rate.Y = along * s_t + rate.y * c_t;
+    rate.theta = rate.s * kappa;
+    return rate;
+}
+
+INLINE motion ahead(motion now, double h, motion rate)
+{
+#define AHEAD(k) now.k = now.k + h * rate.k;
+    MOTION(AHEAD)
+    return now;
+}
+
+INLINE motion rk4(motion now, load first, load middle, load last, push p, car c, road r, fixed f,
+                  double h)
+{
+    frame start;
+    double psi = now.psi, theta = now.theta;
+    sincos_of(theta, &start.sin_t, &start.cos_t);
+    sincos_of(psi - theta, &start.sin_r, &start.cos_r);
+    motion k_1 = derivative(now, first, p, c, r, f, start, psi, theta);
+    motion k_2 = derivative(ahead(now, 0.5 * h, k_1), middle, p, c, r, f, start, psi, theta);
+    motion k_3 = derivative(ahead(now, 0.5 * h, k_2), middle, p, c, r, f, start, psi, theta);
+    motion k_4 = derivative(ahead(now, h, k_3), last, p, c, r, f, start, psi, theta);
+#define MEAN(k) k_1.k = (k_1.k + 2.0 * (k_2.k + k_3.k) + k_4.k) * (1.0 / 6.0);
+    MOTION(MEAN)
+    return ahead(now, h, k_1);
+}
+
+INLINE inputs lagged(inputs command, inputs now, double steer_left, double motor_left)
+{
+    now.delta = command.delta + (now.delta - command.delta) * steer_left;
+    now.T_l = command.T_l + (now.T_l - command.T_l) * motor_left;
+    now.T_r = command.T_r + (now.T_r - command.T_r) * motor_left;
+    return now;
+}
+
+/* One tick of all cars of a block. */
+static void tick(block *b, double h, const double *left)
+{
+#pragma omp simd simdlen(BLOCK)
+    for (int i = 0; i < BLOCK; i++) {
+        car c;
+        road r;
+        push p;
+        inputs command, now;
+        motion m;
+        fixed f;
+        load first;
+#define TAKE(part, to, k) to.k = b->part.k[i];
+#define CAR_IN(k) TAKE(car, c, k)
+#define ROAD_IN(k) TAKE(road, r, k)
+#define PUSH_IN(k) TAKE(push, p, k)
+#define COMMAND_IN(k) TAKE(command, command, k)
+#define NOW_IN(k) TAKE(now, now, k)
+#define MOTION_IN(k) TAKE(motion, m, k)
+#define FIXED_IN(k) TAKE(fixed, f, k)
+#define LOAD_IN(k) TAKE(load, first, k)
+        CAR(CAR_IN) ROAD(ROAD_IN) PUSH(PUSH_IN) INPUTS(COMMAND_IN) INPUTS(NOW_IN)
+        MOTION(MOTION_IN) FIXED(FIXED_IN) LOAD(LOAD_IN)
+        load middle = load_of(lagged(command, now, left[0], left[2]), f.per_r);
+        now = lagged(command, now, left[1], left[3]);
+        load last = load_of(now, f.per_r);
+        m = rk4(m, first, middle, last, p, c, r, f, h);
+#define NOW_OUT(k) b->now.k[i] = now.k;
+#define MOTION_OUT(k) b->motion.k[i] = m.k;
+#define LOAD_OUT(k) b->load.k[i] = last.k;
+        INPUTS(NOW_OUT) MOTION(MOTION_OUT) LOAD(LOAD_OUT)
+    }
+}
+
+/* What is not in the arrays: the fixed numbers and the first load. */
+static void prepare(block *b)
+{
+    for (int i = 0; i < BLOCK; i++) {
+        car c;
+        road r;
+        inputs now;
+        CAR(CAR_IN) ROAD(ROAD_IN) INPUTS(NOW_IN)
+        fixed f = fixed_of(c, r);
+        load first = load_of(now, f.per_r);
+#define FIXED_OUT(k) b->fixed.k[i] = f.k;
+#define FIRST_OUT(k) b->load.k[i] = first.k;
+        FIXED(FIXED_OUT) LOAD(FIRST_OUT)
+    }
+}
+
+static void copy(double *to, const double *from, int rows, long to_step, long from_step)
+{
+    for (int k = 0; k < rows; k++)
+        for (int i = 0; i < BLOCK; i++) to[k * to_step + i] = from[k * from_step + i];
+}
+
+/* Ticks of h seconds of n cars, a multiple of eight. Arrays (fields, n). left: what is left of a
+ * deviation from the command: of steering at the middle and the end of a tick, then of motors. */
+void plant(long n, long ticks, double h, const double *left, const double *cars,
+           const double *roads, const double *pushes, const double *commands, double *motions,
+           double *acting)
+{
+#define ROWS(part) (int)(sizeof(part) / sizeof(double[BLOCK]))
+    block b;
+    for (long at = 0; at < n; at += BLOCK) {
+        copy((double *)&b.car, cars + at, ROWS(b.car), BLOCK, n);
+        copy((double *)&b.road, roads + at, ROWS(b.road), BLOCK, n);
+        copy((double *)&b.push, pushes + at, ROWS(b.push), BLOCK, n);
+        copy((double *)&b.command, commands + at, ROWS(b.command), BLOCK, n);
+        copy((double *)&b.now, acting + at, ROWS(b.now), BLOCK, n);
+        copy((double *)&b.motion, motions + at, ROWS(b.motion), BLOCK, n);
+        prepare(&b);
+        for (long j = 0; j < ticks; j++) tick(&b, h, left);
+        copy(acting + at, (double *)&b.now, ROWS(b.now), n, BLOCK);
+        copy(motions + at, (double *)&b.motion, ROWS(b.motion), n, BLOCK);
+    }
+}

@@ -1,0 +1,214 @@
+"""What a tick of the plant alone costs: ours, the same in C, and CommonRoad's single track.
+
+A tick is a millisecond of one car of `YawFusion-v0`: actuators that lag, the loads at the tick's
+middle and end, Fiala tyres, roll, and Runge-Kutta's four stages; no sensors, no driver.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+import numpy.typing as npt
+
+from ...envs.actuators import lagged
+from ...envs.backend import fixed_tuple, inlined, jit
+from ...envs.dynamics import Car, Motion, Push, Road, rk4
+from ...envs.layout import P, Z
+from ...envs.outside import BMW_320I
+from ...envs.record import TICK
+from ...envs.tyres import FIALA, Inputs, load_of
+from ..rows import Suite
+from .field import Field, add_costs
+from .timing import Contestant, Effort, Taken, interleaved
+from .yardstick import BLOCK, c_plant
+
+Array = npt.NDArray[np.float64]
+
+CARS, TICKS = 1024, 10  # cars at once; ticks a call
+OURS = "plant"
+C = "plant in C"
+SINGLE_TRACK = "single track (commonroad-vehicle-models)"
+
+_CAR, _ROAD, _MOTION = len(Car._fields), len(Road._fields), len(Motion._fields)
+
+
+class Cars(NamedTuple):
+    """Cars in the middle of a drive; arrays (fields, N) in the order of the plant's tuples.
+
+    left: (4,) what is left of an actuator's deviation from its command, of steering at the middle
+    and the end of a tick, then of the motors.
+    """
+
+    left: Array
+    cars: Array
+    roads: Array
+    pushes: Array
+    commands: Array
+    motions: Array
+    acting: Array
+
+    def twin(self) -> "Cars":
+        """The same cars, for another contestant."""
+        return Cars(*(array.copy() for array in self))
+
+
+Advance = Callable[[Cars, int], object]
+"""Moves cars on by some ticks, in place."""
+
+
+def cars_of(count: int, seed: int = 0) -> Cars:
+    """Cars that the seeds of `YawFusion-v0` draw, with commands of their own."""
+    env: Any = gym.make_vec("sideslip/YawFusion-v0", num_envs=count)
+    env.reset(seed=seed)
+    p, z, rng = env.params, env.states, np.random.default_rng(seed)
+    lags = p[0, P.steer + 1 : P.steer + 3], p[0, P.motor + 1 : P.motor + 3]
+
+    def rows(of: Array, at: int, length: int) -> Array:
+        return np.ascontiguousarray(of[:, at : at + length].T)
+
+    return Cars(
+        np.concatenate(lags),
+        rows(p, P.car, _CAR),
+        rows(p, P.road, _ROAD),
+        rng.normal(0.0, 1.0, (3, count)) * [[50.0], [20.0], [0.0]],
+        rng.uniform(-1.0, 1.0, (3, count)) * [[0.05], [20.0], [20.0]],
+        rows(z, Z.motion, _MOTION),
+        np.zeros((3, count)),
+    )
+
+
+@inlined
+def tick(
+    first: Any,
+    motion: Any,
+    acting: Any,
+    command: Any,
+    push: Any,
+    car: Any,
+    road: Any,
+    left: Any,
+) -> Any:
+    """(last, motion, acting) after a tick; first and last: the Load at its start and end."""
+    between = Inputs(
+        lagged(command.delta_f, acting.delta_f, left[0]),
+        lagged(command.T_l, acting.T_l, left[2]),
+        lagged(command.T_r, acting.T_r, left[2]),
+    )
+    acting = Inputs(
+        lagged(command.delta_f, acting.delta_f, left[1]),
+        lagged(command.T_l, acting.T_l, left[3]),
+        lagged(command.T_r, acting.T_r, left[3]),
+    )
+    middle, last = load_of(between, car, 0), load_of(acting, car, 0)
+    return last, rk4(motion, (first, middle, last), push, car, road, TICK, 0, FIALA, 1), acting
+
+
+@jit
+def advance(
+    left: Any,
+    cars: Any,
+    roads: Any,
+    pushes: Any,
+    commands: Any,
+    motions: Any,
+    acting: Any,
+    ticks: int,
+) -> None:
+    """Ticks of every car, one after the other; the arrays of `Cars`."""
+    for i in range(cars.shape[1]):
+        car, road = Car(*fixed_tuple(cars[:, i], _CAR)), Road(*fixed_tuple(roads[:, i], _ROAD))
+        push, command = Push(*fixed_tuple(pushes[:, i], 3)), Inputs(*fixed_tuple(commands[:, i], 3))
+        motion = Motion(*fixed_tuple(motions[:, i], _MOTION))
+        now = Inputs(*fixed_tuple(acting[:, i], 3))
+        load = load_of(now, car, 0)
+        for _ in range(ticks):
+            load, motion, now = tick(load, motion, now, command, push, car, road, left)
+        for k in range(_MOTION):
+            motions[k, i] = motion[k]
+        for k in range(3):
+            acting[k, i] = now[k]
+
+
+def ours(cars: Cars, ticks: int) -> None:
+    """The plant as the batch engine moves it."""
+    advance(*cars, ticks)
+
+
+def in_c() -> Advance:
+    """The same plant in C, once its numbers agree with ours.
+
+    Raises AbsentError without a compiler, RuntimeError where the numbers differ.
+    """
+    function = c_plant()
+
+    def advance_in_c(cars: Cars, ticks: int) -> None:
+        count = cars.cars.shape[1]
+        assert count % BLOCK == 0
+        function(count, ticks, TICK, *(array.ctypes.data for array in cars))
+
+    mine = cars_of(BLOCK)
+    theirs = mine.twin()
+    ours(mine, 100)
+    advance_in_c(theirs, 100)
+    if not np.allclose(theirs.motions, mine.motions, rtol=1e-9, atol=1e-12):
+        off = np.abs(theirs.motions - mine.motions).max()
+        raise RuntimeError(f"the plant in C is not ours: they differ by {off:.3g} after 0.1 s")
+    return advance_in_c
+
+
+def single_track() -> Contestant:
+    """CommonRoad's single track by the Runge-Kutta method in Python, as its users write it.
+
+    Raises ModuleNotFoundError without commonroad-vehicle-models.
+    """
+    from vehiclemodels.vehicle_dynamics_st import vehicle_dynamics_st
+    from vehiclemodels.vehicle_parameters import setup_vehicle_parameters
+
+    p, x = setup_vehicle_parameters(BMW_320I), np.zeros(7)
+
+    def rate(x: Array) -> Array:
+        return np.array(vehicle_dynamics_st(x.tolist(), [0.0, 0.0], p))
+
+    def start() -> None:
+        x[:] = 0.0, 0.0, 0.02, 15.0, 0.0, 0.0, 0.0  # X, Y, steering, speed, heading, yaw rate, slip
+
+    def work() -> None:
+        for _ in range(TICKS):
+            a = rate(x)
+            b = rate(x + 0.5 * TICK * a)
+            c = rate(x + 0.5 * TICK * b)
+            x[:] = x + TICK / 6.0 * (a + 2.0 * (b + c) + rate(x + TICK * c))
+
+    return Contestant(work, TICKS, start)
+
+
+def _many(advance: Advance, cars: Cars) -> Contestant:
+    """Cars from the middle of their drives on, in every round the same ones."""
+    running = cars.twin()
+
+    def start() -> None:
+        running.motions[:], running.acting[:] = cars.motions, cars.acting
+
+    return Contestant(lambda: advance(running, TICKS), CARS * TICKS, start)
+
+
+def add(suite: Suite, effort: Effort) -> tuple[dict[str, Taken], dict[str, str]]:
+    """Rows and a table; what each contestant took, and why others are absent."""
+    cars, field = cars_of(CARS), Field()
+    field.add(OURS, lambda: _many(ours, cars))
+    field.add(C, lambda: _many(in_c(), cars))
+    field.add(SINGLE_TRACK, single_track, "commonroad-vehicle-models")
+    taken = interleaved(field.contestants, effort)
+    add_costs(
+        suite,
+        "Cost of a tick of the plant",
+        "tick",
+        taken,
+        f"One car, one millisecond: lag, load, Fiala tyres, roll, Runge-Kutta; {CARS} cars at "
+        "once. The C is the same text in blocks of eight cars, compiled on the spot "
+        "(-O3 -march=native, no fused multiply-add), with the same numbers. CommonRoad's single "
+        "track has linear tyres and no roll, one car, in Python.",
+        field.absent,
+    )
+    return taken, field.absent

@@ -1,0 +1,64 @@
+"""The plant in C, compiled on the spot: `plant.c` beside this module."""
+
+import ctypes
+import os
+import shutil
+import subprocess
+from importlib.resources import files
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from .field import AbsentError
+
+FLAGS = ("-O3", "-march=native", "-ffp-contract=off")
+VECTORS = ("-fno-math-errno", "-fno-trapping-math", "-fopenmp-simd")
+"""What lets the compiler make vectors of square roots, floor and choices; no number changes."""
+
+BLOCK = 8  # cars
+
+
+def compiler() -> str:
+    """The C compiler: that of the variable CC, or the first one found.
+
+    Raises AbsentError where there is none.
+    """
+    for name in (os.environ.get("CC", ""), "gcc", "clang", "cc"):
+        if name and (path := shutil.which(name)):
+            return path
+    raise AbsentError("no C compiler")
+
+
+def source() -> str:
+    """The text of `plant.c`."""
+    return files(__package__).joinpath("plant.c").read_text(encoding="utf-8")
+
+
+def c_plant() -> Any:
+    """The function `plant` of `plant.c`, loaded.
+
+    Raises AbsentError where there is no compiler, or none that can compile it.
+    """
+    with TemporaryDirectory() as folder:
+        library = Path(folder) / "plant.so"
+        command = [
+            compiler(),
+            *FLAGS,
+            *VECTORS,
+            "-shared",
+            "-fPIC",
+            "-x",
+            "c",
+            "-",
+            "-o",
+            str(library),
+        ]
+        run = subprocess.run(command, input=source(), capture_output=True, text=True)
+        if run.returncode:
+            last = (run.stderr.strip().splitlines() or ["it gave no reason"])[-1]
+            raise AbsentError(f"{command[0]} does not compile it: {last}")
+        function = ctypes.CDLL(str(library)).plant  # stays when the file is gone
+    pointers = [ctypes.c_void_p] * 7
+    function.argtypes = [ctypes.c_long, ctypes.c_long, ctypes.c_double, *pointers]
+    function.restype = None
+    return function
