@@ -19,23 +19,24 @@ from .field import Field, add_costs
 from .timing import Contestant, Effort, Taken, interleaved
 
 COUNT = 1024  # environments at once
-EPISODE = 500  # steps, the most
-STEPS = 10  # of a batch, in one call
+EPISODE, CHUNK = 500, 50  # steps, the most; in one call
+STEPS = 2  # of a batch, in one call
 
-FUSION, VISION = "sideslip/YawFusion-v0", "sideslip/YawVision-v0"
+FUSION_ID, VISION_ID = "sideslip/YawFusion-v0", "sideslip/YawVision-v0"
+FUSION, VISION = "YawFusion-v0", "YawVision-v0"
 PROMPT: dict[str, Any] = {"camera": {"delays": [0.0]}}
 FILTERS: dict[str, tuple[str, dict[str, Any]]] = {
     "multirate-kf": ("multirate-kf", {}),
-    "exact-kf, covariance": ("exact-kf", {"gains": "covariance"}),
-    "exact-kf, covariance, adaptive": ("exact-kf", {"gains": "covariance", "adapt": 0.02}),
+    "exact-kf, full P": ("exact-kf", {"gains": "covariance"}),
+    "exact-kf, full P, adaptive": ("exact-kf", {"gains": "covariance", "adapt": 0.02}),
 }
-FULL_COVARIANCE = f"{FUSION} with exact-kf, covariance"
-AT_ONCE = f"{FUSION}, {COUNT} at once"
+AT_ONCE = f"{FUSION} x {COUNT}"
+FULL_COVARIANCE = f"{AT_ONCE} + exact-kf, full P"
 AT_ENDS = f"{AT_ONCE}, infos at ends"
-LATE, NONE_LATE = f"{VISION}, {COUNT} at once", f"{VISION}, no delay, {COUNT} at once"
+LATE, NONE_LATE = f"{VISION} x {COUNT}", f"{VISION} x {COUNT}, no delay"
 CARTPOLE, PENDULUM, LANE = "CartPole-v1", "Pendulum-v1", "lane-keeping-v0 (highway-env)"
-CARTPOLES = f"{CARTPOLE}, {COUNT} at once"
-PENDULUMS = f"{PENDULUM}, {COUNT} at once (EnvPool)"
+CARTPOLES = f"{CARTPOLE} x {COUNT}"
+PENDULUMS = f"{PENDULUM} x {COUNT} (EnvPool)"
 
 Policy = Callable[[Any], Any]
 
@@ -46,7 +47,7 @@ def upright(obs: Any) -> Any:
 
 
 def episode(env: gym.Env[Any, Any], policy: Policy | None = None) -> Contestant:
-    """One episode a call, of at most `EPISODE` steps, always the same one.
+    """`CHUNK` steps a call of an episode of at most `EPISODE`, always the same one.
 
     policy: what acts (None: action 0, or the one that does nothing); it runs once, its actions are
     replayed.
@@ -59,12 +60,19 @@ def episode(env: gym.Env[Any, Any], policy: Policy | None = None) -> Contestant:
         obs, _, terminated, truncated, _ = env.step(actions[-1])
         over = terminated or truncated
 
-    def work() -> None:
-        env.reset(seed=0)
-        for action in actions:
-            env.step(action)
+    chunk = min(CHUNK, len(actions))
+    end = at = len(actions) // chunk * chunk
 
-    return Contestant(work, len(actions))
+    def work() -> None:
+        nonlocal at
+        if at == end:
+            env.reset(seed=0)
+            at = 0
+        for action in actions[at : at + chunk]:
+            env.step(action)
+        at += chunk
+
+    return Contestant(work, chunk)
 
 
 def batch(env: Any, steps: int = STEPS) -> Contestant:
@@ -122,27 +130,27 @@ def _vector(env_id: str, **arguments: Any) -> Any:
 
 def _filtered(label: str) -> Contestant:
     name, options = FILTERS[label]
-    return episode(EstimateObservation(gym.make(FUSION), name, options=options))
+    return episode(EstimateObservation(gym.make(FUSION_ID), name, options=options))
 
 
 def _all_filtered(label: str) -> Contestant:
     name, options = FILTERS[label]
-    return batch(EstimateObservations(_vector(FUSION), name, options=options))
+    return batch(EstimateObservations(_vector(FUSION_ID), name, options=options))
 
 
 def contestants() -> Field:
     """All environments; those of packages that are not installed are absent."""
     field = Field()
-    field.add(FUSION, lambda: episode(gym.make(FUSION)))
-    field.add(AT_ONCE, lambda: batch(_vector(FUSION)))
-    field.add(AT_ENDS, lambda: batch(_vector(FUSION, info="ends")))
+    field.add(FUSION, lambda: episode(gym.make(FUSION_ID)))
+    field.add(AT_ONCE, lambda: batch(_vector(FUSION_ID)))
+    field.add(AT_ENDS, lambda: batch(_vector(FUSION_ID, info="ends")))
     for label in FILTERS:
-        field.add(f"{FUSION} with {label}", partial(_filtered, label))
-        field.add(f"{AT_ONCE} with {label}", partial(_all_filtered, label))
-    field.add(VISION, lambda: episode(gym.make(VISION)))
-    field.add(f"{VISION}, no delay", lambda: episode(gym.make(VISION, **PROMPT)))
-    field.add(LATE, lambda: batch(_vector(VISION)))
-    field.add(NONE_LATE, lambda: batch(_vector(VISION, **PROMPT)))
+        field.add(f"{FUSION} + {label}", partial(_filtered, label))
+        field.add(f"{AT_ONCE} + {label}", partial(_all_filtered, label))
+    field.add(VISION, lambda: episode(gym.make(VISION_ID)))
+    field.add(f"{VISION}, no delay", lambda: episode(gym.make(VISION_ID, **PROMPT)))
+    field.add(LATE, lambda: batch(_vector(VISION_ID)))
+    field.add(NONE_LATE, lambda: batch(_vector(VISION_ID, **PROMPT)))
     field.add(CARTPOLE, lambda: episode(gym.make(CARTPOLE), upright))
     field.add(PENDULUM, lambda: episode(gym.make(PENDULUM)))
     field.add(LANE, _lane_keeping, "highway-env")
@@ -161,8 +169,9 @@ def add(suite: Suite, effort: Effort) -> tuple[dict[str, Taken], dict[str, str]]
         "step",
         taken,
         "Ours: 10 ms of driving, ten ticks of plant and sensors, with infos. Singles through "
-        f"gym.make, episodes of at most {EPISODE} steps with their reset; of a batch of {COUNT}, "
-        "a step of one environment. The filters' own cost is the difference to the line without.",
+        f"gym.make, in episodes of at most {EPISODE} steps; x {COUNT}: a step of one environment "
+        "of a batch. Filters with full P compute the covariance of six states at every tick; a "
+        "filter's own cost is the difference to the line without.",
         field.absent,
     )
     return taken, field.absent

@@ -69,7 +69,7 @@ def add_costs(
     suite.tables.append(
         Table(
             title,
-            ("", f"us per {unit}", "range", f"{unit}s per CPU-second", f"{unit}s per second"),
+            ("", f"us per {unit}", "range", "per CPU-second", "per second"),
             cells,
             note + absences(absent),
             keyed=False,

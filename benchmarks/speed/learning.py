@@ -14,8 +14,8 @@ from ..rows import Suite
 from .field import Field, add_costs
 from .timing import Contestant, Effort, Taken, interleaved
 
-OURS = "PPO on sideslip/YawFusion-v0 through the bridge"
-PENDULUM = "PPO on Pendulum-v1, defaults"
+OURS = "PPO, YawFusion-v0"
+PENDULUM = "PPO, Pendulum-v1"
 
 COUNT = 1024  # environments of the bridge
 LARGE: dict[str, Any] = {"n_steps": 16, "batch_size": 4096, "n_epochs": 4}
@@ -73,8 +73,8 @@ def add(suite: Suite, effort: Effort) -> tuple[dict[str, Taken], dict[str, str]]
         "Cost of a learned env-step",
         "step",
         taken,
-        f"Rollout and gradient steps, on one thread. Through the bridge: {COUNT} environments, "
-        f"{settings}; the rest, and all on Pendulum-v1, is stable-baselines3's default.",
+        "PPO of stable-baselines3, rollout and gradient steps. YawFusion-v0 through the bridge: "
+        f"{COUNT} environments, {settings}; the rest, and all on Pendulum-v1, is its default.",
         field.absent,
     )
     return taken, field.absent

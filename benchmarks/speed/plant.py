@@ -28,7 +28,7 @@ Array = npt.NDArray[np.float64]
 CARS, TICKS = 1024, 10  # cars at once; ticks a call
 OURS = "plant"
 C = "plant in C"
-SINGLE_TRACK = "single track (commonroad-vehicle-models)"
+SINGLE_TRACK = "single track, CommonRoad"
 
 _CAR, _ROAD, _MOTION = len(Car._fields), len(Road._fields), len(Motion._fields)
 

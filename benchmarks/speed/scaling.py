@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 
 from ..rows import Row, Suite, Table
-from .env_steps import COUNT, FUSION, batch, episode
+from .env_steps import COUNT, FUSION, FUSION_ID, batch, episode
 from .field import absences, add_rows, rate
 from .timing import Contestant, Effort, Taken, interleaved, spread
 
@@ -25,7 +25,7 @@ def bytes_per_row(**arguments: Any) -> int:
     few, many, peaks = 64, 192, list[int]()
     for count in (few, few, many):  # the first one loads what is loaded once
         tracemalloc.start()
-        env: Any = gym.make_vec(FUSION, count, **arguments)
+        env: Any = gym.make_vec(FUSION_ID, count, **arguments)
         env.reset(seed=0)
         env.step(np.zeros(env.action_space.shape, np.float32))
         peaks.append(tracemalloc.get_traced_memory()[1])
@@ -51,7 +51,7 @@ def against_count(suite: Suite, effort: Effort, counts: tuple[int, ...]) -> None
         if held > SHARE * free:
             absent[_at_once(count)] = f"takes {held / 2**30:.1f} GiB, {free / 2**30:.1f} are free"
             break
-        env: Any = gym.make_vec(FUSION, count, info="ends")
+        env: Any = gym.make_vec(FUSION_ID, count, info="ends")
         contestants[_at_once(count)] = batch(env, max(1, WORK // count))
     taken = interleaved(contestants, effort)
     suite.rows.append(Row(suite.name, f"{FUSION}, batch", "bytes_per_row", float(row)))
@@ -81,14 +81,14 @@ def against_ticks(suite: Suite, effort: Effort) -> None:
     """Rows, a table and a figure: control periods of 1 to 50 ticks."""
     contestants: dict[str, Contestant] = {}
     for n in TICKS:
-        contestants[_ticks(n)] = episode(gym.make(FUSION, control_period=n))
-        many: Any = gym.make_vec(FUSION, COUNT, info="ends", control_period=n)
-        contestants[f"{_ticks(n)}, {COUNT} at once"] = batch(many, 2)
+        contestants[_ticks(n)] = episode(gym.make(FUSION_ID, control_period=n))
+        many: Any = gym.make_vec(FUSION_ID, COUNT, info="ends", control_period=n)
+        contestants[f"{FUSION} x {COUNT}, {n} ticks a step"] = batch(many, 2)
     taken = interleaved(contestants, effort)
     for name, each in taken.items():
         add_rows(suite, name, each, "step")
     single = np.array([_cpu(taken[_ticks(n)])[0] for n in TICKS])
-    many_at = np.array([_cpu(taken[f"{_ticks(n)}, {COUNT} at once"])[0] for n in TICKS])
+    many_at = np.array([_cpu(taken[f"{FUSION} x {COUNT}, {n} ticks a step"])[0] for n in TICKS])
     cells = [
         [str(n), f"{one:.3g}", f"{one / n:.3g}", f"{each:.3g}", f"{each / n:.3g}"]
         for n, one, each in zip(TICKS, single, many_at, strict=True)
@@ -96,19 +96,19 @@ def against_ticks(suite: Suite, effort: Effort) -> None:
     suite.tables.append(
         Table(
             "Cost of an env-step against ticks per step",
-            ("ticks", "us per step", "per tick", f"us per step, {COUNT} at once", "per tick"),
+            ("ticks", "us per step", "per tick", f"us per step, x {COUNT}", "per tick"),
             cells,
             f"{FUSION}; a tick is a millisecond. Infos of the batch at ends.",
             keyed=False,
         )
     )
-    lines = {"gym.make": single, f"{COUNT} at once": many_at}
+    lines = {"gym.make": single, f"x {COUNT}": many_at}
     text = "What a step costs apart from its ticks is where a line ends on the left."
     _draw(suite, "ticks per step / ms", np.array(TICKS, float), lines, text)
 
 
 def _at_once(count: int) -> str:
-    return f"{FUSION}, {count} at once, infos at ends"
+    return f"{FUSION} x {count}, infos at ends, scaling"
 
 
 def _ticks(n: int) -> str:

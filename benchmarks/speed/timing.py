@@ -7,9 +7,6 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
-ROUNDS = 15
-QUICK_ROUNDS = 5
-
 
 @dataclass(frozen=True)
 class Contestant:
@@ -39,12 +36,13 @@ class Effort:
     whole calls of its work.
     """
 
-    rounds: int = ROUNDS
-    seconds: float = 0.1
+    rounds: int
+    seconds: float
 
 
-QUICK = Effort(QUICK_ROUNDS, 0.02)
-FULL = Effort()
+QUICK = Effort(9, 0.01)
+FULL = Effort(25, 0.04)
+"""Many short rounds: what the machine does meanwhile falls on all contestants of one round."""
 
 
 def interleaved(contestants: Mapping[str, Contestant], effort: Effort) -> dict[str, Taken]:

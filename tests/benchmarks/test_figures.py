@@ -69,6 +69,19 @@ def test_figures_refuse_unequal_lengths() -> None:
         figures.bars_with_interval(["a"], [1.0], [], [], "m")
 
 
+def test_curves_stand_on_logarithmic_axes() -> None:
+    figures = pytest.importorskip("sideslip.benchmarks.figures")
+    x, y = np.array([1.0, 1024.0, 65536.0]), np.array([8.0, 1.0, 1.0])
+    figure = figures.curves("", x, {"gym.make": y}, "CPU time / us", "environments")
+    (line,) = figure.data
+    assert list(line.x) == list(x) and list(line.y) == list(y)
+    assert line.mode == "lines+markers"
+    assert figure.layout.xaxis.type == figure.layout.yaxis.type == "log"
+    assert figure.layout.yaxis.title.text == "CPU time / us"
+    with pytest.raises(ValueError, match="has 3 values, x 2"):
+        figures.curves("", x[:2], {"gym.make": y}, "CPU time / us", "environments")
+
+
 def test_tracks_have_equal_axes() -> None:
     figures = pytest.importorskip("sideslip.benchmarks.figures")
     figure = figures.track(np.arange(5000.0), np.arange(5000.0))
