@@ -5,15 +5,15 @@
  * cars, structures of arrays, so that the compiler makes vectors of it. What does not change
  * within a call is computed once a block.
  *
- * gcc -O3 -march=native -ffp-contract=off (-fno-math-errno -fno-trapping-math -fopenmp-simd let it
- * make vectors of square roots, of floor and of choices; none of them changes a number).
+ * Compiled with -O3 -march=native -ffp-contract=off; more flags stand in `yardstick.py`.
  */
 #include <math.h>
+#include <string.h>
 
 #define BLOCK 8
 #define INLINE static inline __attribute__((always_inline))
 
-/* Fields in the order of the rows of the arrays (fields, cars). */
+/* Fields in the order of the arrays (blocks, fields, BLOCK). */
 #define CAR(DO) \
     DO(m) DO(I) DO(l_f) DO(l_r) DO(C_f) DO(C_r) DO(d_f) DO(d_r) DO(r) DO(T_max) DO(mu) DO(l_pre) \
     DO(S) DO(I_x) DO(K_x) DO(C_x) DO(h) DO(ahead) DO(left) DO(mu_r)
@@ -256,30 +256,24 @@ static void prepare(block *b)
     }
 }
 
-static void copy(double *to, const double *from, int rows, long to_step, long from_step)
-{
-    for (int k = 0; k < rows; k++)
-        for (int i = 0; i < BLOCK; i++) to[k * to_step + i] = from[k * from_step + i];
-}
-
-/* Ticks of h seconds of n cars, a multiple of eight. Arrays (fields, n). left: what is left of a
+/* Ticks of h seconds of blocks of cars. Arrays (blocks, fields, BLOCK). left: what is left of a
  * deviation from the command: of steering at the middle and the end of a tick, then of motors. */
-void plant(long n, long ticks, double h, const double *left, const double *cars,
+void plant(long blocks, long ticks, double h, const double *left, const double *cars,
            const double *roads, const double *pushes, const double *commands, double *motions,
            double *acting)
 {
-#define ROWS(part) (int)(sizeof(part) / sizeof(double[BLOCK]))
+#define AT(part, array) ((array) + at * (long)(sizeof b.part / sizeof(double)))
     block b;
-    for (long at = 0; at < n; at += BLOCK) {
-        copy((double *)&b.car, cars + at, ROWS(b.car), BLOCK, n);
-        copy((double *)&b.road, roads + at, ROWS(b.road), BLOCK, n);
-        copy((double *)&b.push, pushes + at, ROWS(b.push), BLOCK, n);
-        copy((double *)&b.command, commands + at, ROWS(b.command), BLOCK, n);
-        copy((double *)&b.now, acting + at, ROWS(b.now), BLOCK, n);
-        copy((double *)&b.motion, motions + at, ROWS(b.motion), BLOCK, n);
+    for (long at = 0; at < blocks; at++) {
+        memcpy(&b.car, AT(car, cars), sizeof b.car);
+        memcpy(&b.road, AT(road, roads), sizeof b.road);
+        memcpy(&b.push, AT(push, pushes), sizeof b.push);
+        memcpy(&b.command, AT(command, commands), sizeof b.command);
+        memcpy(&b.now, AT(now, acting), sizeof b.now);
+        memcpy(&b.motion, AT(motion, motions), sizeof b.motion);
         prepare(&b);
         for (long j = 0; j < ticks; j++) tick(&b, h, left);
-        copy(acting + at, (double *)&b.now, ROWS(b.now), n, BLOCK);
-        copy(motions + at, (double *)&b.motion, ROWS(b.motion), n, BLOCK);
+        memcpy(AT(now, acting), &b.now, sizeof b.now);
+        memcpy(AT(motion, motions), &b.motion, sizeof b.motion);
     }
 }

@@ -12,14 +12,15 @@ import numpy as np
 import numpy.typing as npt
 
 from ...envs.actuators import lagged
-from ...envs.backend import fixed_tuple, inlined, jit
+from ...envs.backend import fixed_tuple, inlined, jit, put
 from ...envs.dynamics import Car, Motion, Push, Road, rk4
+from ...envs.lanes import LANES
 from ...envs.layout import P, Z
 from ...envs.outside import BMW_320I
 from ...envs.record import TICK
 from ...envs.tyres import FIALA, Inputs, load_of
 from ..rows import Suite
-from .field import Field, add_costs
+from .field import AbsentError, Field, add_costs
 from .timing import Contestant, Effort, Taken, interleaved
 from .yardstick import BLOCK, c_plant
 
@@ -34,7 +35,8 @@ _CAR, _ROAD, _MOTION = len(Car._fields), len(Road._fields), len(Motion._fields)
 
 
 class Cars(NamedTuple):
-    """Cars in the middle of a drive; arrays (fields, N) in the order of the plant's tuples.
+    """Cars in the middle of a drive; arrays (blocks, fields, LANES), fields as in the plant's
+    tuples.
 
     left: (4,) what is left of an actuator's deviation from its command, of steering at the middle
     and the end of a tick, then of the motors.
@@ -58,23 +60,26 @@ Advance = Callable[[Cars, int], object]
 
 
 def cars_of(count: int, seed: int = 0) -> Cars:
-    """Cars that the seeds of `YawFusion-v0` draw, with commands of their own."""
+    """Cars that the seeds of `YawFusion-v0` draw, with commands of their own.
+
+    count: a multiple of LANES.
+    """
     env: Any = gym.make_vec("sideslip/YawFusion-v0", num_envs=count)
     env.reset(seed=seed)
     p, z, rng = env.params, env.states, np.random.default_rng(seed)
     lags = p[0, P.steer + 1 : P.steer + 3], p[0, P.motor + 1 : P.motor + 3]
 
-    def rows(of: Array, at: int, length: int) -> Array:
-        return np.ascontiguousarray(of[:, at : at + length].T)
+    def blocks(rows: Array) -> Array:
+        return np.ascontiguousarray(rows.reshape(-1, LANES, rows.shape[1]).transpose(0, 2, 1))
 
     return Cars(
         np.concatenate(lags),
-        rows(p, P.car, _CAR),
-        rows(p, P.road, _ROAD),
-        rng.normal(0.0, 1.0, (3, count)) * [[50.0], [20.0], [0.0]],
-        rng.uniform(-1.0, 1.0, (3, count)) * [[0.05], [20.0], [20.0]],
-        rows(z, Z.motion, _MOTION),
-        np.zeros((3, count)),
+        blocks(p[:, P.car : P.car + _CAR]),
+        blocks(p[:, P.road : P.road + _ROAD]),
+        blocks(rng.normal(0.0, 1.0, (count, 3)) * [50.0, 20.0, 0.0]),
+        blocks(rng.uniform(-1.0, 1.0, (count, 3)) * [0.05, 20.0, 20.0]),
+        blocks(z[:, Z.motion : Z.motion + _MOTION]),
+        blocks(np.zeros((count, 3))),
     )
 
 
@@ -115,23 +120,25 @@ def advance(
     acting: Any,
     ticks: int,
 ) -> None:
-    """Ticks of every car, one after the other; the arrays of `Cars`."""
-    for i in range(cars.shape[1]):
-        car, road = Car(*fixed_tuple(cars[:, i], _CAR)), Road(*fixed_tuple(roads[:, i], _ROAD))
-        push, command = Push(*fixed_tuple(pushes[:, i], 3)), Inputs(*fixed_tuple(commands[:, i], 3))
-        motion = Motion(*fixed_tuple(motions[:, i], _MOTION))
-        now = Inputs(*fixed_tuple(acting[:, i], 3))
+    """Ticks of every car, a block at a time; the arrays of `Cars`."""
+    for b in range(len(cars)):
+        car, road = Car(*fixed_tuple(cars[b], _CAR)), Road(*fixed_tuple(roads[b], _ROAD))
+        push, command = Push(*fixed_tuple(pushes[b], 3)), Inputs(*fixed_tuple(commands[b], 3))
+        motion, now = (
+            Motion(*fixed_tuple(motions[b], _MOTION)),
+            Inputs(*fixed_tuple(acting[b], 3)),
+        )
         load = load_of(now, car, 0)
         for _ in range(ticks):
             load, motion, now = tick(load, motion, now, command, push, car, road, left)
         for k in range(_MOTION):
-            motions[k, i] = motion[k]
+            put(motions[b], motion[k], k)
         for k in range(3):
-            acting[k, i] = now[k]
+            put(acting[b], now[k], k)
 
 
 def ours(cars: Cars, ticks: int) -> None:
-    """The plant as the batch engine moves it."""
+    """The plant as the batch engine moves it, in lanes."""
     advance(*cars, ticks)
 
 
@@ -140,12 +147,12 @@ def in_c() -> Advance:
 
     Raises AbsentError without a compiler, RuntimeError where the numbers differ.
     """
+    if LANES != BLOCK:
+        raise AbsentError(f"it takes blocks of {BLOCK} cars, ours has {LANES}")
     function = c_plant()
 
     def advance_in_c(cars: Cars, ticks: int) -> None:
-        count = cars.cars.shape[1]
-        assert count % BLOCK == 0
-        function(count, ticks, TICK, *(array.ctypes.data for array in cars))
+        function(len(cars.cars), ticks, TICK, *(array.ctypes.data for array in cars))
 
     mine = cars_of(BLOCK)
     theirs = mine.twin()

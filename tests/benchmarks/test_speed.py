@@ -82,13 +82,13 @@ def test_poles_stay_up_so_that_no_reset_is_measured() -> None:
 def test_the_plant_in_c_is_ours() -> None:
     """To rounding, over half a second of cars that slide, roll, brake and turn."""
     mine = plant.cars_of(32, seed=3)
-    mine.motions[1] += np.linspace(-3.0, 3.0, 32)  # m/s of v_y: beyond the tyres' peak
+    mine.motions[:, 1] += np.linspace(-3.0, 3.0, 32).reshape(4, 8)  # m/s of v_y: tyres slide
     mine.roads[:] = np.array([[0.01], [0.5], [2.0], [0.3], [0.2]])
     theirs = mine.twin()
     plant.ours(mine, 500)
     plant.in_c()(theirs, 500)
     assert np.isfinite(mine.motions).all()
-    scale = np.abs(mine.motions).max(axis=1, keepdims=True)
+    scale = np.abs(mine.motions).max(axis=(0, 2), keepdims=True)
     np.testing.assert_allclose(theirs.motions / scale, mine.motions / scale, rtol=0.0, atol=1e-11)
     np.testing.assert_allclose(theirs.acting, mine.acting, rtol=1e-13)
 
