@@ -20,7 +20,7 @@ from .timing import Contestant, Effort, Taken, interleaved
 
 COUNT = 1024  # environments at once
 EPISODE, CHUNK = 500, 50  # steps, the most; in one call
-STEPS = 2  # of a batch, in one call
+STEPS, FRAMES = 10, 33  # of a batch, in one call; until camera frames fall on steps as before
 
 FUSION_ID, VISION_ID = "sideslip/YawFusion-v0", "sideslip/YawVision-v0"
 FUSION, VISION = "YawFusion-v0", "YawVision-v0"
@@ -149,8 +149,8 @@ def contestants() -> Field:
         field.add(f"{AT_ONCE} + {label}", partial(_all_filtered, label))
     field.add(VISION, lambda: episode(gym.make(VISION_ID)))
     field.add(f"{VISION}, no delay", lambda: episode(gym.make(VISION_ID, **PROMPT)))
-    field.add(LATE, lambda: batch(_vector(VISION_ID)))
-    field.add(NONE_LATE, lambda: batch(_vector(VISION_ID, **PROMPT)))
+    field.add(LATE, lambda: batch(_vector(VISION_ID), FRAMES))
+    field.add(NONE_LATE, lambda: batch(_vector(VISION_ID, **PROMPT), FRAMES))
     field.add(CARTPOLE, lambda: episode(gym.make(CARTPOLE), upright))
     field.add(PENDULUM, lambda: episode(gym.make(PENDULUM)))
     field.add(LANE, _lane_keeping, "highway-env")

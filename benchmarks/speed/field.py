@@ -69,7 +69,7 @@ def add_costs(
     suite.tables.append(
         Table(
             title,
-            ("", f"us per {unit}", "range", "per CPU-second", "per second"),
+            ("", f"us per {unit}", "range", "per CPU-s", "per s"),
             cells,
             note + absences(absent),
             keyed=False,
