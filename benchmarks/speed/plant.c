@@ -1,16 +1,15 @@
 /* The plant of YawFusion-v0 in plain C: the yardstick that ours is measured against.
  *
  * One tick is what `plant.py` compiles: the actuators' lag, two loads, Fiala tyres, roll, and the
- * classical Runge-Kutta method, operation by operation in the order of `envs`. Blocks of eight
- * cars, structures of arrays, so that the compiler makes vectors of it. What does not change
- * within a call is computed once a block.
+ * classical Runge-Kutta method, operation by operation in the order of `envs`. Blocks of cars,
+ * structures of arrays, so that the compiler makes vectors of it; BLOCK cars, told on its command
+ * line. What does not change within a call is computed once a block.
  *
  * Compiled with -O3 -march=native -ffp-contract=off; more flags stand in `yardstick.py`.
  */
 #include <math.h>
 #include <string.h>
 
-#define BLOCK 8
 #define INLINE static inline __attribute__((always_inline))
 
 /* Fields in the order of the arrays (blocks, fields, BLOCK). */
@@ -25,7 +24,7 @@
 /* What a car's numbers give once and for all. */
 #define FIXED(DO) \
     DO(per_m) DO(per_I) DO(front) DO(rear_l) DO(rear_r) DO(slope_f) DO(per_front) DO(per_rear) \
-    DO(direct) DO(lean) DO(per_r) DO(per_ramp) DO(half_track)
+    DO(direct) DO(per_lean) DO(per_r) DO(per_ramp) DO(half_track)
 #define LOAD(DO) DO(sin_d) DO(cos_d) DO(F_l) DO(F_r)
 
 #define DOUBLE(k) double k;
@@ -93,7 +92,7 @@ INLINE fixed fixed_of(car c, road r)
     f.per_front = 1.0 / (half_weight * c.d_f);
     f.per_rear = 1.0 / (half_weight * c.d_r);
     f.direct = c.m * c.h - c.S;
-    f.lean = c.I_x - c.S * c.S * f.per_m;
+    f.per_lean = 1.0 / (c.I_x - c.S * c.S * f.per_m);
     f.per_r = 1.0 / c.r;
     f.per_ramp = 1.0 / r.ramp;
     f.half_track = 0.5 * c.d_r;
@@ -109,9 +108,9 @@ INLINE load load_of(inputs now, double per_r)
     return l;
 }
 
-INLINE double capacity(double limit, double drive)
+INLINE double squared_capacity(double limit, double drive)
 {
-    return sqrt(most(limit * limit - drive * drive, 0.0025 * limit * limit));
+    return most(limit * limit - drive * drive, 0.0025 * limit * limit);
 }
 
 INLINE double lateral(double tangent, double limit, double slope)
@@ -130,45 +129,56 @@ INLINE void turned(double sine, double cosine, double angle, double *s_out, doub
 }
 
 INLINE motion derivative(motion at, load l, push p, car c, road r, fixed f, frame start, double psi,
-                         double theta)
+                         double theta, int curved, int sloped)
 {
     motion rate;
     double share = within((at.s - r.start) * f.per_ramp, 0.0, 1.0), kappa = r.curvature * share;
-    double turn = at.theta - theta, s_r, c_r, s_t, c_t;
+    double turn = 0.0, g_x = 0.0, g_y = 0.0, s_t = start.sin_t, c_t = start.cos_t, s_r, c_r;
+    if (curved) {
+        turn = at.theta - theta;
+        turned(start.sin_t, start.cos_t, turn, &s_t, &c_t);
+    }
     turned(start.sin_r, start.cos_r, at.psi - psi - turn, &s_r, &c_r);
-    turned(start.sin_t, start.cos_t, turn, &s_t, &c_t);
-    double along = r.along * share, across = r.across * share;
-    double g_x = along * c_r + across * s_r, g_y = across * c_r - along * s_r;
-
+    if (sloped) {
+        double along = r.along * share, across = r.across * share;
+        g_x = along * c_r + across * s_r;
+        g_y = across * c_r - along * s_r;
+    }
     double front = at.v_y + c.l_f * at.gamma, rear = at.v_y - c.l_r * at.gamma;
-    double t_f = (at.v_x * l.sin_d - front * l.cos_d) /
-                 most(size(at.v_x * l.cos_d + front * l.sin_d), SLOW);
-    double t_r = (0.0 - rear) / most(size(at.v_x), SLOW);
+    double along_f = most(size(at.v_x * l.cos_d + front * l.sin_d), SLOW);
+    double across_f = at.v_x * l.sin_d - front * l.cos_d, across_r = 0.0 - rear;
+    double along_r = most(size(at.v_x), SLOW);
+
     double direct = f.direct * (at.v_x * at.gamma + g_y);
     double moment = c.K_x * at.phi + c.C_x * at.phi_dot + direct;
     double e_f = within(moment * f.per_front, -0.9, 0.9);
     double e_r = within(moment * f.per_rear, -0.9, 0.9);
-    double narrow = 1.0 - e_f, wide = 1.0 + e_f, per = f.slope_f / (narrow * wide);
-    double F_yf =
-        lateral(t_f, f.front * narrow, per * wide) + lateral(t_f, f.front * wide, per * narrow);
+    double narrow = 1.0 - e_f, wide = 1.0 + e_f;
     double rear_l = f.rear_l * (1.0 - e_r), rear_r = f.rear_r * (1.0 + e_r);
     double F_l = within(l.F_l, 0.0 - rear_l, rear_l), F_r = within(l.F_r, 0.0 - rear_r, rear_r);
-    double left = capacity(rear_l, F_l), right = capacity(rear_r, F_r);
-    per = c.C_r / (3.0 * left * right);
-    double F_yr = lateral(t_r, left, per * right) + lateral(t_r, right, per * left);
+    double square_l = squared_capacity(rear_l, F_l), square_r = squared_capacity(rear_r, F_r);
+    double left = sqrt(square_l), right = sqrt(square_r);
+    double sides = narrow * wide, squares = square_l * square_r;
+    double per = 1.0 / (along_f * along_r * (sides * squares));
+    double slope_f = f.slope_f * (along_r * squares * per);
+    double slope_r = c.C_r * (1.0 / 3.0) * (along_f * sides * per);
+    double F_yf = lateral(across_f, f.front * narrow, slope_f * wide) +
+                  lateral(across_f, f.front * wide, slope_f * narrow);
+    double F_yr = lateral(across_r, left, slope_r * square_r * left) +
+                  lateral(across_r, right, slope_r * square_l * right);
 
     double F_yc = F_yf * l.cos_d, F_y = F_yc + F_yr + p.F_d, N_z = f.half_track * (F_r - F_l);
     double lever = c.S * (F_y * f.per_m + GRAVITY * at.phi);
     rate.phi = at.phi_dot;
-    rate.phi_dot = (lever + (p.N_x - c.C_x * at.phi_dot - c.K_x * at.phi)) / f.lean;
+    rate.phi_dot = (lever + (p.N_x - c.C_x * at.phi_dot - c.K_x * at.phi)) * f.per_lean;
     F_y = F_y + c.S * rate.phi_dot;
     rate.v_x = (F_l + F_r - F_yf * l.sin_d) * f.per_m + at.v_y * at.gamma - g_x;
     rate.v_y = F_y * f.per_m - at.v_x * at.gamma - g_y;
     rate.gamma = (c.l_f * F_yc - c.l_r * F_yr + N_z + p.N_d) * f.per_I;
     rate.psi = at.gamma;
-    along = at.v_x * c_r - at.v_y * s_r;
+    double along = at.v_x * c_r - at.v_y * s_r;
     rate.y = at.v_x * s_r + at.v_y * c_r;
-    rate.s = along / most(1.0 - kappa * at.y, 0.1);
+    rate.s = curved ? along / most(1.0 - kappa * at.y, 0.1) : along;
     rate.X = along * c_t - rate.y * s_t;
     rate.Y = along * s_t + rate.y * c_t;
     rate.theta = rate.s * kappa;
@@ -183,16 +193,17 @@ INLINE motion ahead(motion now, double h, motion rate)
 }
 
 INLINE motion rk4(motion now, load first, load middle, load last, push p, car c, road r, fixed f,
-                  double h)
+                  double h, int curved, int sloped)
 {
     frame start;
     double psi = now.psi, theta = now.theta;
     sincos_of(theta, &start.sin_t, &start.cos_t);
     sincos_of(psi - theta, &start.sin_r, &start.cos_r);
-    motion k_1 = derivative(now, first, p, c, r, f, start, psi, theta);
-    motion k_2 = derivative(ahead(now, 0.5 * h, k_1), middle, p, c, r, f, start, psi, theta);
-    motion k_3 = derivative(ahead(now, 0.5 * h, k_2), middle, p, c, r, f, start, psi, theta);
-    motion k_4 = derivative(ahead(now, h, k_3), last, p, c, r, f, start, psi, theta);
+#define SLOPE(at, load) derivative(at, load, p, c, r, f, start, psi, theta, curved, sloped)
+    motion k_1 = SLOPE(now, first);
+    motion k_2 = SLOPE(ahead(now, 0.5 * h, k_1), middle);
+    motion k_3 = SLOPE(ahead(now, 0.5 * h, k_2), middle);
+    motion k_4 = SLOPE(ahead(now, h, k_3), last);
 #define MEAN(k) k_1.k = (k_1.k + 2.0 * (k_2.k + k_3.k) + k_4.k) * (1.0 / 6.0);
     MOTION(MEAN)
     return ahead(now, h, k_1);
@@ -207,32 +218,28 @@ INLINE inputs lagged(inputs command, inputs now, double steer_left, double motor
 }
 
 /* One tick of all cars of a block. */
-static void tick(block *b, double h, const double *left)
+INLINE void tick(block *b, double h, const double *left, int curved, int sloped)
 {
-#pragma omp simd simdlen(BLOCK)
+#pragma omp simd
     for (int i = 0; i < BLOCK; i++) {
-        car c;
-        road r;
-        push p;
+        car c; road r; push p; fixed f;
         inputs command, now;
         motion m;
-        fixed f;
         load first;
-#define TAKE(part, to, k) to.k = b->part.k[i];
-#define CAR_IN(k) TAKE(car, c, k)
-#define ROAD_IN(k) TAKE(road, r, k)
-#define PUSH_IN(k) TAKE(push, p, k)
-#define COMMAND_IN(k) TAKE(command, command, k)
-#define NOW_IN(k) TAKE(now, now, k)
-#define MOTION_IN(k) TAKE(motion, m, k)
-#define FIXED_IN(k) TAKE(fixed, f, k)
-#define LOAD_IN(k) TAKE(load, first, k)
+#define CAR_IN(k) c.k = b->car.k[i];
+#define ROAD_IN(k) r.k = b->road.k[i];
+#define PUSH_IN(k) p.k = b->push.k[i];
+#define COMMAND_IN(k) command.k = b->command.k[i];
+#define NOW_IN(k) now.k = b->now.k[i];
+#define MOTION_IN(k) m.k = b->motion.k[i];
+#define FIXED_IN(k) f.k = b->fixed.k[i];
+#define LOAD_IN(k) first.k = b->load.k[i];
         CAR(CAR_IN) ROAD(ROAD_IN) PUSH(PUSH_IN) INPUTS(COMMAND_IN) INPUTS(NOW_IN)
         MOTION(MOTION_IN) FIXED(FIXED_IN) LOAD(LOAD_IN)
         load middle = load_of(lagged(command, now, left[0], left[2]), f.per_r);
         now = lagged(command, now, left[1], left[3]);
         load last = load_of(now, f.per_r);
-        m = rk4(m, first, middle, last, p, c, r, f, h);
+        m = rk4(m, first, middle, last, p, c, r, f, h, curved, sloped);
 #define NOW_OUT(k) b->now.k[i] = now.k;
 #define MOTION_OUT(k) b->motion.k[i] = m.k;
 #define LOAD_OUT(k) b->load.k[i] = last.k;
@@ -240,12 +247,15 @@ static void tick(block *b, double h, const double *left)
     }
 }
 
+#define ALONE static __attribute__((noinline))
+ALONE void tick_anywhere(block *b, double h, const double *left) { tick(b, h, left, 1, 1); }
+ALONE void tick_straight(block *b, double h, const double *left) { tick(b, h, left, 0, 0); }
+
 /* What is not in the arrays: the fixed numbers and the first load. */
 static void prepare(block *b)
 {
     for (int i = 0; i < BLOCK; i++) {
-        car c;
-        road r;
+        car c; road r;
         inputs now;
         CAR(CAR_IN) ROAD(ROAD_IN) INPUTS(NOW_IN)
         fixed f = fixed_of(c, r);
@@ -272,7 +282,15 @@ void plant(long blocks, long ticks, double h, const double *left, const double *
         memcpy(&b.now, AT(now, acting), sizeof b.now);
         memcpy(&b.motion, AT(motion, motions), sizeof b.motion);
         prepare(&b);
-        for (long j = 0; j < ticks; j++) tick(&b, h, left);
+        int curved = 0, sloped = 0;
+        for (int i = 0; i < BLOCK; i++) {
+            curved |= b.road.curvature[i] != 0.0;
+            sloped |= b.road.across[i] != 0.0 || b.road.along[i] != 0.0;
+        }
+        if (curved || sloped)
+            for (long j = 0; j < ticks; j++) tick_anywhere(&b, h, left);
+        else
+            for (long j = 0; j < ticks; j++) tick_straight(&b, h, left);
         memcpy(AT(now, acting), &b.now, sizeof b.now);
         memcpy(AT(motion, motions), &b.motion, sizeof b.motion);
     }

@@ -18,11 +18,11 @@ from ...envs.lanes import LANES
 from ...envs.layout import P, Z
 from ...envs.outside import BMW_320I
 from ...envs.record import TICK
-from ...envs.tyres import FIALA, Inputs, load_of
+from ...envs.tyres import FIALA, Inputs, load_of, shifts
 from ..rows import Suite
-from .field import AbsentError, Field, add_costs
+from .field import Field, add_costs
 from .timing import Contestant, Effort, Taken, interleaved
-from .yardstick import BLOCK, c_plant
+from .yardstick import c_plant
 
 Array = npt.NDArray[np.float64]
 
@@ -105,7 +105,8 @@ def tick(
         lagged(command.T_l, acting.T_l, left[3]),
         lagged(command.T_r, acting.T_r, left[3]),
     )
-    middle, last = load_of(between, car, 0), load_of(acting, car, 0)
+    shifting = shifts(0, FIALA, 1)
+    middle, last = load_of(between, car, 0, shifting), load_of(acting, car, 0, shifting)
     return last, rk4(motion, (first, middle, last), push, car, road, TICK, 0, FIALA, 1), acting
 
 
@@ -128,7 +129,7 @@ def advance(
             Motion(*fixed_tuple(motions[b], _MOTION)),
             Inputs(*fixed_tuple(acting[b], 3)),
         )
-        load = load_of(now, car, 0)
+        load = load_of(now, car, 0, shifts(0, FIALA, 1))
         for _ in range(ticks):
             load, motion, now = tick(load, motion, now, command, push, car, road, left)
         for k in range(_MOTION):
@@ -147,14 +148,12 @@ def in_c() -> Advance:
 
     Raises AbsentError without a compiler, RuntimeError where the numbers differ.
     """
-    if LANES != BLOCK:
-        raise AbsentError(f"it takes blocks of {BLOCK} cars, ours has {LANES}")
-    function = c_plant()
+    function = c_plant(LANES)
 
     def advance_in_c(cars: Cars, ticks: int) -> None:
         function(len(cars.cars), ticks, TICK, *(array.ctypes.data for array in cars))
 
-    mine = cars_of(BLOCK)
+    mine = cars_of(LANES)
     theirs = mine.twin()
     ours(mine, 100)
     advance_in_c(theirs, 100)
@@ -213,7 +212,7 @@ def add(suite: Suite, effort: Effort) -> tuple[dict[str, Taken], dict[str, str]]
         "tick",
         taken,
         f"One car, one millisecond: lag, load, Fiala tyres, roll, Runge-Kutta; {CARS} cars at "
-        "once. The C is the same text in blocks of eight cars, compiled on the spot "
+        "once. The C is the same text in blocks of as many cars, compiled on the spot "
         "(-O3 -march=native, no fused multiply-add), with the same numbers. CommonRoad's single "
         "track has linear tyres and no roll, one car, in Python.",
         field.absent,

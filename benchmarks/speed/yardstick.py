@@ -23,8 +23,6 @@ VECTORS = (
 """What lets gcc make vectors of square roots, floor and choices, and gave it the best time of the
 flags that were tried; no number changes."""
 
-BLOCK = 8  # cars
-
 
 def compiler() -> str:
     """The C compiler: that of the variable CC, or the first one found.
@@ -42,25 +40,15 @@ def source() -> str:
     return files(__package__).joinpath("plant.c").read_text(encoding="utf-8")
 
 
-def c_plant() -> Any:
-    """The function `plant` of `plant.c`, loaded.
+def c_plant(block: int) -> Any:
+    """The function `plant` of `plant.c` for blocks of so many cars, loaded.
 
     Raises AbsentError where there is no compiler, or none that can compile it.
     """
     with TemporaryDirectory() as folder:
         library = Path(folder) / "plant.so"
-        command = [
-            compiler(),
-            *FLAGS,
-            *VECTORS,
-            "-shared",
-            "-fPIC",
-            "-x",
-            "c",
-            "-",
-            "-o",
-            str(library),
-        ]
+        told = [*FLAGS, *VECTORS, f"-DBLOCK={block}", "-shared", "-fPIC"]
+        command = [compiler(), *told, "-x", "c", "-", "-o", str(library)]
         run = subprocess.run(command, input=source(), capture_output=True, text=True)
         if run.returncode:
             last = (run.stderr.strip().splitlines() or ["it gave no reason"])[-1]

@@ -20,6 +20,7 @@ from sideslip.benchmarks.speed import (
     timing,
     yardstick,
 )
+from sideslip.envs.lanes import LANES
 
 SHORT = timing.Effort(rounds=1, seconds=0.0)
 compiler = pytest.mark.skipif(
@@ -33,7 +34,7 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(env_steps, "EPISODE", 5)
     monkeypatch.setattr(scaling, "COUNT", 3)
     monkeypatch.setattr(scaling, "WORK", 3)
-    monkeypatch.setattr(plant, "CARS", 16)
+    monkeypatch.setattr(plant, "CARS", 32)
 
 
 def without(monkeypatch: pytest.MonkeyPatch, *packages: str) -> None:
@@ -82,8 +83,8 @@ def test_poles_stay_up_so_that_no_reset_is_measured() -> None:
 def test_the_plant_in_c_is_ours() -> None:
     """To rounding, over half a second of cars that slide, roll, brake and turn."""
     mine = plant.cars_of(32, seed=3)
-    mine.motions[:, 1] += np.linspace(-3.0, 3.0, 32).reshape(4, 8)  # m/s of v_y: tyres slide
-    mine.roads[:] = np.array([[0.01], [0.5], [2.0], [0.3], [0.2]])
+    mine.motions[:, 1] += np.linspace(-3.0, 3.0, 32).reshape(-1, LANES)  # m/s of v_y: tyres slide
+    mine.roads[0] = np.array([[0.01], [0.5], [2.0], [0.3], [0.2]])  # the others: straight, flat
     theirs = mine.twin()
     plant.ours(mine, 500)
     plant.in_c()(theirs, 500)
