@@ -10,10 +10,12 @@ import sys
 from tempfile import TemporaryDirectory
 
 from ..rows import Row, Suite, Table
+from .field import AbsentError
 from .timing import spread
 
 FIRST = "gym.make to the first step, kernels on disk"
 KERNEL = "cold compile of the dearest kernel"
+LIMIT = 60.0  # s, on the wall, of a process that has nothing to compile
 
 _WARM = """
 import json, time
@@ -70,8 +72,14 @@ run(EstimateObservations(gym.make_vec(id, num_envs=8), **told), (8, 1))
 
 
 def warm() -> dict[str, float]:
-    """CPU seconds of each thing a fresh process does up to its first step."""
-    marks: list[tuple[str, float]] = json.loads(_python(_WARM))
+    """CPU seconds of each thing a fresh process does up to its first step.
+
+    Raises AbsentError where that takes minutes, because no kernels are kept on disk.
+    """
+    try:
+        marks: list[tuple[str, float]] = json.loads(_python(_WARM, limit=LIMIT))
+    except subprocess.TimeoutExpired:
+        raise AbsentError("no kernels are kept on disk here") from None
     before = [0.0, *(at for _, at in marks)]
     return {name: at - before[i] for i, (name, at) in enumerate(marks)}
 
@@ -85,10 +93,11 @@ def cold(code: str = _COLD) -> list[tuple[str, float]]:
     return [(str(name), float(seconds)) for name, seconds in json.loads(said)]
 
 
-def _python(code: str, variables: dict[str, str] | None = None) -> str:
+def _python(code: str, variables: dict[str, str] | None = None, limit: float | None = None) -> str:
     """What code prints in an interpreter of its own that finds the same packages."""
     told = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)} | (variables or {})
-    run = subprocess.run([sys.executable, "-c", code], env=told, capture_output=True, text=True)
+    command = [sys.executable, "-c", code]
+    run = subprocess.run(command, env=told, capture_output=True, text=True, timeout=limit)
     if run.returncode:
         raise RuntimeError(f"a fresh process failed:\n{run.stderr}")
     return run.stdout.splitlines()[-1]
@@ -100,6 +109,22 @@ def add(suite: Suite, runs: int, compiling: bool) -> tuple[dict[str, list[float]
     runs: processes whose first one does not count. compiling: also everything cold, which takes
     minutes.
     """
+    seconds, absent = dict[str, list[float]](), dict[str, str]()
+    try:
+        seconds[FIRST] = _add_first(suite, runs)
+    except AbsentError as error:
+        absent[FIRST] = str(error)
+    if compiling:
+        kernels = cold()
+        seconds[KERNEL] = [max(taken for _, taken in kernels)]
+        _add_kernels(suite, kernels)
+    else:
+        absent[KERNEL] = "in the full form only"
+    return seconds, absent
+
+
+def _add_first(suite: Suite, runs: int) -> list[float]:
+    """Rows and a table of fresh processes; CPU seconds up to the first step."""
     taken = [warm() for _ in range(runs + 1)][1:]
     columns = {name: [run[name] for run in taken] for name in taken[0]}
     ours = ("import numba", "gym.make", "first reset", "first step")
@@ -114,13 +139,7 @@ def add(suite: Suite, runs: int, compiling: bool) -> tuple[dict[str, list[float]
     suite.tables.append(
         Table("Cost of the first use", ("", "CPU-s", "range"), cells, note, keyed=False)
     )
-    seconds = {FIRST: columns[FIRST]}
-    if not compiling:
-        return seconds, {KERNEL: "in the full form only"}
-    kernels = cold()
-    seconds[KERNEL] = [max(taken for _, taken in kernels)]
-    _add_kernels(suite, kernels)
-    return seconds, {}
+    return columns[FIRST]
 
 
 def _add_kernels(suite: Suite, kernels: list[tuple[str, float]]) -> None:

@@ -183,6 +183,16 @@ outer(1); outer(1.0); inner(1)
         first_use.cold("raise ValueError('no such thing')")
 
 
+def test_where_no_kernels_are_kept_the_first_step_is_absent(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(first_use, "LIMIT", 0.01)
+    measured = Suite("speed", "", "")
+    seconds, absent = first_use.add(measured, 1, compiling=False)
+    assert seconds == {} and measured.rows == []
+    assert absent[first_use.FIRST] == "no kernels are kept on disk here"
+
+
 def test_ratios_are_taken_round_by_round() -> None:
     """Their median is not the ratio of the medians."""
     target = targets.TARGETS[0]
