@@ -17,8 +17,8 @@ from .timing import Contestant, Effort, Taken, interleaved
 OURS = "PPO, YawFusion-v0"
 PENDULUM = "PPO, Pendulum-v1"
 
-COUNT = 1024  # environments of the bridge
-LARGE: dict[str, Any] = {"n_steps": 16, "batch_size": 4096, "n_epochs": 4}
+COUNT = 256  # environments of the bridge
+LARGE: dict[str, Any] = {"n_steps": 32, "batch_size": 1024, "n_epochs": 4}  # as `sideslip train`
 DEFAULTS = 2048  # steps of a rollout with the defaults
 ROUNDS = 5  # at most: a round takes seconds
 
