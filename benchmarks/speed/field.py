@@ -60,8 +60,8 @@ def add_costs(
         cells.append(
             [
                 name,
-                f"{middle:.3g}",
-                f"{low:.3g} .. {high:.3g}",
+                three(middle),
+                f"{three(low)} .. {three(high)}",
                 rate(middle),
                 rate(spread(each.wall)[0]),
             ]
@@ -75,6 +75,15 @@ def add_costs(
             keyed=False,
         )
     )
+
+
+def three(value: float) -> str:
+    """A number to three digits, without an exponent.
+
+    >>> three(0.04431), three(7.2), three(1004.0)
+    ('0.0443', '7.2', '1000')
+    """
+    return f"{float(f'{value:.3g}'):g}"
 
 
 def rate(microseconds: float) -> str:

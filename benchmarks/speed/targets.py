@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from ..rows import Row, Suite, Table
 from . import env_steps, first_use, learning, plant
-from .field import absences
+from .field import absences, three
 from .timing import Taken, ratios, spread
 
 
@@ -96,4 +96,4 @@ def _said(suite: Suite, name: str, metric: str, values: list[float]) -> list[str
     """A row; median and range as text."""
     middle, low, high = spread(values)
     suite.rows.append(Row(suite.name, name, metric, middle, low=low, high=high, n=len(values)))
-    return [f"{middle:.3g}", f"{low:.3g} .. {high:.3g}"]
+    return [three(middle), f"{three(low)} .. {three(high)}"]
