@@ -64,8 +64,8 @@ def add(suite: Suite, effort: Effort) -> tuple[dict[str, Taken], dict[str, str]]
     if not field.contestants:
         return {}, field.absent
     with _torch_on_one_thread():
-        taken = interleaved(
-            field.contestants, replace(effort, rounds=min(effort.rounds // 2, ROUNDS))
+        fewer = replace(effort, rounds=max(1, min(effort.rounds // 2, ROUNDS)))
+        taken = interleaved(field.contestants, fewer)
         )
     settings = ", ".join(f"{name} = {value}" for name, value in LARGE.items())
     add_costs(
