@@ -66,7 +66,6 @@ def add(suite: Suite, effort: Effort) -> tuple[dict[str, Taken], dict[str, str]]
     with _torch_on_one_thread():
         fewer = replace(effort, rounds=max(1, min(effort.rounds // 2, ROUNDS)))
         taken = interleaved(field.contestants, fewer)
-        )
     settings = ", ".join(f"{name} = {value}" for name, value in LARGE.items())
     add_costs(
         suite,
