@@ -16,8 +16,9 @@ from typing import Any, TypeVar
 
 import numba
 import numpy as np
-from numba.core.dispatcher import Dispatcher
+from llvmlite import ir
 from numba.core import cgutils, types
+from numba.core.dispatcher import Dispatcher
 from numba.extending import intrinsic, overload
 
 _PACKAGE = Path(__file__).resolve().parent.parent
@@ -109,7 +110,7 @@ def maximum(a: Any, b: Any) -> Any:
 
 def absolute(a: Any) -> Any:
     """|a|."""
-    return a if a > 0.0 else 0.0 - a
+    return math.fabs(a)
 
 
 def floor(a: Any) -> Any:
@@ -158,7 +159,23 @@ def _for_numbers(primitive: Callable[..., Any]) -> None:
 
 
 for _each in PRIMITIVES:
-    _for_numbers(_each)
+    if _each is not floor:
+        _for_numbers(_each)
+
+
+@intrinsic
+def _floor(typingctx, a):  # type: ignore[no-untyped-def]  # without the way over an integer
+    def code(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        of = ir.FunctionType(args[0].type, [args[0].type])
+        function = cgutils.get_or_insert_function(builder.module, of, "llvm.floor.f64")
+        return builder.call(function, args)
+
+    return types.float64(types.float64), code
+
+
+@overload(floor)
+def _floor_of(a):  # type: ignore[no-untyped-def]
+    return (lambda a: _floor(a)) if isinstance(a, types.Number) else None
 
 
 @jit

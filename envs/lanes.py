@@ -173,6 +173,7 @@ def _pick(typingctx, condition, a, b):  # type: ignore[no-untyped-def]
 
 def _machine(name: str) -> Any:
     """One of LLVM's own functions of lanes of floats."""
+    name = f"llvm.{name}.v{_COUNT}f64"
 
     @intrinsic
     def call(typingctx, a):  # type: ignore[no-untyped-def]
@@ -185,7 +186,7 @@ def _machine(name: str) -> Any:
     return call
 
 
-_floor, _sqrt = _machine(f"llvm.floor.v{_COUNT}f64"), _machine(f"llvm.sqrt.v{_COUNT}f64")
+_floor, _sqrt, _fabs = _machine("floor"), _machine("sqrt"), _machine("fabs")
 
 
 @intrinsic
@@ -217,7 +218,7 @@ def _for_lanes(primitive: Callable[..., Any], text: Callable[..., Any]) -> None:
 
 _for_lanes(backend.minimum, lambda a, b: _pick(a < b, a, b))
 _for_lanes(backend.maximum, lambda a, b: _pick(a > b, a, b))
-_for_lanes(backend.absolute, lambda a: _pick(a > 0.0, a, 0.0 - a))
+_for_lanes(backend.absolute, lambda a: _fabs(a))
 _for_lanes(backend.floor, lambda a: _floor(a))
 _for_lanes(backend.sqrt, lambda a: _sqrt(a))
 _for_lanes(backend.select, lambda condition, a, b: _pick(condition, a, b))

@@ -133,7 +133,9 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
         self._bounds = self.setting.bounds
         low, high = self._bounds.astype(np.float32)
         self.observation_space = gym.spaces.Box(low, high, dtype=np.float32)
-        self.action_space = gym.spaces.Box(-1.0, 1.0, (self.setting.action_width,), np.float32)
+        self._entries, self._width = len(self.layout), self.setting.action_width
+        self._fails = on_bad_action == "fail"
+        self.action_space = gym.spaces.Box(-1.0, 1.0, (self._width,), np.float32)
         self._params, self._state = np.zeros(P.end), np.zeros(Z.end)
         self._scratch = scratch_of(self.control_period)
         self.rows = np.zeros((self.control_period, FAST_WIDTH))
@@ -186,8 +188,8 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
         """Hold the action for one control period."""
         if self._over:
             raise ResetNeeded("the episode is over or was never started: call reset() first")
-        force = action_of(action, self.setting.action_width, self.setting.on_bad_action == "fail")
-        obs = np.empty(len(self.layout), np.float32)
+        force = action_of(action, self._width, self._fails)
+        obs = np.empty(self._entries, np.float32)
         done = self._advance(force, obs)
         if done <= 0:
             if done == REFUSED:
