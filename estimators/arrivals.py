@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from ..envs.backend import floor, jit
+from ..envs.backend import apart, floor, jit
 from ..envs.record import GPS, PACKET, PACKET_WIDTH
 from .delay import BUFFER, DROPPED, find, known
 from .innovation import SATELLITES
@@ -103,7 +103,7 @@ def receive_sample(f: Any, gains: Any) -> bool:
     return use(f, gains, s, f.sample)
 
 
-@jit
+@apart
 def receive(f: Any, gains: Any, packet: Any) -> bool:
     """Use a packet that is here now, keep it for the next step, or drop and count it; whether it
     was used or kept."""

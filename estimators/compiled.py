@@ -23,13 +23,25 @@ def entry(function: Any, *example: Any) -> Any:
     return function.compile(tuple(map(numba.typeof, example)))
 
 
+def _memory() -> tuple[Any, Any]:
+    return np.zeros(1, FILTER), np.zeros((1, 1, 1))
+
+
 @cache
-def entries() -> tuple[Any, Any, Any]:
-    """(`advance`, `receive_all`, `step_all`) as plain calls."""
-    filters, gains = np.zeros(1, FILTER), np.zeros((1, 1, 1))
+def advance_entry() -> Any:
+    """`advance` as a plain call."""
     matrix, vector = np.zeros((1, 1)), np.zeros(1)
-    return (
-        entry(advance, filters, gains, matrix, 0, matrix, 0, 0, matrix, matrix, vector),
-        entry(receive_all, filters, gains, np.zeros(PACKET_WIDTH)),
-        entry(step_all, filters, gains, matrix, matrix, 0),
-    )
+    return entry(advance, *_memory(), matrix, 0, matrix, 0, 0, matrix, matrix, vector)
+
+
+@cache
+def receive_entry() -> Any:
+    """`receive_all` as a plain call."""
+    return entry(receive_all, *_memory(), np.zeros(PACKET_WIDTH))
+
+
+@cache
+def step_entry() -> Any:
+    """`step_all` as a plain call."""
+    matrix = np.zeros((1, 1))
+    return entry(step_all, *_memory(), matrix, matrix, 0)

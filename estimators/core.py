@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ..envs.backend import jit, maximum, sqrt
+from ..envs.backend import apart, jit, maximum, sqrt
 from ..envs.record import FAST, PACKET
 from .arrivals import receive, use_waiting
 from .delay import BUFFER, latch_due
@@ -22,7 +22,7 @@ from .step import advance_state, correct_fast, read
 from .transition import build
 
 
-@jit
+@apart
 def begin(f: Any, first: int) -> None:
     """A fresh filter whose first row is the tick `first`."""
     f.start, f.tick, f.begun, f.at = first, first - 1, 0, 0
@@ -132,7 +132,7 @@ def _write(layers: Any, gains: Any, j: int, X: Any, S: Any) -> None:
             column += 1
 
 
-@jit
+@apart
 def advance(
     layers: Any,
     gains: Any,

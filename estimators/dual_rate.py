@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..envs.record import CAMERA, FAST_WIDTH, PACKET, PACKET_WIDTH
-from .compiled import entries
+from .compiled import advance_entry, receive_entry
 from .core import begin_all
 from .delay import IGNORE
 from .estimates import Estimates, UnobservableWarning
@@ -129,7 +129,7 @@ class DualRate:
         self._filters[0].x[: len(self.names)] = self._start
 
     def _take(self, fast: Array, packets: Array, X: Array = _NOTHING, S: Array = _NOTHING) -> None:
-        advance, count = entries()[0], len(packets)
+        advance, count = advance_entry(), len(packets)
         advance(self._filters, self.gains, fast, len(fast), packets, count, 0, X, S, _NO_NIS)
 
     def step(self, u: npt.ArrayLike) -> None:
@@ -148,7 +148,9 @@ class DualRate:
             raise ValueError(f"a sample comes every {self.ratio} steps, this is step {f.tick}")
         if f.since == 0:
             raise ValueError(f"step {f.tick} has had its sample")
-        entries()[1](self._filters, self.gains, self._packet(vector("y", y, int(f.rows[CAMERA]))))
+        receive_entry()(
+            self._filters, self.gains, self._packet(vector("y", y, int(f.rows[CAMERA])))
+        )
 
     def _packet(self, y: Array) -> Array:
         packet = np.zeros(PACKET_WIDTH)

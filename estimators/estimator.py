@@ -11,7 +11,7 @@ import numpy.typing as npt
 from scipy.linalg import block_diag
 
 from ..envs.record import FAST, FAST_WIDTH, PACKET_WIDTH, SLOW_NAMES, Log, Record, SlowSensor
-from .compiled import entries
+from .compiled import advance_entry, receive_entry, step_entry
 from .core import begin_all
 from .estimates import Estimates, UnobservableWarning
 from .memory import Counters
@@ -160,7 +160,7 @@ class Estimator:
         if wide != FAST_WIDTH or long != PACKET_WIDTH:
             raise ValueError(_misshapen(fast, packets))
         arrived = arrived if count is None else count
-        done = entries()[2](self.filters, self.gains, fast, packets, arrived)
+        done = step_entry()(self.filters, self.gains, fast, packets, arrived)
         if done < rows:  # gains are missing
             nothing = _NOTHING, _NOTHING, _NO_NIS
             self._go_on(done, rows, (fast, rows, packets, arrived), nothing)
@@ -181,7 +181,7 @@ class Estimator:
         to be filled with the normalised innovation squared of each packet, or empty.
         """
         given = fast, rows, packets, count
-        done = entries()[0](self.filters, self.gains, *given, 0, X, S, nis)
+        done = advance_entry()(self.filters, self.gains, *given, 0, X, S, nis)
         if done < rows:
             self._go_on(done, rows, given, (X, S, nis))
 
@@ -192,7 +192,7 @@ class Estimator:
         """
         while done < rows:
             self.design_missing()
-            done = entries()[0](self.filters, self.gains, *given, done, *filled)
+            done = advance_entry()(self.filters, self.gains, *given, done, *filled)
 
     def predict(self, fast_row: npt.ArrayLike) -> None:
         """Take one fast row: from the last tick to this one, with the gyro."""
@@ -203,7 +203,7 @@ class Estimator:
         values = np.ascontiguousarray(packet, np.float64)
         if values.shape != (PACKET_WIDTH,):
             raise ValueError(f"a packet has shape ({PACKET_WIDTH},), got {values.shape}")
-        entries()[1](self.filters, self.gains, values)
+        receive_entry()(self.filters, self.gains, values)
 
     def run(self, source: Log | Record) -> Estimates:
         """Reset, then filter a whole record.

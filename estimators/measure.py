@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from ..envs.backend import absolute, jit, maximum
+from ..envs.backend import absolute, apart, jit, maximum
 from ..envs.elementary import wrap
 from ..envs.record import GPS, PACKET
 from .covariance import measure_clone, measure_state
@@ -113,7 +113,7 @@ def _deliver_promise(f: Any, s: int) -> None:
             f.x[k] += f.promise[s, i, k] * f.residual[i]
 
 
-@jit
+@apart
 def measure(f: Any, gains: Any, s: int, first: int, packet: Any, judge: bool) -> bool:
     """Correct by one packet of sensor s whose values are sound; False if the gate refused it.
 

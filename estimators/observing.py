@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from ..envs.backend import jit, maximum, minimum
+from ..envs.backend import apart, jit, maximum, minimum
 from ..envs.elementary import wrap
 from .compiled import entry
 from .core import advance, covariance_of, deviation
@@ -38,7 +38,7 @@ def _nees(f: Any, gains: Any, i: int, j: int, beta: Any, gamma: Any) -> Any:
     return a * a / p if p > 0.0 else 0.0
 
 
-@jit
+@apart
 def observe(
     filters: Any,
     gains: Any,

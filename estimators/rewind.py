@@ -10,11 +10,21 @@ that it refuses leaves everything as it was.
 
 from typing import Any
 
-from ..envs.backend import jit, maximum
+from ..envs.backend import apart, jit, maximum
 from ..envs.record import PACKET, PACKET_WIDTH
 from .delay import direct
 from .measure import measure
-from .memory import COUNTERS, EVERY, RECENT, ROWS, SLOW, SNAPSHOTS, WINDOW
+from .memory import (
+    COUNTERS,
+    EVERY,
+    FASTS,
+    INPUTS,
+    RECENT,
+    ROWS,
+    SLOW,
+    SNAPSHOTS,
+    WINDOW,
+)
 from .step import advance_state, correct_fast
 from .transition import VELOCITY_ROLL, build
 
@@ -50,8 +60,10 @@ def _take_back(f: Any, slot: int) -> None:
 def remember(f: Any) -> None:
     """Keep what the present tick told."""
     slot = f.tick % WINDOW
-    f.told_u[slot] = f.u
-    f.told_y[slot] = f.y
+    for i in range(INPUTS):
+        f.told_u[slot, i] = f.u[i]
+    for i in range(FASTS):
+        f.told_y[slot, i] = f.y[i]
     f.told_speed[slot, 0], f.told_speed[slot, 1] = f.model_speed, f.turning
     if (f.tick - f.start) % EVERY == 0:
         _shoot(f, _slot(f, f.tick))
@@ -61,8 +73,10 @@ def remember(f: Any) -> None:
 def _recall(f: Any, tick: int) -> None:
     """Inputs, fast measurements and model of a tick."""
     slot = tick % WINDOW
-    f.u[:] = f.told_u[slot]
-    f.y[:] = f.told_y[slot]
+    for i in range(INPUTS):
+        f.u[i] = f.told_u[slot, i]
+    for i in range(FASTS):
+        f.y[i] = f.told_y[slot, i]
     speed, turning = f.told_speed[slot, 0], f.told_speed[slot, 1]
     if speed != f.model_speed or turning != f.turning:
         build(f, speed, turning)
@@ -82,7 +96,8 @@ def _oldest(f: Any) -> int:
 def _keep(f: Any, s: int, packet: Any, place: int) -> None:
     """Keep a packet and its noise; what stood in its place is lost."""
     f.lost = maximum(f.lost, int(f.recent[place, PACKET.captured]))
-    f.recent[place, :] = packet[:PACKET_WIDTH]
+    for i in range(PACKET_WIDTH):
+        f.recent[place, i] = packet[i]
     for i in range(ROWS):
         f.recent_r[place, i] = f.r[s, i]
 
@@ -157,7 +172,7 @@ def _tell_again(f: Any, gains: Any, first: int, new: int) -> bool:
     return passed
 
 
-@jit
+@apart
 def take_late(f: Any, gains: Any, s: int, packet: Any) -> bool:
     """Use a sample of any age within the window; whether it was used."""
     captured = int(packet[PACKET.captured])

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from ..envs.backend import absolute, jit, maximum
+from ..envs.backend import absolute, apart, jit, maximum
 from ..envs.linear import bicycle_coefficients
 from ..envs.record import GPS
 from ..envs.vehicle import GRAVITY
@@ -137,7 +137,7 @@ def _lagging(f: Any) -> None:
         f.G[first + i, first + i] = 1.0 - f.relax
 
 
-@jit
+@apart
 def build(f: Any, speed: Any, turning: Any) -> None:
     """The model at a speed in m/s and a yaw rate in rad/s, and the course's variance there."""
     V = maximum(speed, SLOWEST)

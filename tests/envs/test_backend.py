@@ -64,10 +64,12 @@ def test_an_edit_in_a_callee_reaches_its_cached_callers(copy: Path, tmp_path: Pa
     variables = {"XDG_CACHE_HOME": str(cache)}
     exact = (2**31 - 0.5) / 2.0**32
     assert float(run(UNIFORM, copy, **variables)) == exact
-    kernels = sorted(cache.rglob("noise.uniform*.nbc"))
+    kernels = sorted(cache.rglob("noise.uniform*.kernel"))
     assert len(kernels) == 1
     assert float(run(UNIFORM, copy, **variables)) == exact
-    assert sorted(cache.rglob("noise.uniform*.nbc")) == kernels  # the second run compiled nothing
+    assert (
+        sorted(cache.rglob("noise.uniform*.kernel")) == kernels
+    )  # the second run compiled nothing
     source = copy / "envs" / "backend.py"
     text = source.read_text()
     changed = text.replace("return a * 1.0", "return a * 3.0")

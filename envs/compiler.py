@@ -1,0 +1,272 @@
+# numba's own types say too little about itself:
+# mypy: disable-error-code="attr-defined,no-untyped-call,call-arg,misc,unused-ignore"
+"""How kernels are compiled: each function's text once, each kernel's machine code once.
+
+numba by itself runs LLVM's whole pipeline and emits machine code for every function a kernel calls,
+with everything below it, level by level. Here a function that another one calls is a `Part`: its
+LLVM text is kept as numba lowered it. What Python calls links the parts below it, and is optimised
+and emitted then; that alone is kept on disk.
+"""
+
+import contextlib
+import gc
+import logging
+import multiprocessing
+import os
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from llvmlite import binding
+from numba.core import types
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import Compiler
+from numba.core.compiler_lock import global_compiler_lock
+from numba.core.dispatcher import _FunctionCompiler
+from numba.core.environment import lookup_environment
+from numba.core.registry import CPUDispatcher
+from numba.core.sigutils import normalize_signature
+from numba.core.typing import make_concrete_template
+
+from .kept import Kept, environment_names, link_environments
+
+QUIET = "SIDESLIP_QUIET"
+"""The environment variable that keeps `tell` from writing to standard error."""
+
+_logger = logging.getLogger("sideslip.compiler")
+_told: list[str] = []
+_spent = [0.0]  # CPU-s on kernels so far, to tell a kernel's own from those it waited for
+
+
+class Part(JITCodeLibrary):
+    """The LLVM text of one function, neither optimised nor linked with those that it calls."""
+
+    def finalize(self) -> None:
+        """Nothing but a note of what keeps it from the disk."""
+        self._raise_if_finalized()
+        self._finalize_dynamic_globals()
+        self._finalized = True
+
+    def bare(self) -> Any:
+        """The LLVM module of this function alone, for linking."""
+        return super()._get_module_for_linking()
+
+    def _get_module_for_linking(self) -> Any:
+        """What a function that numba compiles by itself links: this one and all below it."""
+        module = self.bare().clone()
+        for each in _with_callees(self)[1:]:
+            if not isinstance(each, _Apart):
+                below = each.bare() if isinstance(each, Part) else each._get_module_for_linking()
+                module.link_in(below, preserve=True)
+        return module
+
+
+class _Bare:
+    """A part as a kernel of ours links it, which links each part itself."""
+
+    def __init__(self, part: Part) -> None:
+        self._part, self._reload_init = part, part._reload_init
+
+    def _ensure_finalized(self) -> None:
+        self._part._ensure_finalized()
+
+    def _get_module_for_linking(self) -> Any:
+        return self._part.bare()
+
+
+class _Apart:
+    """A kernel that callers find as machine code: nothing is linked into them."""
+
+    def __init__(self, kernel: "Kernel", args: tuple[types.Type, ...]) -> None:
+        self.needed = kernel.py_func.__module__, kernel.py_func.__name__, args
+        self._reload_init: set[str] = set()
+
+    def _ensure_finalized(self) -> None:
+        """There is nothing to finalize: numba asks before it links."""
+
+    def _get_module_for_linking(self) -> Any:
+        """Nothing: the machine code is found by its name."""
+        return binding.parse_assembly("")
+
+
+class _PartPipeline(Compiler):
+    def compile_extra(self, func: Any) -> Any:
+        self.state.library = Part(self.state.targetctx.codegen(), func.__qualname__)
+        return super().compile_extra(func)
+
+
+class _ApartPipeline(_PartPipeline):
+    def _compile_bytecode(self) -> Any:
+        """Callers' files know the function by a name without numba's count of this process."""
+        self.state.func_id.unique_id = 0
+        return super()._compile_bytecode()
+
+
+class _PartCompiler(_FunctionCompiler):
+    def _customize_flags(self, flags: Any) -> Any:
+        flags.no_compile = flags.no_cpython_wrapper = flags.no_cfunc_wrapper = True
+        return flags
+
+
+class Kernel(CPUDispatcher):
+    """A compiled function: a dispatcher of numba whose callees are parts.
+
+    kept: the folder on disk, or None. apart: callers do not take its text in but call its machine
+    code; so must a function of a module be that several kernels call and that is long itself.
+    """
+
+    def __init__(
+        self,
+        py_func: Any,
+        locals: Any = None,
+        targetoptions: Any = None,
+        pipeline_class: Any = Compiler,
+        kept: str | None = None,
+        apart: bool = False,
+    ) -> None:
+        super().__init__(py_func, locals, targetoptions, pipeline_class)
+        self.kept = None if kept is None else Kept(kept)
+        self.apart = apart
+        self.parts: dict[Any, Any] = {}
+        self._part_compiler = _PartCompiler(
+            py_func,
+            self.targetdescr,
+            self.targetoptions,
+            self.locals,
+            _ApartPipeline if apart else _PartPipeline,
+        )
+
+    def part(self, args: tuple[types.Type, ...]) -> Any:
+        """What callers link, for arguments of these types."""
+        with global_compiler_lock, self._compiling_counter:
+            if args not in self.parts:
+                if self.apart:
+                    self.compile(args)
+                    part = self.overloads[args]._replace(library=_Apart(self, args))
+                else:
+                    part = self._part_compiler.compile(args, None)
+                part = part._replace(entry_point=part.library)  # the key of its code for callers
+                self.targetctx.insert_user_function(part.entry_point, part.fndesc, [part.library])
+                self.parts[args] = part
+            return self.parts[args]
+
+    def get_call_template(self, args: Any, kws: Any) -> Any:
+        """What numba asks when it finds a call: the part's signature.
+
+        A literal is any number of its type: numba would compile the same text for 0, for 1 and for
+        an integer.
+        """
+        pysig, args = self._compiler.fold_argument_types(args, kws)
+        part = self.part(tuple(map(types.unliteral, args)))
+        name = self.py_func.__name__
+        return make_concrete_template(name, key=name, signatures=[part.signature]), pysig, args, {}
+
+    def get_overload(self, sig: Any) -> Any:
+        """What numba asks when it writes a call: the key of the part."""
+        return self.part(tuple(normalize_signature(sig)[0])).entry_point
+
+    def compile(self, sig: Any) -> Any:
+        """The call for arguments of these types, from the disk where it is kept."""
+        args = tuple(normalize_signature(sig)[0])
+        with global_compiler_lock:
+            if args not in self.overloads:
+                if not self._can_compile:
+                    raise RuntimeError("compilation disabled")
+                self.add_overload(self._found(args))
+            return self.overloads[args].entry_point
+
+    def _found(self, args: tuple[types.Type, ...]) -> Any:
+        if self.kept is None:
+            return self._built(args)[0]
+        path = self.kept.path(self.py_func, args, self.targetctx.codegen())
+        found = self.kept.load(path, args, self.targetctx)
+        if found is None:
+            found, *told = self._built(args)
+            self.kept.save(path, found, *told)
+        return found
+
+    def _built(self, args: tuple[types.Type, ...]) -> tuple[Any, list[Any], list[Any]]:
+        """What `_linked` returns, compiled while the user is told."""
+        tell(self.kept.folder.parent if self.kept else None)
+        start, nested = time.process_time(), _spent[0]
+        with _without_collection():
+            result = _linked(
+                self._part_compiler.compile(args, None) if self.apart else self.part(args)
+            )
+        spent = time.process_time() - start
+        own, _spent[0] = spent - (_spent[0] - nested), nested + spent
+        _logger.info("compiled %s in %.1f CPU-s", self.py_func.__qualname__, own)
+        return result
+
+
+@contextlib.contextmanager
+def _without_collection() -> Iterator[None]:
+    """No search for cycles among a compiler's millions of objects: a fifth of its time."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
+
+
+def _linked(part: Any) -> tuple[Any, list[Any], list[Any]]:
+    """A part with everything below it, optimised and emitted; all their environments; what it needs
+    of kernels that stand apart."""
+    target = part.target_context
+    library = target.codegen().create_library(part.library.name)
+    library.enable_object_caching()
+    own, *callees = _with_callees(part.library)
+    library.add_llvm_module(own._final_module.clone())  # where others find the function by name
+    library._reload_init.update(own._reload_init)
+    needed = [each.needed for each in callees if isinstance(each, _Apart)]
+    for each in callees:
+        if not isinstance(each, _Apart):
+            library.add_linking_library(_Bare(each) if isinstance(each, Part) else each)
+    target.create_cpython_wrapper(library, part.fndesc, part.environment, part.call_helper)
+    entry = target.get_executable(library, part.fndesc, part.environment)
+    environments = [
+        environment
+        for environment in map(lookup_environment, environment_names(library))
+        if environment is not None
+    ]
+    link_environments(library, environments)
+    return part._replace(library=library, entry_point=entry), environments, needed
+
+
+def _with_callees(library: Any) -> list[Any]:
+    """A part and all it calls, directly or not, callers first.
+
+    LLVM's linker leaves out what nothing refers to yet.
+    """
+    done: dict[Any, None] = {}
+
+    def visit(each: Any) -> None:
+        if isinstance(each, Part):
+            for callee in each._linking_libraries:
+                if callee not in done:
+                    visit(callee)
+        done[each] = None
+
+    visit(library)
+    return list(reversed(done))
+
+
+def tell(folder: Path | None) -> None:
+    """Say once in a process that kernels are being compiled, where the user waits for it.
+
+    A line on standard error; a record of the logger `sideslip.compiler` instead where the program
+    has set up logging; nothing in worker processes or with SIDESLIP_QUIET set.
+    """
+    where = f"kept in {folder}" if folder else "not kept: the cache's folder cannot be written"
+    text = f"sideslip: compiling kernels for this machine ({where}) ..."
+    if _told or os.environ.get(QUIET):
+        return
+    _told.append(text)
+    if _logger.hasHandlers():
+        _logger.info(text)
+    elif multiprocessing.parent_process() is None:
+        print(text, file=sys.stderr, flush=True)

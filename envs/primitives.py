@@ -1,0 +1,188 @@
+# numba's own types say too little about itself:
+# mypy: disable-error-code="no-untyped-call,no-untyped-def,misc,untyped-decorator"
+"""The primitives: what the equations use beside + - * /, by name.
+
+Each kind of number has its own table of these. The functions here serve Python floats; the compiler
+is taught them for single numbers and for lanes alike, the same instructions for both.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from llvmlite import ir
+from numba.core import cgutils, types
+from numba.core.imputils import lower_builtin
+from numba.core.typing.templates import AbstractTemplate, infer_global, signature
+
+from .lanes import BOOLS, FLOATS, INTS, LANES, Lanes, compare, meet
+
+
+def minimum(a: Any, b: Any) -> Any:
+    """The smaller of two numbers."""
+    return a if a < b else b
+
+
+def maximum(a: Any, b: Any) -> Any:
+    """The larger of two numbers."""
+    return a if a > b else b
+
+
+def absolute(a: Any) -> Any:
+    """|a|."""
+    return math.fabs(a)
+
+
+def floor(a: Any) -> Any:
+    """The largest whole number at or below a, as a float."""
+    return math.floor(a) * 1.0
+
+
+def sqrt(a: Any) -> Any:
+    """The square root, correctly rounded."""
+    return math.sqrt(a)
+
+
+def select(condition: Any, a: Any, b: Any) -> Any:
+    """a where the condition holds, else b (both are evaluated)."""
+    return a if condition else b
+
+
+def to_float(a: Any) -> Any:
+    """An integer as a float."""
+    return a * 1.0
+
+
+def whole(a: Any) -> Any:
+    """A whole number that is a float, as an integer."""
+    return int(a)
+
+
+def anywhere(condition: Any) -> Any:
+    """Whether a condition holds for any of the cars that are computed together."""
+    return condition
+
+
+ARRAYS: dict[str, Callable[..., Any]] = {
+    "minimum": np.minimum,
+    "maximum": np.maximum,
+    "absolute": np.absolute,
+    "floor": np.floor,
+    "sqrt": np.sqrt,
+    "select": np.where,
+    "to_float": lambda a: np.multiply(a, 1.0),
+    "whole": lambda a: np.asarray(a).astype(np.int64),
+    "anywhere": np.any,
+}
+"""The primitives for NumPy arrays, by the names the equations use."""
+
+_ABREAST = {types.float64: FLOATS, types.int64: INTS, types.boolean: BOOLS}
+
+
+def _teach(
+    primitive: Callable[..., Any], typing: Callable[..., Any], code: Callable[..., Any]
+) -> None:
+    """typing: from the arguments' types to a signature or None. code: of (builder, sig, args)."""
+
+    @infer_global(primitive)
+    class _Typing(AbstractTemplate):
+        def generic(self, args, kws):
+            return typing(*args)
+
+    def lower(context, builder, sig, args):
+        return code(builder, sig, args)
+
+    lower_builtin(primitive, *[types.Any] * primitive.__code__.co_argcount)(lower)
+
+
+def _of_two(a, b):
+    kind = meet((a, b))
+    return kind and signature(kind, kind, kind)
+
+
+def _of_float(a):
+    kind = meet((a,))
+    if kind is None:
+        return None
+    kind = FLOATS if isinstance(kind, Lanes) else types.float64
+    return signature(kind, kind)
+
+
+def _of_choice(condition, a, b):
+    kind, asked = meet((a, b)), BOOLS if condition is BOOLS else types.boolean
+    if kind is None or not isinstance(condition, types.Boolean | Lanes):
+        return None
+    if asked is BOOLS:
+        kind = _ABREAST.get(kind, kind)
+    return signature(kind, asked, kind, kind)
+
+
+def _converted(to: types.Type, abreast: Lanes) -> Callable[..., Any]:
+    def typing(a):
+        kind = meet((a,))
+        lanes = isinstance(kind, Lanes)
+        return kind and signature(abreast if lanes else to, kind)
+
+    return typing
+
+
+def _machine(name: str) -> Callable[..., Any]:
+    """LLVM's own function of a float or of lanes of them."""
+
+    def code(builder, sig, args):
+        of = args[0].type
+        suffix = f"v{LANES}f64" if isinstance(of, ir.VectorType) else "f64"
+        function = cgutils.get_or_insert_function(
+            builder.module, ir.FunctionType(of, [of]), f"llvm.{name}.{suffix}"
+        )
+        return builder.call(function, args)
+
+    return code
+
+
+def _chosen(sign: str) -> Callable[..., Any]:
+    """The first of two where it stands so to the second, else the second."""
+    codes = compare(sign)
+
+    def code(builder, sig, args):
+        kind = FLOATS if sig.args[0] in (FLOATS, types.float64) else INTS
+        return builder.select(codes[kind](builder, *args), *args)
+
+    return code
+
+
+def _as_float(builder, sig, args):
+    if sig.args[0] in (FLOATS, types.float64):
+        return args[0]
+    to = FLOATS.value if sig.return_type is FLOATS else ir.DoubleType()
+    return builder.sitofp(args[0], to)
+
+
+def _as_whole(builder, sig, args):
+    if sig.args[0] in (INTS, types.int64):
+        return args[0]
+    to = INTS.value if sig.return_type is INTS else ir.IntType(64)
+    return builder.fptosi(args[0], to)
+
+
+def _any(builder, sig, args):
+    if sig.args[0] is not BOOLS:
+        return args[0]
+    bits = builder.bitcast(args[0], ir.IntType(LANES))
+    return builder.icmp_unsigned("!=", bits, ir.Constant(bits.type, 0))
+
+
+_teach(minimum, _of_two, _chosen("<"))
+_teach(maximum, _of_two, _chosen(">"))
+_teach(absolute, _of_float, _machine("fabs"))
+_teach(floor, _of_float, _machine("floor"))
+_teach(sqrt, _of_float, _machine("sqrt"))
+_teach(select, _of_choice, lambda builder, sig, args: builder.select(*args))
+_teach(to_float, _converted(types.float64, FLOATS), _as_float)
+_teach(whole, _converted(types.int64, INTS), _as_whole)
+_teach(
+    anywhere,
+    lambda a: signature(types.boolean, BOOLS if a is BOOLS else types.boolean),
+    _any,
+)

@@ -1,0 +1,242 @@
+"""Compiled kernels on disk: kept once, loaded bit for bit, and their absence is no trouble."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numba
+import numpy as np
+import pytest
+
+from sideslip.envs.compiler import Kernel
+
+MODULE = '''
+"""Kernels in a folder named by the first argument."""
+
+import math
+import sys
+
+import numpy as np
+
+from sideslip.envs.compiler import Kernel
+
+
+def kernel(function, apart=False):
+    return Kernel(function, targetoptions={"nopython": True}, kept=sys.argv[1], apart=apart)
+
+
+@kernel
+def halved(x):
+    return 0.5 * math.sqrt(x)
+
+
+@kernel
+def total(vector, offset):
+    if offset < 0.0:
+        raise ValueError("offset is not negative")
+    for x in vector:
+        offset += x
+    return halved(offset)
+
+
+def _apart(function):
+    return kernel(function, apart=True)
+
+
+@_apart
+def negative(x):
+    if x > 8.0:
+        raise ValueError("x is at most 8")
+    return 0.0 - halved(x)
+
+
+@kernel
+def first(x):
+    return negative(x) + 1.0
+
+
+@kernel
+def second(x):
+    return negative(x) + 2.0
+'''
+USE = """
+print(total(np.arange(5.0), 0.5).hex())
+try:
+    total(np.arange(5.0), -1.0)
+except ValueError as error:
+    print(error)
+"""
+EXPECTED = [(0.5 * np.sqrt(10.5)).hex(), "offset is not negative"]
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "kernels").mkdir()
+    (tmp_path / "tiny.py").write_text(MODULE)
+    return tmp_path / "kernels"
+
+
+def start(folder: Path, code: str = USE, **variables: str) -> subprocess.Popen[str]:
+    kept = {name: value for name, value in os.environ.items() if not name.startswith("NUMBA_")}
+    return subprocess.Popen(
+        [sys.executable, "-W", "error", "-c", "from tiny import *\n" + code, str(folder)],
+        env=kept | {"PYTHONPATH": f"{folder.parent}{os.pathsep}{SOURCE}"} | variables,
+        cwd=folder.parent,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+SOURCE = Path(__file__).resolve().parents[2] / "src"
+
+
+def run(folder: Path, code: str = USE, **variables: str) -> tuple[list[str], str]:
+    """The lines that a process prints, and what it writes to standard error."""
+    process = start(folder, code, **variables)
+    said, complained = process.communicate(timeout=100)
+    assert process.returncode == 0, complained
+    return said.splitlines(), complained
+
+
+def test_a_second_process_loads_what_the_first_compiled(folder: Path) -> None:
+    first, told = run(folder)
+    assert first == EXPECTED
+    assert told.count("compiling") == 1  # one line, whatever the number of kernels
+    files = {path: path.read_bytes() for path in folder.iterdir()}
+    assert [path.name.partition("-")[0] for path in files] == ["tiny.total"]  # no callee
+    second, told = run(folder)
+    assert second == EXPECTED and told == ""
+    assert {path: path.read_bytes() for path in folder.iterdir()} == files
+
+
+@pytest.mark.parametrize("left", [0, 31, 1000, -1], ids=["empty", "digest", "cut", "last byte"])
+def test_a_damaged_file_is_compiled_again(left: int, tmp_path: Path) -> None:
+    def kernel() -> Any:
+        return Kernel(_tripled, targetoptions={"nopython": True}, kept=str(tmp_path))
+
+    assert kernel()(2.0) == 6.0
+    (path,) = tmp_path.iterdir()
+    whole = path.read_bytes()
+    path.write_bytes(whole[:left])
+    again = kernel()
+    assert again(3.0) == 9.0 and again.parts != {}
+    assert len(path.read_bytes()) == len(whole)
+    loaded = kernel()
+    assert loaded(4.0) == 12.0 and loaded.parts == {}
+
+
+def test_a_kernel_that_stands_apart_is_compiled_once_for_its_callers(folder: Path) -> None:
+    """Its file is needed by theirs, and comes back where it is missing; errors pass through."""
+    code = """
+print(first(4.0), second(4.0), halved.parts == {})
+try:
+    first(9.0)
+except ValueError as error:
+    print(error)
+"""
+    expected = ["0.0 1.0 False", "x is at most 8"]
+    assert run(folder, code)[0] == expected
+    files = {path.name.partition("-")[0]: path for path in folder.iterdir()}
+    assert sorted(files) == ["tiny.first", "tiny.negative", "tiny.second"]
+    expected[0] = "0.0 1.0 True"  # nothing was compiled
+    assert run(folder, code) == (expected, "")
+    files["tiny.negative"].unlink()
+    assert run(folder, code)[0][1:] == expected[1:]
+    assert run(folder, code) == (expected, "")
+
+
+def test_processes_that_start_at_once(folder: Path) -> None:
+    """Each of them compiles, one file is left, and it is whole."""
+    processes = [start(folder) for _ in range(3)]
+    for process in processes:
+        printed = process.communicate(timeout=100)[0]
+        assert process.returncode == 0 and printed.splitlines() == EXPECTED
+    assert len(list(folder.iterdir())) == 1
+    said, told = run(folder)
+    assert said == EXPECTED and told == ""
+
+
+def test_signatures_compiled_at_once_do_not_take_each_others_files(folder: Path) -> None:
+    """numba's numbered files do: two processes both take the first number."""
+    floats = "print(halved(16.0))"
+    whole = "print(halved(36))"
+    processes = [start(folder, code) for code in (floats, whole)]
+    assert [process.communicate(timeout=100)[0] for process in processes] == ["2.0\n", "3.0\n"]
+    assert len(list(folder.iterdir())) == 2
+    assert run(folder, floats + "\n" + whole) == (["2.0", "3.0"], "")
+
+
+@pytest.mark.parametrize("obstacle", ["missing", "file", "full"])
+def test_a_kernel_that_cannot_be_kept_is_compiled(
+    obstacle: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "kernels"
+    if obstacle == "file":
+        folder.write_text("not a folder")
+    elif obstacle == "full":
+        folder.mkdir()
+
+        def full(self: Path, data: bytes) -> int:
+            with open(self, "wb") as file:
+                file.write(data[:100])
+            raise OSError(28, "No space left on device")
+
+        monkeypatch.setattr(Path, "write_bytes", full)
+    kernel: Any = Kernel(_tripled, targetoptions={"nopython": True}, kept=str(folder))
+    assert kernel(2.0) == 6.0
+    assert not folder.is_dir() or not list(folder.iterdir())  # nothing half written is left
+
+
+def _tripled(x: float) -> float:
+    return 3.0 * x
+
+
+def test_a_callee_is_compiled_once_for_all_literals() -> None:
+    kernel: Any = Kernel(_tripled, targetoptions={"nopython": True})
+    caller: Any = Kernel(_caller(kernel), targetoptions={"nopython": True})
+    assert caller(5) == 3 * (5 + 7 + 9)
+    assert [str(each) for args in kernel.parts for each in args] == ["int64"]
+    assert kernel.overloads == {}  # no machine code of its own
+
+
+def _caller(kernel: Any) -> Any:
+    def caller(x: int) -> Any:
+        return kernel(x) + kernel(7) + kernel(9)
+
+    return caller
+
+
+@pytest.mark.parametrize("apart", [False, True])
+def test_a_function_compiled_by_numba_itself_may_call_a_kernel(apart: bool) -> None:
+    inner: Any = Kernel(_tripled, targetoptions={"nopython": True})
+    kernel: Any = Kernel(_caller(inner), targetoptions={"nopython": True}, apart=apart)
+    assert numba.njit(_caller(kernel))(1) == sum(3 * (x + 7 + 9) for x in (1, 7, 9))
+
+
+SETUP = "import logging; logging.basicConfig(level=logging.INFO, format='LOG %(message)s')\n"
+
+
+def test_who_waits_is_told(folder: Path) -> None:
+    """On standard error, or by the program's own logging; not with SIDESLIP_QUIET."""
+    say = "halved(2.0); halved(3)"
+    told = run(folder, say)[1].splitlines()
+    assert len(told) == 1 and str(folder.parent) in told[0]
+    for path in folder.iterdir():
+        path.unlink()
+    told = run(folder, SETUP + say)[1].splitlines()
+    assert [line.split()[1] for line in told] == ["sideslip:", "compiled", "compiled"]
+    for path in folder.iterdir():
+        path.unlink()
+    assert run(folder, say, SIDESLIP_QUIET="1")[1] == ""
+
+
+def test_workers_say_nothing(folder: Path) -> None:
+    code = """
+import multiprocessing
+with multiprocessing.get_context("fork").Pool(2) as pool:
+    print(pool.map(halved, [16.0, 36.0]))
+"""
+    assert run(folder, code) == (["[2.0, 3.0]"], "")
