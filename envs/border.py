@@ -81,7 +81,8 @@ def mask_of(mask: Any, count: int) -> Mask:
 
 
 def options_of(options: Mapping[str, Any], count: int) -> list[dict[str, Any]]:
-    """The options of each row's reset: a list, tuple or array has one for each row."""
+    """The options of each row's reset: a list, tuple or array has one for each row, None for a row
+    that is told nothing."""
     columns = {}
     for name, value in options.items():
         if isinstance(value, np.ndarray) and value.ndim > 0:
@@ -91,7 +92,10 @@ def options_of(options: Mapping[str, Any], count: int) -> list[dict[str, Any]]:
         elif len(value) != count:
             raise ValueError(f"reset option {name}: one or a list of {count}, got {len(value)}")
         columns[name] = value
-    return [{name: value[i] for name, value in columns.items()} for i in range(count)]
+    return [
+        {name: value[i] for name, value in columns.items() if value[i] is not None}
+        for i in range(count)
+    ]
 
 
 def action_of(action: Any, width: int, fail: bool) -> Actions:

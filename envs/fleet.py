@@ -66,9 +66,9 @@ class Fleet:
         """
         each, places = options_of(options, self._count), []
         made: list[Made] = []
-        known: dict[tuple[int, ...], int] = {}  # rows that are told the same objects share
+        known: dict[tuple[Any, ...], int] = {}  # rows that are told the same objects share
         for i in chosen:
-            told = tuple(map(id, each[i].values()))
+            told = (*each[i], *map(id, each[i].values()))
             if told not in known:
                 known[told] = len(made)
                 made.append(self.setting.optioned(each[i]))

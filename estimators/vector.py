@@ -21,7 +21,7 @@ from .records import Batch, BatchedRecords, SyncRecords, records_of, true_vehicl
 from .truth import as_built, tell_stiffness
 from .truth_vector import TruthObservation as TruthObservation
 from .twin import twin_spec
-from .wrappers import TRUTH
+from .wrappers import TRUTH, usual_estimator
 from .wrappers import EstimateObservation as Single
 
 Observations = npt.NDArray[np.float32]
@@ -53,7 +53,7 @@ class EstimateObservation(
     def __init__(
         self,
         env: VectorEnv[Any, Any, Any],
-        estimator: str = "dakf",
+        estimator: str | None = None,
         outputs: Sequence[str] = ("beta", "gamma"),
         std: bool = True,
         replace: bool = False,
@@ -61,6 +61,9 @@ class EstimateObservation(
         options: Mapping[str, Any] | None = None,
         name: str | None = None,
     ) -> None:
+        self._records = _records_below(env)
+        if estimator is None:
+            estimator = usual_estimator(self._records.told([0])[0].sensors)
         car = vehicle.to_dict() if isinstance(vehicle, Vehicle) else vehicle
         RecordConstructorArgs.__init__(
             self,
@@ -72,7 +75,6 @@ class EstimateObservation(
             options=dict(options or {}),
             name=name,
         )
-        self._records = _records_below(env)
         VectorWrapper.__init__(self, env)
         mode = env.metadata.get("autoreset_mode")
         if mode not in (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP):
@@ -121,7 +123,12 @@ class EstimateObservation(
             raise ResetNeeded(
                 "call reset() first: before the first step, and after one that failed"
             )
-        obs, rewards, terminated, truncated, infos = self.env.step(actions)
+        try:
+            obs, rewards, terminated, truncated, infos = self.env.step(actions)
+        except ValueError:
+            if isinstance(self._records, BatchedRecords):  # it refuses before it steps any row
+                self._ended = before
+            raise
         self._ended = ended = np.logical_or(terminated, truncated)
         if not self._same_step:
             self._restart(before)

@@ -1,6 +1,6 @@
 """EstimateObservation: an estimator's view beside, or instead of, the raw observation."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -18,6 +18,9 @@ from .outputs import BETA, outputs_of
 from .truth import as_built, tell_stiffness
 
 _MAY_STAND_BETWEEN = (PassiveEnvChecker, OrderEnforcing)
+# stable-baselines3's make_vec_env and rl-zoo put it directly around the environment. It only keeps
+# count, and is known by name: this module loads nothing of theirs.
+_MONITOR = ("stable_baselines3.common.monitor", "Monitor")
 TRUTH = "truth"  # in place of a vehicle: the one that is driven
 _OFFERED = ("rows", "ticks_done", "packets", "delivered", "slow_sensors", "nominal", "layout")
 
@@ -28,13 +31,13 @@ class EstimateObservation(
     """Runs an estimator on the car's record and appends what it says to the observation.
 
     It must be the innermost wrapper: the estimator sees every tick of every step. Others of its
-    kind may be stacked, each with its own `name`.
+    kind may be stacked, each with its own `name`; stable-baselines3's `Monitor` may be inside.
 
-    estimator: a name of `make_estimator`. outputs: states to append, each as `<state>_hat`, then,
-    if `std`, each one's standard deviation as `<state>_std`. replace: the observation is these
-    alone. vehicle: what the estimator is told (a preset, a mapping; default the env's nominal;
-    "truth": the true car of each episode, as it is at the reset). options: of `make_estimator`.
-    name: put before every name as `<name>_`.
+    estimator: a name of `make_estimator`; None: `usual_estimator` of the env's sensors. outputs:
+    states to append, each as `<state>_hat`, then, if `std`, each one's standard deviation as
+    `<state>_std`. replace: the observation is these alone. vehicle: what the estimator is told (a
+    preset, a mapping; default the env's nominal; "truth": the true car of each episode, as it is at
+    the reset). options: of `make_estimator`. name: put before every name as `<name>_`.
 
     `info` gains `beta_hat` and `beta_std` where the estimator has beta and, if beta or gamma is
     among the outputs, `nees`: their normalised estimation error squared, divided by their number.
@@ -47,7 +50,7 @@ class EstimateObservation(
     def __init__(
         self,
         env: gym.Env[Any, Any],
-        estimator: str = "dakf",
+        estimator: str | None = None,
         outputs: Sequence[str] = ("beta", "gamma"),
         std: bool = True,
         replace: bool = False,
@@ -55,6 +58,9 @@ class EstimateObservation(
         options: Mapping[str, Any] | None = None,
         name: str | None = None,
     ) -> None:
+        self._base = base_of(env)
+        if estimator is None:
+            estimator = usual_estimator(self._base.slow_sensors)
         car = vehicle.to_dict() if isinstance(vehicle, Vehicle) else vehicle
         RecordConstructorArgs.__init__(
             self,
@@ -67,7 +73,6 @@ class EstimateObservation(
             name=name,
         )
         gym.Wrapper.__init__(self, env)
-        self._base = base_of(env)
         self._kind, self._options = estimator, dict(options or {})
         self._truth = isinstance(vehicle, str) and vehicle == TRUTH
         self._vehicle = None if vehicle is None or self._truth else vehicle_from(vehicle)
@@ -163,14 +168,21 @@ class EstimateObservation(
         return out
 
 
+def usual_estimator(slow_sensors: Iterable[str]) -> str:
+    """The estimator where none is named: `dakf` where there is a GPS, else `exact-kf`."""
+    return "dakf" if "gps" in slow_sensors else "exact-kf"
+
+
 def base_of(env: gym.Env[Any, Any]) -> Any:
     """The base env; TypeError if anything that may hide ticks from the estimator is in between."""
     layer = env
     while isinstance(layer, gym.Wrapper):
-        if not isinstance(layer, (*_MAY_STAND_BETWEEN, EstimateObservation)):
+        kind = type(layer)
+        known = isinstance(layer, (*_MAY_STAND_BETWEEN, EstimateObservation))
+        if not known and (kind.__module__, kind.__name__) != _MONITOR:
             raise TypeError(
                 "EstimateObservation must be the innermost wrapper, directly around the "
-                f"environment; inside it is {type(layer).__name__}"
+                f"environment; inside it is {kind.__name__}"
             )
         layer = layer.env
     missing = [name for name in _OFFERED if not hasattr(layer, name)]

@@ -54,6 +54,7 @@ LISTS: list[dict[str, Any]] = [
     {"friction": [0.9, 0.5, 0.3, 0.7]},
     {"friction": np.array([0.9, 0.5, 0.3, 0.7]), "duration": (0.05, 0.1, 0.15, 0.2)},
     {"state": [{}, {"v_y": 0.2}, {"v_x": 5.0, "gamma": 0.1}, {"y": 1.0}], "scenario": "step-steer"},
+    {"friction": [0.5, None, None, None], "duration": [None, 0.1, 0.5, None]},
     {
         "scenario": ["tie-vision-fig7", "sine", "straight", "step-steer"],
         "friction": 0.6,
@@ -73,7 +74,8 @@ def test_each_row_may_have_options_of_its_own(options: dict[str, Any], mode: str
     alone, together = pair(FUSION, 4, mode)
     obs, infos = together.reset(seed=10, options=options)
     for i, env in enumerate(alone.envs):
-        told = {name: own(value, i) for name, value in options.items()}
+        mine = {name: own(value, i) for name, value in options.items()}
+        told = {name: value for name, value in mine.items() if value is not None}
         alone_obs, info = env.reset(seed=10 + i, options=told)
         assert bits(alone_obs) == bits(obs[i])
         assert info == {key: infos[key][i] for key in info}

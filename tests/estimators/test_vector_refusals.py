@@ -15,6 +15,18 @@ from tests.estimators.fleets import BAD, VISION, fleet
 pytestmark = pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning")
 
 
+def test_a_native_env_refuses_all_rows_and_the_estimators_go_on() -> None:
+    native = gym.make_vec(VISION, num_envs=2), gym.make_vec(VISION, num_envs=2)
+    env, twin = (EstimateObservation(each, "multirate-kf") for each in native)
+    for each in (env, twin):
+        each.reset(seed=0)
+    still = np.zeros((2, 1), np.float32)
+    for bad in (np.array([[0.0], [BAD]], np.float32), still[:1]):
+        with pytest.raises(ValueError, match="nothing was stepped"):
+            env.step(bad)
+        assert env.step(still)[0].tobytes() == twin.step(still)[0].tobytes()
+
+
 def test_a_failed_step_or_none_asks_for_a_reset() -> None:
     """Some rows were stepped, others not: no estimator may go on as if nothing had happened."""
     env: Any = EstimateObservation(

@@ -13,7 +13,7 @@ from gymnasium.utils.env_checker import check_env
 import sideslip  # noqa: F401  registers the environments
 from sideslip.agents.rollout import rollout
 from sideslip.envs import COMS
-from sideslip.estimators import EstimateObservation, make_estimator
+from sideslip.estimators import EstimateObservation, make_estimator, vector
 
 pytestmark = pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning")
 
@@ -108,6 +108,18 @@ def test_it_is_the_innermost_wrapper_or_an_error() -> None:
         EstimateObservation(env, "multirate-kf")
     with pytest.raises(TypeError, match="CartPoleEnv has no rows"):
         EstimateObservation(gym.make("CartPole-v1").unwrapped, "multirate-kf")
+
+
+@pytest.mark.parametrize(
+    ("name", "usual"), [(VISION, "exact-kf"), ("sideslip/YawFusion-v0", "dakf")]
+)
+def test_the_usual_estimator_fits_the_sensors(name: str, usual: str) -> None:
+    """Wherever a wrapper is named without arguments, as rl-zoo's `env_wrapper` does."""
+    env = EstimateObservation(gym.make(name))
+    assert env.layout == EstimateObservation(gym.make(name), usual).layout
+    assert env.spec is not None and env.spec.additional_wrappers[-1].kwargs["estimator"] == usual
+    rows = vector.EstimateObservation(gym.make_vec(name, num_envs=2))
+    assert rows.layout == env.layout
 
 
 def test_several_estimators_stand_side_by_side() -> None:
