@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 from gymnasium.vector import VectorEnv, VectorWrapper
@@ -10,7 +10,12 @@ from gymnasium.vector import VectorEnv, VectorWrapper
 from ..envs.layout import Entry
 from ..envs.vehicle import Vehicle
 
-AnyEnv = gym.Env[Any, Any] | VectorEnv[Any, Any, Any]
+if TYPE_CHECKING:
+    from stable_baselines3.common.vec_env import VecEnv
+
+    AnyEnv = gym.Env[Any, Any] | VectorEnv[Any, Any, Any] | VecEnv
+else:
+    AnyEnv = Any  # stable-baselines3 comes with an extra, and needs a second to load
 
 
 @dataclass(frozen=True)
@@ -32,17 +37,28 @@ class Given:
 
 
 def given(env: AnyEnv) -> Given:
-    """Read it; ValueError where the rows of a vector env were told different cars."""
-    if isinstance(env, VectorEnv):
+    """Read it, from a stable-baselines3 `VecEnv` too.
+
+    Raises ValueError where the rows of a vector env were told different cars, or where a wrapper of
+    stable-baselines3 changes the observations.
+    """
+    nominals: Sequence[Any]
+    vehicles: Sequence[Any]
+    if isinstance(env, gym.Env):
         base: Any = env.unwrapped
+        layout, width = env.get_wrapper_attr("layout"), base.action_space.shape[0]
+        nominals, vehicles = [base.nominal], [base.vehicle]
+        period, kind = base.control_period, base.reference
+    elif isinstance(env, VectorEnv):
+        base = env.unwrapped
         layout, width = _layout(env), base.single_action_space.shape[0]
         nominals, vehicles = _rows(base, "nominal"), _rows(base, "vehicle")
         period, kind = _common(base, "control_period"), _common(base, "reference")
     else:
         base = env.unwrapped
-        layout, width = env.get_wrapper_attr("layout"), base.action_space.shape[0]
-        nominals, vehicles = [base.nominal], [base.vehicle]
-        period, kind = base.control_period, base.reference
+        layout, width = _plain(env, _common(base, "layout")), base.action_space.shape[0]
+        nominals, vehicles = base.get_attr("nominal"), base.get_attr("vehicle")
+        period, kind = _common(base, "control_period"), _common(base, "reference")
     limits = [(car.yaw_moment_limit, car.steering_authority) for car in vehicles]
     for i, told in enumerate(zip(nominals, limits, strict=True)):
         if told != (nominals[0], limits[0]):
@@ -51,6 +67,19 @@ def given(env: AnyEnv) -> Given:
                 "vehicle or has other limits than row 0: make an agent for each kind of car"
             )
     return Given(layout, nominals[0], *limits[0], period, kind, width)
+
+
+def _plain(env: Any, layout: tuple[Entry, ...]) -> tuple[Entry, ...]:
+    """The layout, if the outermost observations of a stable-baselines3 env are what it says."""
+    layer = env
+    while layer is not None:
+        if vars(layer).get("norm_obs") or layer.observation_space.shape != (len(layout),):
+            raise ValueError(
+                f"{type(layer).__name__} changes the observations, which a controller reads by "
+                "name: design and drive it on the env inside"
+            )
+        layer = vars(layer).get("venv")
+    return layout
 
 
 def _layout(env: VectorEnv[Any, Any, Any]) -> tuple[Entry, ...]:

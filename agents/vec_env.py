@@ -1,0 +1,206 @@
+"""The bridge to stable-baselines3: its `VecEnv` over the native vector env, a call for all rows."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NoReturn
+
+import gymnasium as gym
+import numpy as np
+import numpy.typing as npt
+from gymnasium.vector import AutoresetMode, VectorEnv
+
+from ..envs import StabilityVectorEnv
+from ..envs.episode import info_of
+from ..estimators.vector import EstimateObservation
+from .vec_row import Row
+
+try:
+    from stable_baselines3.common.vec_env import VecEnv, VecMonitor
+    from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
+except ModuleNotFoundError as error:
+    raise ModuleNotFoundError(
+        "training needs torch and stable-baselines3: pip install 'sideslip[train]'", name=error.name
+    ) from None
+
+Observations = npt.NDArray[np.float32]
+Indices = int | Iterable[int] | None
+
+
+class _Nothing(dict[str, Any]):
+    """The info of a row where nothing ended: empty, one for all rows, and closed."""
+
+    def _refuse(self, *_: Any, **__: Any) -> NoReturn:
+        raise TypeError(
+            "the info of a row whose episode goes on is one empty dict that all rows share; put "
+            "another dict in its place in the list instead of writing into it"
+        )
+
+    __setitem__ = update = setdefault = __ior__ = _refuse
+
+    def __reduce__(self) -> tuple[Any, ...]:  # a copy is an ordinary dict
+        return dict, ()
+
+
+NOTHING = _Nothing()
+
+
+class NativeVecEnv(VecEnv):
+    """stable-baselines3's `VecEnv` over a `StabilityVectorEnv`, wrapped or bare.
+
+    What stable-baselines3 would get of its `DummyVecEnv` around single environments with the same
+    seeds, bit for bit, but for one thing: where no episode ends, `infos` holds one empty dict that
+    all rows share (`NOTHING`; it refuses to be written into, `infos` itself is a fresh list). Where
+    one ends, its row has the whole info of the last step, `terminal_observation` and
+    `TimeLimit.truncated`. `reset_infos` are those of each row's newest reset.
+
+    vector_env: with autoreset in the same step; `make_vec_env` builds one. `get_attr` reads what
+    `Row` tells of each row; `set_attr` keeps values for `get_attr`; `env_method` calls methods of
+    `Row`. `set_options` takes what `reset` of a single env does, for all rows or a list of them.
+
+    Raises TypeError for another kind of env, ValueError for another autoreset mode.
+    """
+
+    def __init__(self, vector_env: VectorEnv[Any, Any, Any]) -> None:
+        base = vector_env.unwrapped
+        if not isinstance(base, StabilityVectorEnv):
+            raise TypeError(
+                f"{type(base).__name__} is no native vector env of this package; for single "
+                "environments there is stable_baselines3.common.env_util.make_vec_env"
+            )
+        mode = vector_env.metadata.get("autoreset_mode")
+        if mode != AutoresetMode.SAME_STEP:
+            raise ValueError(
+                "stable-baselines3 expects rows to be reset in the step that ends them: build the "
+                f"vector env with autoreset_mode='SameStep', not {mode}"
+            )
+        self.vector_env, self._base = vector_env, base
+        self._rows = [Row(vector_env, i) for i in range(vector_env.num_envs)]
+        self._actions: Any = None
+        super().__init__(
+            vector_env.num_envs,
+            vector_env.single_observation_space,
+            vector_env.single_action_space,
+        )
+
+    @property
+    def spec(self) -> Any:
+        """Of the vector env, wrappers included."""
+        return self.vector_env.spec
+
+    def reset(self) -> Observations:
+        """Start an episode in every row, with the seeds and options that were set for it."""
+        seeds: Any = None if all(seed is None for seed in self._seeds) else list(self._seeds)
+        obs, infos = self.vector_env.reset(seed=seeds, options=_merged(self._options))
+        self._reset_seeds()
+        self._reset_options()
+        self._keep(range(self.num_envs), infos)
+        return np.asarray(obs)
+
+    def step_async(self, actions: npt.NDArray[Any]) -> None:
+        """Take the actions (N, width); `step_wait` steps."""
+        self._actions = actions
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """Hold each row's action for one control period.
+
+        Returns observations (N, k) and rewards (N,) as float32, dones (N,) and N infos.
+        Raises ValueError for actions of another shape or not finite, and steps nothing.
+        """
+        actions, self._actions = self._actions, None
+        obs, rewards, terminated, truncated, infos = self.vector_env.step(actions)
+        dones = terminated | truncated
+        told: list[dict[str, Any]] = [NOTHING] * self.num_envs
+        if "final_obs" in infos:
+            ended = np.flatnonzero(dones).tolist()
+            finals = _rows_of(infos["final_info"], ended)
+            for i, info in zip(ended, finals, strict=True):
+                info["TimeLimit.truncated"] = bool(truncated[i] and not terminated[i])
+                info["terminal_observation"] = infos["final_obs"][i]
+                told[i] = info
+            self._keep(ended, infos)
+        return obs, rewards.astype(np.float32), dones, told
+
+    def _keep(self, rows: Sequence[int], infos: Mapping[str, Any]) -> None:
+        """Remember what the resets of these rows told."""
+        more = {key: each for key, each in infos.items() if "final_" not in key}
+        for i, info in zip(rows, _rows_of(more, rows), strict=True):
+            self.reset_infos[i] = info_of(self._base.reports[i])[0] | info
+
+    def close(self) -> None:
+        """Close the vector env."""
+        self.vector_env.close()
+
+    def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
+        """What `Row` tells of each row; AttributeError for a name that is not among it."""
+        return [row.get_wrapper_attr(attr_name) for row in self._chosen(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
+        """Keep a value beside the rows; AttributeError for a name that is the environment's."""
+        for row in self._chosen(indices):
+            row.set_wrapper_attr(attr_name, value)
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: Indices = None, **method_kwargs: Any
+    ) -> list[Any]:
+        """Call a method of `Row` for each row; AttributeError for another."""
+        chosen = [row.get_wrapper_attr(method_name) for row in self._chosen(indices)]
+        return [method(*method_args, **method_kwargs) for method in chosen]
+
+    def env_is_wrapped(
+        self, wrapper_class: type[gym.Wrapper[Any, Any, Any, Any]], indices: Indices = None
+    ) -> list[bool]:
+        """Whether the rows wear a wrapper: a single one's class stands for its vector twin."""
+        return [row.is_wrapped(wrapper_class) for row in self._chosen(indices)]
+
+    def _chosen(self, indices: Indices) -> list[Row]:
+        return [self._rows[i] for i in self._get_indices(indices)]
+
+
+def make_vec_env(
+    env_id: str,
+    num_envs: int = 1,
+    seed: int | None = None,
+    estimator: str | Mapping[str, Any] | None = None,
+    env_kwargs: Mapping[str, Any] | None = None,
+    monitor_file: str | None = None,
+    info_keywords: Sequence[str] = (),
+) -> VecMonitor:
+    """As stable-baselines3's function of this name, on the native vector env.
+
+    seed: of row 0; row i gets seed + i at the first reset. estimator: a name, or arguments of
+    `EstimateObservation`. env_kwargs: of the environment. monitor_file: a CSV file of episodes,
+    with the `info_keywords` of their last step.
+
+    Raises ValueError for an id without a native vector env, and what `gym.make_vec` and
+    `EstimateObservation` raise.
+    """
+    if gym.spec(env_id).vector_entry_point is None:
+        raise ValueError(
+            f"{env_id} has no vector env of its own; use stable_baselines3's make_vec_env"
+        )
+    told: dict[str, Any] = {"autoreset_mode": "SameStep", "info": "ends", **(env_kwargs or {})}
+    env: VectorEnv[Any, Any, Any] = gym.make_vec(env_id, num_envs=num_envs, **told)
+    if estimator is not None:
+        wish = {"estimator": estimator} if isinstance(estimator, str) else dict(estimator)
+        env = EstimateObservation(env, **wish)
+    bridge = NativeVecEnv(env)
+    bridge.action_space.seed(seed)
+    bridge.seed(seed)
+    return VecMonitor(bridge, monitor_file, tuple(info_keywords))
+
+
+def _rows_of(infos: Mapping[str, Any], rows: Sequence[int]) -> list[dict[str, Any]]:
+    """What a vector env's infos tell of some rows, as the single env's infos."""
+    told: list[dict[str, Any]] = [{} for _ in rows]
+    for key, column in infos.items():
+        if not key.startswith("_"):
+            values, there = column[rows].tolist(), infos[f"_{key}"][rows].tolist()
+            for info, value, known in zip(told, values, there, strict=True):
+                if known:
+                    info[key] = value
+    return told
+
+
+def _merged(options: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
+    """The rows' options as the vector env takes them, None where there are none."""
+    names = dict.fromkeys(name for each in options for name in each)
+    return {name: [each.get(name) for each in options] for name in names} or None

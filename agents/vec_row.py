@@ -1,0 +1,95 @@
+"""One row of a native vector env, as far as it can be asked what a single environment is asked."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from gymnasium.vector import VectorEnv, VectorWrapper
+
+from ..envs.dynamics import Motion
+from ..envs.episode import info_of
+from ..estimators import truth, truth_vector, vector, wrappers
+
+_OWN = (  # a sequence in the vector env, with an item for each row
+    "vehicle", "nominal", "scenario", "record", "held_speed", "slow_sensors", "motion",
+    "estimator", "np_random", "np_random_seed",
+)  # fmt: skip
+_SHARED = (
+    "layout", "control_period", "reference", "dt", "setting", "spec", "render_mode", "metadata",
+)  # fmt: skip
+_SPACES = ("observation_space", "action_space")
+_METHODS = ("reset", "get_wrapper_attr", "has_wrapper_attr", "set_wrapper_attr")
+_TWINS: dict[type, type] = {
+    wrappers.EstimateObservation: vector.EstimateObservation,
+    truth.TruthObservation: truth_vector.TruthObservation,
+}
+
+
+class Row:
+    """Row i of a vector env: what it tells are attributes of the single env of the same name.
+
+    Attributes: those of `_OWN`, `_SHARED` and `_SPACES`, the methods, and what was set here.
+    """
+
+    def __init__(self, env: VectorEnv[Any, Any, Any], i: int) -> None:
+        self._env, self._i = env, i
+        self._set: dict[str, Any] = {}
+
+    def _layers(self) -> Iterator[VectorEnv[Any, Any, Any]]:
+        """From the outermost to the bare vector env."""
+        layer = self._env
+        while isinstance(layer, VectorWrapper):
+            yield layer
+            layer = layer.env
+        yield layer
+
+    def get_wrapper_attr(self, name: str) -> Any:
+        """An attribute of this row, of the outermost layer that has it; or AttributeError."""
+        if name in self._set:
+            return self._set[name]
+        if name in _METHODS:
+            return getattr(self, name)
+        there = f"single_{name}" if name in _SPACES else name
+        if name in (*_OWN, *_SHARED, *_SPACES):
+            for layer in self._layers():
+                if there in vars(layer) or hasattr(type(layer), there):
+                    value = getattr(layer, there)
+                    return self._own(name, value) if name in _OWN else value
+        told = (*_OWN, *_SHARED, *_SPACES, *_METHODS, *self._set)
+        raise AttributeError(f"a row of a vector env tells {', '.join(told)}; not {name!r}")
+
+    def _own(self, name: str, value: Any) -> Any:
+        return Motion(*value[self._i].tolist()) if name == "motion" else value[self._i]
+
+    def has_wrapper_attr(self, name: str) -> bool:
+        """Whether `get_wrapper_attr` would find it."""
+        try:
+            self.get_wrapper_attr(name)
+        except AttributeError:
+            return False
+        return True
+
+    def set_wrapper_attr(self, name: str, value: Any, **_: Any) -> None:
+        """Keep a value under a name that the environment does not have; else AttributeError."""
+        if name not in self._set and self.has_wrapper_attr(name):
+            raise AttributeError(
+                f"{name!r} is the environment's and is not set from outside; options of reset "
+                "(`set_options`) change the scenario, vehicle, friction, state and duration"
+            )
+        self._set[name] = value
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Start a new episode in this row alone; its observation (k,) and info."""
+        mask = np.arange(self._env.num_envs) == self._i
+        seeds: Any = [seed if mine else None for mine in mask]
+        told = {name: [value] * len(mask) for name, value in (options or {}).items()}
+        obs, _ = self._env.reset(seed=seeds, options={**told, "reset_mask": mask})
+        base: Any = self._env.unwrapped
+        return obs[self._i], info_of(base.reports[self._i])[0]
+
+    def is_wrapped(self, wrapper_class: type) -> bool:
+        """Whether one of the layers is of this class, or the twin of this single wrapper."""
+        wanted = _TWINS.get(wrapper_class, wrapper_class)
+        return any(isinstance(layer, wanted) for layer in self._layers())

@@ -1,0 +1,286 @@
+"""The bridge to stable-baselines3: the bits of its DummyVecEnv, the manners its users expect."""
+
+import copy
+import pickle
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from sideslip.agents import make_agent
+from sideslip.envs import SCENARIOS, StabilityVectorEnv
+from sideslip.estimators import EstimateObservation
+from sideslip.estimators.truth import TruthObservation
+
+pytest.importorskip("stable_baselines3")
+from stable_baselines3 import PPO
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import (
+    DummyVecEnv,
+    VecCheckNan,
+    VecFrameStack,
+    VecNormalize,
+)
+
+from sideslip.agents.vec_env import NOTHING, NativeVecEnv, make_vec_env
+
+VISION, FUSION = "sideslip/YawVision-v0", "sideslip/AfsYawFusion-v0"
+SHORT: dict[str, Any] = {"base": "random-steering", "duration": 0.25}
+NARROW: dict[str, Any] = {"base": "straight", "half_width": 0.3, "wind_force": 900.0}
+ESTIMATE: dict[str, Any] = {"estimator": "exact-kf", "outputs": ["beta"]}
+RANDOM: dict[str, Any] = {"phase": None, "loss": 0.2}
+
+
+def native(name: str, count: int, wish: Any = None, **arguments: Any) -> NativeVecEnv:
+    env = make_vec_env(name, count, estimator=wish, env_kwargs=arguments).venv
+    assert isinstance(env, NativeVecEnv)
+    return env
+
+
+def dummy(name: str, count: int, wish: Any = None, **arguments: Any) -> DummyVecEnv:
+    def make() -> gym.Env[Any, Any]:
+        env = gym.make(name, **arguments)
+        return env if wish is None else EstimateObservation(env, **wish)
+
+    return DummyVecEnv([make] * count)
+
+
+def bits(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: bits(each) for key, each in value.items()}
+    array = np.asarray(value)
+    return array.dtype.str, array.shape, array.tobytes()
+
+
+def drawn(env: Any, step: int) -> Any:
+    shape = (env.num_envs, *env.action_space.shape)
+    return np.random.default_rng(step).uniform(-1.2, 1.2, shape).astype(np.float32)
+
+
+@pytest.mark.parametrize("scenario", [SHORT, NARROW], ids=["truncated", "terminated"])
+@pytest.mark.parametrize("wish", [None, ESTIMATE], ids=["raw", "estimator"])
+@pytest.mark.parametrize("name", [VISION, FUSION])
+def test_it_has_the_bits_of_the_single_environments(name: str, wish: Any, scenario: Any) -> None:
+    """Observations, rewards, ends, the infos where episodes end and those of resets."""
+    told = {"scenario": scenario, "camera": RANDOM, "on_bad_action": "fail"}
+    ours, theirs = native(name, 3, wish, **told), dummy(name, 3, wish, **told)
+    assert ours.observation_space == theirs.observation_space
+    assert ours.action_space == theirs.action_space
+    assert ours.seed(40) == theirs.seed(40) == [40, 41, 42]
+    assert bits(ours.reset()) == bits(theirs.reset())
+    causes = set()
+    for step in range(400):
+        actions = drawn(ours, step)
+        actions[step % 3, 0] = np.nan if step % 97 == 0 else 0.9
+        one, other = ours.step(actions), theirs.step(actions)
+        assert [bits(each) for each in one[:3]] == [bits(each) for each in other[:3]]
+        for i, done in enumerate(one[2]):
+            if not done:
+                assert one[3][i] is NOTHING
+                continue
+            assert bits(one[3][i]) == bits(other[3][i])
+            causes.add(one[3][i]["TimeLimit.truncated"])
+            known = {key: theirs.reset_infos[i][key] for key in ours.reset_infos[i]}
+            assert bits(ours.reset_infos[i]) == bits(known)
+    assert causes == ({True, False} if scenario is SHORT else {False})
+    assert bits(ours.reset()) == bits(theirs.reset())  # generators go on
+
+
+def test_it_has_the_bits_of_the_vector_env() -> None:
+    ours = native(FUSION, 4, ESTIMATE, scenario=SHORT)
+    alone = native(FUSION, 4, ESTIMATE, scenario=SHORT).vector_env
+    ours.seed(7)
+    assert bits(ours.reset()) == bits(alone.reset(seed=7)[0])
+    for step in range(60):
+        obs, rewards, dones, _ = ours.step(drawn(ours, step))
+        wanted = alone.step(drawn(ours, step))
+        assert bits(obs) == bits(wanted[0])
+        assert bits(rewards) == bits(wanted[1].astype(np.float32))
+        assert bits(dones) == bits(wanted[2] | wanted[3])
+
+
+def test_seeds_and_options_serve_one_reset_each_row_its_own() -> None:
+    ours, theirs = native(FUSION, 3), dummy(FUSION, 3)
+    options: list[dict[str, Any]] = [{}, {"friction": 0.5, "duration": 0.1}, {"duration": 0.5}]
+    for env in (ours, theirs):
+        env.seed(5)
+        env.set_options(options)
+    for _ in range(2):
+        assert bits(ours.reset()) == bits(theirs.reset())
+        for name in ("vehicle", "scenario", "nominal"):
+            assert ours.get_attr(name) == theirs.get_attr(name)
+    for env in (ours, theirs):
+        env.set_options({"scenario": "slalom"})
+        env.reset()
+    assert ours.get_attr("scenario") == theirs.get_attr("scenario") == [SCENARIOS["slalom"]] * 3
+
+
+def test_a_row_tells_what_a_single_environment_tells() -> None:
+    told: dict[str, Any] = {"camera": RANDOM, "vehicle": "coms", "nominal": "passenger-car"}
+    ours, theirs = native(FUSION, 3, ESTIMATE, **told), dummy(FUSION, 3, ESTIMATE, **told)
+    for env in (ours, theirs):
+        env.seed(5)
+        env.reset()
+        env.step(drawn(env, 0))
+    same = "vehicle nominal scenario held_speed slow_sensors motion np_random_seed layout reference"
+    for name in f"{same} control_period dt render_mode observation_space action_space".split():
+        assert ours.get_attr(name) == theirs.get_attr(name), name
+    for one, other in zip(ours.get_attr("estimator"), theirs.get_attr("estimator"), strict=True):
+        assert bits(one.x) == bits(other.x) and bits(one.P) == bits(other.P)
+    for one, other in zip(ours.get_attr("record"), theirs.get_attr("record"), strict=True):
+        assert bits(one.fast) == bits(other.fast) and bits(one.packets) == bits(other.packets)
+    assert ours.get_attr("vehicle", 1) == [theirs.get_attr("vehicle")[1]]
+    assert ours.get_attr("vehicle", [2, 0]) == theirs.get_attr("vehicle", [2, 0])
+    assert ours.env_method("get_wrapper_attr", "dt", indices=[0, 2]) == [0.001, 0.001]
+    assert ours.env_method("has_wrapper_attr", "speed") == [False] * 3
+    assert ours.has_attr("layout") and not ours.has_attr("envs")
+    with pytest.raises(AttributeError, match=r"a row of a vector env tells vehicle.*not 'speed'"):
+        ours.get_attr("speed")
+
+
+def test_one_row_is_reset_alone() -> None:
+    ours, theirs = native(VISION, 3), dummy(VISION, 3)
+    for env in (ours, theirs):
+        env.seed(5)
+        env.reset()
+        env.step(drawn(env, 0))
+    how: Any = {"seed": 9, "options": {"friction": 0.4}, "indices": 1}
+    (one,), (other,) = ours.env_method("reset", **how), theirs.env_method("reset", **how)
+    assert bits(one[0]) == bits(other[0]) and one[1] == other[1]
+    assert bits(ours.step(drawn(ours, 1))[0]) == bits(theirs.step(drawn(ours, 1))[0])
+
+
+def test_what_is_set_is_told_and_the_environment_is_not_overwritten() -> None:
+    env = native(VISION, 3)
+    env.set_attr("lesson", 2, indices=[0, 2])
+    assert env.get_attr("lesson", [0, 2]) == [2, 2] and not env.has_attr("lesson")
+    env.set_attr("lesson", 3)
+    assert env.get_attr("lesson") == [3, 3, 3]
+    with pytest.raises(AttributeError, match=r"'vehicle' is the environment's.*set_options"):
+        env.set_attr("vehicle", None)
+
+
+def test_wrappers_are_known_by_the_single_ones_class() -> None:
+    plain, wearing = native(VISION, 2), native(VISION, 2, ESTIMATE)
+    assert wearing.env_is_wrapped(EstimateObservation) == [True, True]
+    assert wearing.env_is_wrapped(EstimateObservation, indices=1) == [True]
+    assert wearing.env_is_wrapped(TruthObservation) == [False, False]
+    assert plain.env_is_wrapped(EstimateObservation) == [False, False]
+    assert plain.env_is_wrapped(Monitor) == [False, False]
+
+
+def test_the_empty_info_refuses_to_be_written_into() -> None:
+    info: Any = NOTHING
+    for write in (
+        lambda: info.__setitem__("episode", 1),
+        lambda: info.update(episode=1),
+        lambda: info.setdefault("episode", 1),
+    ):
+        with pytest.raises(TypeError, match="one empty dict that all rows share"):
+            write()
+    for made in (info.copy(), copy.deepcopy(info), pickle.loads(pickle.dumps(info))):
+        made["episode"] = 1
+    assert info == {} and info.get("episode") is None
+
+
+def test_monitor_and_normalisation_work_on_it() -> None:
+    """The same sums and statistics as around the single environments."""
+    ours: Any = make_vec_env(VISION, 3, seed=3, env_kwargs={"scenario": SHORT})
+    theirs: Any = DummyVecEnv([lambda: Monitor(gym.make(VISION, scenario=SHORT))] * 3)
+    theirs.seed(3)
+    one, other = VecNormalize(VecCheckNan(ours, True)), VecNormalize(theirs)
+    assert bits(one.reset()) == bits(other.reset())
+    for step in range(60):
+        ours_, theirs_ = one.step(drawn(one, step)), other.step(drawn(one, step))
+        assert [bits(each) for each in ours_[:3]] == [bits(each) for each in theirs_[:3]]
+        for i in np.flatnonzero(ours_[2]):
+            info, wanted = ours_[3][i], theirs_[3][i]
+            assert bits(info["terminal_observation"]) == bits(wanted["terminal_observation"])
+            assert info["episode"]["l"] == wanted["episode"]["l"] == 25
+            assert info["episode"]["r"] == pytest.approx(wanted["episode"]["r"], abs=1e-6)
+    assert bits(one.obs_rms.mean) == bits(other.obs_rms.mean)
+
+
+def test_the_monitors_file_keeps_words_of_the_last_info(tmp_path: Path) -> None:
+    path, words = tmp_path / "monitor.csv", ("cost", "is_success", "beta_hat")
+    env = make_vec_env(VISION, 2, 0, ESTIMATE, {"scenario": SHORT}, str(path), words)
+    env.reset()
+    for step in range(25):
+        env.step(drawn(env, step))
+    env.close()
+    lines = path.read_text().splitlines()
+    assert lines[1] == "r,l,t,cost,is_success,beta_hat" and len(lines) == 4
+    assert lines[2].split(",")[4] == "True"
+
+
+@pytest.mark.parametrize("agent", ["none", "lqr"])
+def test_a_controller_is_evaluated_like_a_network(agent: str) -> None:
+    """The returns of each row's first episodes are those of the single environments."""
+    wish = {"estimator": "exact-kf", "outputs": ["beta", "gamma", "F_d", "N_d"], "std": False}
+    rewards = []
+    for env in (
+        make_vec_env(VISION, 2, 3, wish, {"scenario": SHORT}),
+        dummy(VISION, 2, wish, scenario=SHORT),
+    ):
+        env.seed(3)
+        model: Any = make_agent(agent, env)
+        told = evaluate_policy(model, env, 6, return_episode_rewards=True, warn=False)
+        assert told[1] == [25] * 6
+        rewards.append(sorted(told[0]))
+    assert rewards[0] == pytest.approx(rewards[1], rel=1e-5)
+
+
+def test_a_controller_is_not_designed_on_changed_observations() -> None:
+    env = make_vec_env(VISION, 2, 0)
+    assert make_agent("none", VecCheckNan(env)).nominal == env.get_attr("nominal")[0]
+    for changed in (VecNormalize(env), VecFrameStack(env, 2)):
+        with pytest.raises(ValueError, match=f"{type(changed).__name__} changes the observations"):
+            make_agent("none", changed)
+    assert make_agent("none", VecNormalize(env, norm_obs=False)).control_period == 10
+
+
+def test_ppo_learns_on_it_and_is_evaluated() -> None:
+    env = make_vec_env(VISION, 8, 0, env_kwargs={"scenario": SHORT})
+    model = PPO("MlpPolicy", env, n_steps=32, batch_size=64, n_epochs=1, seed=0, device="cpu")
+    model.learn(512)
+    assert model.num_timesteps == 512 and len(model.ep_info_buffer or ()) == 16
+    returns, lengths = evaluate_policy(model, env, 8, return_episode_rewards=True)
+    assert lengths == [25] * 8 and np.max(returns) < 0.0
+
+
+@pytest.mark.parametrize("wish", [None, "exact-kf"])
+def test_bad_actions_step_nothing(wish: Any) -> None:
+    env, twin = native(VISION, 3, wish and ESTIMATE), native(VISION, 3, wish and ESTIMATE)
+    for each in (env, twin):
+        each.seed(0)
+        each.reset()
+    before = env.get_attr("motion")
+    bad = np.zeros((3, 1), np.float32)
+    bad[1] = np.nan
+    for actions, said in (
+        (np.zeros((2, 1)), r"shape \(3, 1\), got 2 rows; nothing was stepped"),
+        (np.zeros((3, 2)), r"got in rows 0, 1, 2 \(3 of them\) shape \(2,\); nothing was stepped"),
+        (bad, r"row 1 is not finite.*; nothing was stepped"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            env.step(actions)
+        assert env.get_attr("motion") == before
+    assert bits(env.step(drawn(env, 0))[0]) == bits(twin.step(drawn(env, 0))[0])
+
+
+def test_what_cannot_be_bridged_says_why() -> None:
+    with pytest.raises(ValueError, match="num_envs is at least 1, got 0"):
+        make_vec_env(VISION, 0)
+    with pytest.raises(ValueError, match="has no vector env of its own"):
+        make_vec_env("Pendulum-v1", 2)
+    with pytest.raises(TypeError, match="SyncVectorEnv is no native vector env"):
+        NativeVecEnv(gym.make_vec(VISION, num_envs=2, vectorization_mode="sync"))
+    with pytest.raises(ValueError, match=r"autoreset_mode='SameStep', not .*NEXT_STEP"):
+        NativeVecEnv(StabilityVectorEnv(2))
+    with pytest.raises(gym.error.NameNotFound):
+        make_vec_env("sideslip/Yaw-v0", 2)
+    with pytest.raises(ValueError, match="dakf needs the slow sensor gps"):
+        make_vec_env(VISION, 2, estimator="dakf")
