@@ -6,6 +6,7 @@ from typing import Any, NoReturn
 import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
+from gymnasium.envs.registration import load_env_creator
 from gymnasium.vector import AutoresetMode, VectorEnv
 
 from ..envs import StabilityVectorEnv
@@ -173,19 +174,33 @@ def make_vec_env(
     Raises ValueError for an id without a native vector env, and what `gym.make_vec` and
     `EstimateObservation` raise.
     """
-    if gym.spec(env_id).vector_entry_point is None:
-        raise ValueError(
-            f"{env_id} has no vector env of its own; use stable_baselines3's make_vec_env"
-        )
-    told: dict[str, Any] = {"autoreset_mode": "SameStep", "info": "ends", **(env_kwargs or {})}
-    env: VectorEnv[Any, Any, Any] = gym.make_vec(env_id, num_envs=num_envs, **told)
-    if estimator is not None:
-        wish = {"estimator": estimator} if isinstance(estimator, str) else dict(estimator)
-        env = EstimateObservation(env, **wish)
+    env = make_native_env(env_id, num_envs, estimator, env_kwargs)
     bridge = NativeVecEnv(env)
     bridge.action_space.seed(seed)
     bridge.seed(seed)
     return VecMonitor(bridge, monitor_file, tuple(info_keywords))
+
+
+def make_native_env(
+    env_id: str,
+    num_envs: int,
+    estimator: str | Mapping[str, Any] | None = None,
+    env_kwargs: Mapping[str, Any] | None = None,
+) -> VectorEnv[Any, Any, Any]:
+    """What `make_vec_env` bridges: a vector env, with its estimator around it; the same errors."""
+    entry = gym.spec(env_id).vector_entry_point
+    kind = load_env_creator(entry) if isinstance(entry, str) else entry
+    if not (isinstance(kind, type) and issubclass(kind, StabilityVectorEnv)):
+        raise ValueError(
+            f"{env_id} has no native vector env of this package; for single environments there is "
+            "stable_baselines3.common.env_util.make_vec_env"
+        )
+    told: dict[str, Any] = {"autoreset_mode": "SameStep", "info": "ends", **(env_kwargs or {})}
+    env: VectorEnv[Any, Any, Any] = gym.make_vec(env_id, num_envs=num_envs, **told)
+    if estimator is None:
+        return env
+    wish = {"estimator": estimator} if isinstance(estimator, str) else dict(estimator)
+    return EstimateObservation(env, **wish)
 
 
 def _rows_of(infos: Mapping[str, Any], rows: Sequence[int]) -> list[dict[str, Any]]:

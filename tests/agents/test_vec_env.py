@@ -174,11 +174,12 @@ def test_wrappers_are_known_by_the_single_ones_class() -> None:
 
 def test_the_empty_info_refuses_to_be_written_into() -> None:
     info: Any = NOTHING
-    for write in (
+    writes: tuple[Any, ...] = (
         lambda: info.__setitem__("episode", 1),
         lambda: info.update(episode=1),
         lambda: info.setdefault("episode", 1),
-    ):
+    )
+    for write in writes:
         with pytest.raises(TypeError, match="one empty dict that all rows share"):
             write()
     for made in (info.copy(), copy.deepcopy(info), pickle.loads(pickle.dumps(info))):
@@ -191,7 +192,8 @@ def test_monitor_and_normalisation_work_on_it() -> None:
     ours: Any = make_vec_env(VISION, 3, seed=3, env_kwargs={"scenario": SHORT})
     theirs: Any = DummyVecEnv([lambda: Monitor(gym.make(VISION, scenario=SHORT))] * 3)
     theirs.seed(3)
-    one, other = VecNormalize(VecCheckNan(ours, True)), VecNormalize(theirs)
+    one: Any = VecNormalize(VecCheckNan(ours, True))
+    other: Any = VecNormalize(theirs)
     assert bits(one.reset()) == bits(other.reset())
     for step in range(60):
         ours_, theirs_ = one.step(drawn(one, step)), other.step(drawn(one, step))
@@ -274,7 +276,7 @@ def test_bad_actions_step_nothing(wish: Any) -> None:
 def test_what_cannot_be_bridged_says_why() -> None:
     with pytest.raises(ValueError, match="num_envs is at least 1, got 0"):
         make_vec_env(VISION, 0)
-    with pytest.raises(ValueError, match="has no vector env of its own"):
+    with pytest.raises(ValueError, match="has no native vector env"):
         make_vec_env("Pendulum-v1", 2)
     with pytest.raises(TypeError, match="SyncVectorEnv is no native vector env"):
         NativeVecEnv(gym.make_vec(VISION, num_envs=2, vectorization_mode="sync"))

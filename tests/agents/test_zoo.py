@@ -80,7 +80,7 @@ def wrapper_of(wish: Any) -> Any:
 )
 def test_rl_zoos_env_wrapper_estimates(name: str, wish: Any) -> None:
     """`make_vec_env` puts its Monitor inside, which must change nothing."""
-    env = make_vec_env(name, 2, seed=4, wrapper_class=wrapper_of(wish))
+    env: Any = make_vec_env(name, 2, seed=4, wrapper_class=wrapper_of(wish))
     alone = wrapper_of(wish)(gym.make(name))
     assert env.observation_space == alone.observation_space
     first = env.reset()
@@ -100,7 +100,8 @@ def test_monitor_keeps_words_of_the_info(tmp_path: Path) -> None:
         info_keywords=("cost", "failure", "is_success", "beta_hat", "nees"),
     )
     env.reset(seed=0)
-    over, info = False, {}
+    over = False
+    info: dict[str, Any] = {}
     while not over:
         *_, terminated, truncated, info = env.step(np.zeros(1, np.float32))
         over = terminated or truncated

@@ -115,9 +115,9 @@ def test_it_is_the_innermost_wrapper_or_an_error() -> None:
 )
 def test_the_usual_estimator_fits_the_sensors(name: str, usual: str) -> None:
     """Wherever a wrapper is named without arguments, as rl-zoo's `env_wrapper` does."""
-    env = EstimateObservation(gym.make(name))
+    env: Any = EstimateObservation(gym.make(name))
     assert env.layout == EstimateObservation(gym.make(name), usual).layout
-    assert env.spec is not None and env.spec.additional_wrappers[-1].kwargs["estimator"] == usual
+    assert env.spec.additional_wrappers[-1].kwargs["estimator"] == usual
     rows = vector.EstimateObservation(gym.make_vec(name, num_envs=2))
     assert rows.layout == env.layout
 
