@@ -1,4 +1,4 @@
-"""The command line: list, run, bench, replay, enjoy, tune, calibrate."""
+"""The command line: list, run, bench, replay, train, enjoy, tune, calibrate."""
 
 import sys
 from pathlib import Path
@@ -15,6 +15,7 @@ from .enjoy_command import enjoy_command
 from .giving import give, show_episode
 from .rows import check_writable
 from .suites import SUITES, Wish
+from .train_command import train_command
 from .tune_command import tune_app
 
 app = typer.Typer(
@@ -25,6 +26,7 @@ app = typer.Typer(
 app.add_typer(tune_app, name="tune")
 app.command("calibrate")(calibrate_command)
 app.command("enjoy")(enjoy_command)
+app.command("train")(train_command)
 console = Console()
 
 Quick = Annotated[bool, typer.Option("--quick", help="Few seeds: a first look in seconds.")]

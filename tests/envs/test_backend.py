@@ -55,28 +55,29 @@ def test_stamp_is_that_of_the_sources(copy: Path, monkeypatch: pytest.MonkeyPatc
     assert len(seen) == 6
 
 
-UNIFORM = "from sideslip.envs.noise import uniform; print(uniform(2**31 - 1))"
+SHIFT = """
+from sideslip.envs.tracks import Path, path_offset
+print(path_offset(Path(1.0, 0.0, 1.0, 0.0, 0.0, 1.0), 0.25))
+"""
 
 
 def test_an_edit_in_a_callee_reaches_its_cached_callers(copy: Path, tmp_path: Path) -> None:
-    """Numba alone would answer from the stale kernel: `uniform` itself did not change."""
+    """Numba alone would answer from the stale kernel: `path_offset` itself did not change."""
     cache = tmp_path / "cache"
     variables = {"XDG_CACHE_HOME": str(cache)}
-    exact = (2**31 - 0.5) / 2.0**32
-    assert float(run(UNIFORM, copy, **variables)) == exact
-    kernels = sorted(cache.rglob("noise.uniform*.kernel"))
+    exact = 0.25**2 * (3.0 - 2.0 * 0.25)
+    assert float(run(SHIFT, copy, **variables)) == exact
+    kernels = sorted(cache.rglob("tracks.path_offset*.kernel"))
     assert len(kernels) == 1
-    assert float(run(UNIFORM, copy, **variables)) == exact
-    assert (
-        sorted(cache.rglob("noise.uniform*.kernel")) == kernels
-    )  # the second run compiled nothing
-    source = copy / "envs" / "backend.py"
+    assert float(run(SHIFT, copy, **variables)) == exact
+    again = sorted(cache.rglob("tracks.path_offset*.kernel"))
+    assert again == kernels  # the second run compiled nothing
+    source = copy / "envs" / "elementary.py"
     text = source.read_text()
-    changed = text.replace("return a * 1.0", "return a * 3.0")
+    changed = text.replace("return t * t * (3.0 - 2.0 * t)", "return t * t * (6.0 - 4.0 * t)")
     assert changed != text
     source.write_text(changed)
-    tripled = (3.0 * (2**31 - 1) + 0.5) / 2.0**32
-    assert float(run(UNIFORM, copy, **variables)) == tripled
+    assert float(run(SHIFT, copy, **variables)) == 2.0 * exact
 
 
 @pytest.mark.parametrize("variable", ["XDG_CACHE_HOME", "NUMBA_CACHE_DIR"])

@@ -1,0 +1,260 @@
+"""Training of a policy: rollouts on the batch engine, evaluations on other seeds, a checkpoint.
+
+A training's folder holds `checkpoint.safetensors` (all that `resume` needs), `best.zip` (the model
+of the best evaluation, stable-baselines3's format) and `curve.jsonl` (the evaluations).
+"""
+
+import json
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from gymnasium.vector import VectorEnv
+
+from .. import __version__
+from .algorithms import algorithm_of
+from .checkpoint import load_parameters, read_told, save_checkpoint, write_whole
+from .controller import NoControl
+from .costs import costs_of
+from .scaling import PerSecond, measured
+from .vec_env import make_native_env, make_vec_env
+
+import torch  # isort: skip  # after ours, which say which extra is missing
+from stable_baselines3.common.base_class import BaseAlgorithm  # isort: skip
+from stable_baselines3.common.callbacks import BaseCallback  # isort: skip
+
+CHECKPOINT, BEST, CURVE = "checkpoint.safetensors", "best.zip", "curve.jsonl"
+
+EPISODES = 256  # of an evaluation
+EVERY = 250_000  # steps from one evaluation to the next
+_MEASURED = 64  # environments whose observations make the scaling
+
+# Test seeds are below 2^32, calibration seeds below 2^62 but above 2^30 by a hash; no others are.
+_EVALUATION, _SCALING, _TRAINING = 2**64, 2**65, 2**66
+_ROOM = 2**40  # seeds of a training: it takes those from its steps on when it starts or goes on
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is trained: it stays the same when a training goes on.
+
+    env_id: of a native vector env. algo: a name of `ALGORITHMS`. estimator: of
+    `EstimateObservation`, "" for none. scenario: a name, "" for the id's own. seed: of the weights,
+    the episodes and the exploration. num_envs: side by side.
+
+    Raises ValueError for an unknown algorithm or a negative seed.
+    """
+
+    env_id: str = "sideslip/YawVision-v0"
+    algo: str = "ppo"
+    estimator: str = ""
+    scenario: str = ""
+    seed: int = 0
+    num_envs: int = 256
+
+    def __post_init__(self) -> None:
+        algorithm_of(self.algo)
+        if self.seed < 0:
+            raise ValueError(f"seed is at least 0, got {self.seed}")
+
+    @property
+    def env_options(self) -> dict[str, Any]:
+        """Of `gym.make`."""
+        return {"scenario": self.scenario} if self.scenario else {}
+
+    def vector_env(self, num_envs: int) -> VectorEnv[Any, Any, Any]:
+        """Another vector env of the task, not the one that is trained on."""
+        return make_native_env(self.env_id, num_envs, self.estimator or None, self.env_options)
+
+
+class Evaluation(NamedTuple):
+    """Of the deterministic policy: mean cost, its share of the uncontrolled car's on these seeds.
+
+    cpu_seconds: of the training up to here, evaluations apart.
+    """
+
+    steps: int
+    cpu_seconds: float
+    cost: float
+    of_none: float
+
+
+class Progress(NamedTuple):
+    """Where a training stands: its newest episodes' mean cost with exploration (None: no episode
+    ended yet), and its evaluations."""
+
+    steps: int
+    cost: float | None
+    evaluations: tuple[Evaluation, ...]
+
+
+class Trained(NamedTuple):
+    """The last model, and all evaluations."""
+
+    model: BaseAlgorithm
+    evaluations: tuple[Evaluation, ...]
+
+    @property
+    def best(self) -> Evaluation:
+        """The evaluation whose model is kept."""
+        return min(self.evaluations, key=lambda each: each.cost)
+
+
+def train(
+    task: Task,
+    steps: int,
+    folder: str | Path,
+    resume: bool = False,
+    report: Callable[[Progress], None] | None = None,
+) -> Trained:
+    """Train up to a number of steps (rounded up to whole rollouts), in a folder.
+
+    resume: go on from the folder's checkpoint: weights, optimiser, step size, steps and evaluations
+    are those of the checkpoint, episodes are new. report: called after every rollout.
+
+    Raises ValueError where the folder holds another training, FileNotFoundError where there is
+    none to go on with, and what `make_vec_env` raises.
+    """
+    if steps < 1:
+        raise ValueError(f"steps is at least 1, got {steps}")
+    torch.set_num_threads(1)  # on small matrices threads only wait for each other
+    place = Path(folder)
+    told = _start(task, place, resume)
+    keeper = _Keeper(task, place, told, report)
+    model = keeper.build(told)
+    done = model.num_timesteps
+    if done < steps:
+        model.learn(steps - done, callback=keeper, reset_num_timesteps=done == 0)
+        keeper.evaluate()
+    return Trained(model, tuple(keeper.evaluations))
+
+
+def task_in(folder: str | Path, **given: Any) -> Task:
+    """The task of a folder's checkpoint; ValueError where something given is another.
+
+    Raises FileNotFoundError where there is no checkpoint.
+    """
+    path = Path(folder) / CHECKPOINT
+    if not path.is_file():
+        raise FileNotFoundError(f"{folder} holds no training to go on with: no {CHECKPOINT}")
+    saved = read_told(path)["task"]
+    task = Task(**{each.name: saved[each.name] for each in fields(Task)})
+    for name, value in given.items():
+        if value != getattr(task, name):
+            raise ValueError(
+                f"{path} is of {name} {getattr(task, name)!r}, not {value!r}: train that in "
+                "another folder"
+            )
+    return task
+
+
+def _start(task: Task, folder: Path, resume: bool) -> dict[str, Any] | None:
+    """What the checkpoint tells, None for a new training in a folder that is ready for it."""
+    if resume:
+        task_in(folder, **asdict(task))
+        return read_told(folder / CHECKPOINT)
+    if (folder / CHECKPOINT).exists():
+        raise ValueError(
+            f"{folder} holds a training already: go on with it (resume), or take another folder"
+        )
+    folder.mkdir(parents=True, exist_ok=True)
+    return None
+
+
+class _Keeper(BaseCallback):
+    """Builds the model; evaluates it between rollouts and keeps what is needed to go on."""
+
+    def __init__(
+        self,
+        task: Task,
+        folder: Path,
+        told: Mapping[str, Any] | None,
+        report: Callable[[Progress], None] | None,
+    ) -> None:
+        super().__init__()
+        self.task, self.folder, self.report = task, folder, report
+        self.seeds = [_EVALUATION + i for i in range(EPISODES)]
+        self.tested = task.vector_env(EPISODES)
+        saved = {} if told is None else told
+        self.evaluations = [Evaluation(*each) for each in saved.get("evaluations", [])]
+        self.none: float = saved.get("none") or self._cost(NoControl(self.tested))
+        self.scaling: Any = saved.get("scaling")
+        self.spent = self.evaluations[-1].cpu_seconds if self.evaluations else 0.0
+        self.since = time.process_time()
+
+    def build(self, told: Mapping[str, Any] | None) -> BaseAlgorithm:
+        """The model, new or of the checkpoint, with the environments it is trained on."""
+        task, algorithm = self.task, algorithm_of(self.task.algo)
+        if self.scaling is None:
+            spread, seed = float(np.exp(algorithm.log_std)), _SCALING + task.seed
+            found = measured(task.vector_env(_MEASURED), spread, seed)
+            self.scaling = [each.tolist() for each in found]
+        env = make_vec_env(
+            task.env_id,
+            task.num_envs,
+            estimator=task.estimator or None,
+            env_kwargs=task.env_options,
+        )
+        period = env.get_attr("control_period")[0] * env.get_attr("dt")[0]
+        steps = 0 if told is None else int(told["steps"])
+        seed = (task.seed + steps) % 2**32
+        model = algorithm.make(PerSecond(env, period), period, self.scaling, seed)
+        if told is not None:
+            load_parameters(self.folder / CHECKPOINT, model)
+        model.num_timesteps = steps
+        env.seed(_TRAINING + task.seed * _ROOM + steps)
+        self.init_callback(model)
+        return model
+
+    def _cost(self, agent: Any) -> float:
+        """Mean over the evaluation's drives."""
+        return float(costs_of(self.tested, agent, self.seeds).mean())
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_start(self) -> None:
+        last = self.evaluations[-1].steps if self.evaluations else -EVERY
+        if self.model.num_timesteps - last >= EVERY:
+            self.evaluate()
+
+    def _on_rollout_end(self) -> None:
+        if self.report is not None:
+            ended = self.model.ep_info_buffer
+            cost = -float(np.mean([each["r"] for each in ended])) if ended else None
+            progress = Progress(self.model.num_timesteps, cost, tuple(self.evaluations))
+            self.report(progress)
+
+    def evaluate(self) -> None:
+        """Cost of the policy as it is; the best one so far and the checkpoint are written."""
+        self.spent += time.process_time() - self.since
+        cost = self._cost(self.model)
+        now = Evaluation(self.model.num_timesteps, round(self.spent, 3), cost, cost / self.none)
+        if all(cost < each.cost for each in self.evaluations):
+            self._keep_best()
+        self.evaluations.append(now)
+        told = {
+            "sideslip": __version__,
+            "task": asdict(self.task),
+            "steps": self.model.num_timesteps,
+            "none": self.none,
+            "scaling": self.scaling,
+            "evaluations": self.evaluations,
+        }
+        save_checkpoint(self.folder / CHECKPOINT, self.model, told)
+        lines = "".join(json.dumps(each._asdict()) + "\n" for each in self.evaluations)
+        write_whole(self.folder / CURVE, lines.encode())
+        self.since = time.process_time()
+
+    def _keep_best(self) -> None:
+        part = self.folder / f".part-{BEST}"
+        self.model.save(part)
+        part.replace(self.folder / BEST)
+
+
+def with_defaults(**given: Any) -> Task:
+    """A task of what is given, None standing for the default."""
+    return replace(Task(), **{name: value for name, value in given.items() if value is not None})

@@ -1,0 +1,95 @@
+"""`sideslip train`: a policy learns, with a progress bar; a stopped training goes on."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+if TYPE_CHECKING:
+    from ..agents.train import Progress as Now
+    from ..agents.train import Task, Trained
+
+STEPS = 2_000_000
+_Text = str | None
+
+
+def train_command(
+    algo: Annotated[_Text, typer.Option(help="An algorithm's name (ppo).")] = None,
+    env: Annotated[_Text, typer.Option(help="An environment's id (sideslip/YawVision-v0).")] = None,
+    estimator: Annotated[_Text, typer.Option(help="An estimator's name (none).")] = None,
+    scenario: Annotated[_Text, typer.Option(help="A scenario's name (the id's own).")] = None,
+    steps: Annotated[int, typer.Option(help="Control periods, all in all.")] = STEPS,
+    seed: Annotated[int | None, typer.Option(help="Of weights and episodes (0).")] = None,
+    num_envs: Annotated[int | None, typer.Option(help="Side by side (256).")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder; default: train-ENV-ALGO[-ESTIMATOR]-SEED here.")
+    ] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with the training in the folder.")
+    ] = False,
+) -> None:
+    """Train a policy; the best one of the evaluations is kept, the last one can be gone on with.
+
+    With --resume whatever is not given is that of the training in the folder.
+    """
+    from ..agents.train import BEST, CURVE, task_in, train, with_defaults
+
+    wish: dict[str, Any] = {
+        "env_id": env,
+        "algo": algo,
+        "estimator": estimator,
+        "scenario": scenario,
+        "seed": seed,
+        "num_envs": num_envs,
+    }
+    given = {name: value for name, value in wish.items() if value is not None}
+    task = with_defaults(**given)
+    folder = out or Path(_name_of(task))
+    if resume:
+        task = task_in(folder, **given)
+    console = Console()
+    with _Bar(console, steps) as bar:
+        trained = train(task, steps, folder, resume, bar.show)
+    console.print(_table(trained))
+    console.print(f"best: {folder / BEST}", highlight=False, soft_wrap=True)
+    console.print(f"curve: {folder / CURVE}", highlight=False, soft_wrap=True)
+
+
+def _name_of(task: "Task") -> str:
+    """Of the folder where none is given."""
+    words = [task.env_id.rpartition("/")[2], task.algo, task.estimator, task.scenario]
+    return "-".join(["train", *filter(None, words), str(task.seed)])
+
+
+class _Bar(Progress):
+    """Steps, the cost of the newest episodes, and the newest and the best evaluation."""
+
+    def __init__(self, console: Console, steps: int) -> None:
+        columns = (
+            TextColumn("{task.completed:,.0f} steps"),
+            BarColumn(20),
+            TextColumn("{task.description}"),
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+        )
+        super().__init__(*columns, console=console)
+        self._task = self.add_task("", total=steps)
+
+    def show(self, now: "Now") -> None:
+        """Say where the training stands."""
+        said = "" if now.cost is None else f"cost {now.cost:.3g} exploring, "
+        last, best = now.evaluations[-1], min(now.evaluations, key=lambda each: each.cost)
+        said += f"of none's {last.of_none:.3f}, best {best.of_none:.3f}"
+        self.update(self._task, completed=now.steps, description=said)
+
+
+def _table(trained: "Trained") -> Table:
+    table = Table("steps", "CPU-s", "cost", "of none's")
+    for each in trained.evaluations:
+        mark = " best" if each is trained.best else ""
+        numbers = f"{each.steps:,}", f"{each.cpu_seconds:.1f}", f"{each.cost:.4g}"
+        table.add_row(*numbers, f"{each.of_none:.3f}{mark}")
+    return table

@@ -1,0 +1,240 @@
+"""Training: what is kept is what was evaluated, a stopped training goes on, files stay whole."""
+
+import dataclasses
+import json
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sideslip.agents.costs import costs_of
+from sideslip.envs.vector import StabilityVectorEnv
+
+pytest.importorskip("stable_baselines3")
+import torch
+from safetensors.torch import save
+from stable_baselines3 import PPO
+
+from sideslip.agents import train
+from sideslip.agents.algorithms import ALGORITHMS
+from sideslip.agents.scaling import CLIP, Standardised, measured
+from sideslip.agents.train import BEST, CHECKPOINT, CURVE, Progress, Task, task_in
+
+TINY = Task(num_envs=8, scenario="sine-with-dwell", seed=3)
+ROLLOUT = 256  # steps of 8 environments
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.setattr(train, "EPISODES", 4)
+    monkeypatch.setattr(train, "EVERY", ROLLOUT)
+    monkeypatch.setattr(train, "_MEASURED", 8)
+    threads = torch.get_num_threads()
+    yield
+    torch.set_num_threads(threads)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Of a training of three rollouts."""
+    path = tmp_path_factory.mktemp("trained")
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in {"EPISODES": 4, "EVERY": ROLLOUT, "_MEASURED": 8}.items():
+            patch.setattr(train, name, value)
+        train.train(TINY, 3 * ROLLOUT, path)
+    yield path
+
+
+def curve(folder: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in (folder / CURVE).read_text().splitlines()]
+
+
+def parameters(model: Any) -> dict[str, Any]:
+    """Every tensor of a model and of its optimisers, by name."""
+    found: dict[str, Any] = dict(model.policy.state_dict())
+    for i, each in model.policy.optimizer.state_dict()["state"].items():
+        found |= {f"{i} {key}": value for key, value in each.items()}
+    return found
+
+
+def test_the_best_evaluation_is_kept(folder: Path) -> None:
+    lines = curve(folder)
+    assert [line["steps"] for line in lines] == [0, ROLLOUT, 2 * ROLLOUT, 3 * ROLLOUT]
+    assert np.all(np.diff([line["cpu_seconds"] for line in lines]) > 0.0)
+    model = PPO.load(folder / BEST, device="cpu")
+    env = TINY.vector_env(4)
+    seeds = [train._EVALUATION + i for i in range(4)]
+    best = min(line["cost"] for line in lines)
+    assert costs_of(env, model, seeds).mean() == pytest.approx(best, rel=1e-6)
+    still: Any = type("Still", (), {"predict": lambda *_, **__: (np.zeros((4, 1)), None)})()
+    none = costs_of(env, still, seeds).mean()
+    assert lines[0]["of_none"] == pytest.approx(lines[0]["cost"] / none, rel=1e-12)
+    assert sorted(os.listdir(folder)) == sorted([BEST, CHECKPOINT, CURVE])
+
+
+def test_training_goes_on_where_the_checkpoint_is(folder: Path, tmp_path: Path) -> None:
+    """Weights, the optimiser's moments, the step size, the count, the evaluations."""
+    first = train.train(TINY, 2 * ROLLOUT, tmp_path)
+    again = train.train(TINY, 2 * ROLLOUT, tmp_path, resume=True)  # there is nothing to do
+    assert again.evaluations == first.evaluations
+    one, other = parameters(first.model), parameters(again.model)
+    assert one.keys() == other.keys() and len(one) > 30
+    assert all(torch.equal(one[name], other[name]) for name in one)
+    more = train.train(TINY, 5 * ROLLOUT, tmp_path, resume=True)
+    assert more.model.num_timesteps == 5 * ROLLOUT
+    assert more.evaluations[:3] == first.evaluations
+    assert [each.steps // ROLLOUT for each in more.evaluations] == [0, 1, 2, 3, 4, 5]
+    rate = more.model.policy.optimizer.param_groups[0]["lr"]
+    assert rate == pytest.approx(0.0, abs=1e-12)
+    moved = parameters(more.model)
+    assert not torch.equal(moved["action_net.weight"], one["action_net.weight"])
+    assert torch.equal(
+        moved["features_extractor.scale"], one["features_extractor.scale"]
+    )  # measured once
+
+
+def test_the_same_seed_trains_the_same(folder: Path, tmp_path: Path) -> None:
+    here = train.train(TINY, 3 * ROLLOUT, tmp_path)
+    assert [each.cost for each in here.evaluations] == [line["cost"] for line in curve(folder)]
+
+
+def test_no_seed_serves_two_purposes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Test and calibration seeds are below 2^63; a training that goes on has new episodes."""
+    told: list[int] = []
+    reset = StabilityVectorEnv.reset
+
+    def watched(self: Any, *, seed: Any = None, options: Any = None) -> Any:
+        if seed is not None:
+            seeds = [seed + i for i in range(self.num_envs)] if isinstance(seed, int) else seed
+            told.extend(set(seeds))
+        return reset(self, seed=seed, options=options)
+
+    monkeypatch.setattr(StabilityVectorEnv, "reset", watched)
+    monkeypatch.setattr(train, "EVERY", 10 * ROLLOUT)
+    train.train(TINY, ROLLOUT, tmp_path)
+    train.train(TINY, 2 * ROLLOUT, tmp_path, resume=True)
+    tested = {train._EVALUATION + i for i in range(4)}
+    others = [seed for seed in told if seed not in tested]
+    assert len(others) == len(set(others)) == 8 + 8 + 8  # scaling, training, going on
+    assert min(told) >= 2**63
+
+
+def test_progress_is_told_after_every_rollout(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(train, "EVERY", 10**6)
+    told: list[Progress] = []
+    task = Task(num_envs=40, scenario="sine-with-dwell")
+    train.train(task, 20 * 40 * 32, tmp_path, report=told.append)
+    assert [each.steps for each in told] == [40 * 32 * i for i in range(1, 21)]
+    assert told[0].cost is None and told[0].evaluations[0].steps == 0
+    assert told[-1].cost is not None and told[-1].cost > 0.0  # 640 steps: episodes have 600
+
+
+def test_a_kill_in_the_middle_of_saving_leaves_the_older_checkpoint(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    train.train(TINY, ROLLOUT, tmp_path)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+
+    def killed(_: int) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", killed)
+        with pytest.raises(KeyboardInterrupt):
+            train.train(TINY, 2 * ROLLOUT, tmp_path, resume=True)
+    after = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    assert after.keys() == before.keys()
+    assert after[CHECKPOINT] == before[CHECKPOINT] and after[CURVE] == before[CURVE]
+    assert train.train(TINY, 2 * ROLLOUT, tmp_path, resume=True).model.num_timesteps == 2 * ROLLOUT
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("env_id", "sideslip/YawFusion-v0"),
+        ("estimator", "exact-kf"),
+        ("scenario", ""),
+        ("seed", 4),
+        ("num_envs", 16),
+    ],
+)
+def test_a_checkpoint_of_another_training_is_refused(folder: Path, name: str, value: Any) -> None:
+    with pytest.raises(ValueError, match=f"is of {name} .*, not {value!r}: train that in another"):
+        task_in(folder, **{name: value})
+    assert task_in(folder) == TINY
+    with pytest.raises(ValueError, match="train that in another folder"):
+        train.train(dataclasses.replace(TINY, **{name: value}), 10, folder, resume=True)
+
+
+def test_a_folder_that_holds_a_training_is_not_overwritten(folder: Path, tmp_path: Path) -> None:
+    before = (folder / CHECKPOINT).read_bytes()
+    with pytest.raises(ValueError, match="holds a training already: go on with it"):
+        train.train(TINY, 10, folder)
+    assert (folder / CHECKPOINT).read_bytes() == before
+    with pytest.raises(FileNotFoundError, match="holds no training to go on with"):
+        train.train(TINY, 10, tmp_path, resume=True)
+
+
+def test_a_file_that_is_no_checkpoint_says_so(folder: Path, tmp_path: Path) -> None:
+    whole = (folder / CHECKPOINT).read_bytes()
+    for content in (b"", b"no", whole[:-100]):
+        (tmp_path / CHECKPOINT).write_bytes(content)
+        with pytest.raises(ValueError, match="is no checkpoint, or is cut short"):
+            task_in(tmp_path)
+    (tmp_path / CHECKPOINT).write_bytes(save({"a": torch.zeros(1)}))
+    with pytest.raises(ValueError, match="is no checkpoint of this format"):
+        task_in(tmp_path)
+
+
+def test_what_cannot_be_trained_says_why_and_leaves_no_checkpoint(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="unknown algorithm 'dqn'; known: ppo"):
+        Task(algo="dqn")
+    with pytest.raises(ValueError, match="seed is at least 0, got -1"):
+        Task(seed=-1)
+    with pytest.raises(ValueError, match="steps is at least 1, got 0"):
+        train.train(TINY, 0, tmp_path)
+    for task, said in (
+        (Task(estimator="dakf"), "dakf needs the slow sensor gps"),
+        (Task(estimator="kf"), "kf"),
+        (Task(scenario="moon"), "unknown scenario 'moon'"),
+        (Task("CartPole-v1"), "has no native vector env"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            train.train(task, 10, tmp_path)
+    assert not (tmp_path / CHECKPOINT).exists()
+
+
+def test_observations_are_standardised_by_the_network() -> None:
+    env = TINY.vector_env(16)
+    mean, scale = measured(env, 0.4, 5)
+    names = [entry.name for entry in env.unwrapped.layout]  # type: ignore[attr-defined]
+    assert scale[names.index("gamma_ref")] == 0.0  # zero-slip: it never varies
+    layer = Standardised(env.single_observation_space, mean.tolist(), scale.tolist())
+    obs = 30.0 * np.random.default_rng(0).standard_normal((50, len(mean)))
+    wanted = np.clip((obs - mean) * scale, -CLIP, CLIP)
+    given = layer(torch.tensor(obs, dtype=torch.float32)).numpy()
+    assert given == pytest.approx(wanted, abs=1e-3)
+    assert np.abs(wanted).max() == CLIP and not list(layer.parameters())
+
+
+@pytest.mark.parametrize("num_envs", [1, 7, 100, 256, 1000])
+def test_batches_divide_a_rollout(num_envs: int) -> None:
+    algorithm = ALGORITHMS["ppo"]
+    told = algorithm.options(0.01, num_envs)
+    assert num_envs * told["n_steps"] % told["batch_size"] == 0
+    assert told["batch_size"] <= algorithm.batch and told["gamma"] == pytest.approx(0.951, abs=1e-3)
+
+
+@pytest.mark.long
+def test_ppo_passes_a_quarter_of_none_within_a_minute(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(train, "EPISODES", 256)
+    monkeypatch.setattr(train, "EVERY", 250_000)
+    found = train.train(Task(), 250_000, tmp_path).best
+    assert found.of_none < 0.25

@@ -1,0 +1,94 @@
+"""`sideslip train`: what it leaves, how it goes on, and each way to type it wrong."""
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from sideslip.benchmarks import cli
+
+pytest.importorskip("stable_baselines3")
+from sideslip.agents import train
+from sideslip.benchmarks import train_command
+
+Run = Callable[..., tuple[int, str, str]]
+TINY = ("--num-envs", 8, "--scenario", "sine-with-dwell")
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], tmp_path: Path) -> Run:
+    """Call `sideslip train` in an empty folder; gives (exit status, stdout, stderr)."""
+    for name, value in {"EPISODES": 4, "EVERY": 256, "_MEASURED": 8}.items():
+        monkeypatch.setattr(train, name, value)
+    monkeypatch.chdir(tmp_path)
+
+    def call(*arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setattr("sys.argv", ["sideslip", "train", *map(str, arguments)])
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+            raise SystemExit(0)
+        out, err = capfd.readouterr()
+        return int(ended.value.code or 0), out, err
+
+    return call
+
+
+def test_it_trains_and_goes_on(run: Run, tmp_path: Path) -> None:
+    status, out, err = run(*TINY, "--steps", 256)
+    folder = "train-YawVision-v0-ppo-sine-with-dwell-0"
+    assert status == 0, err
+    assert "best" in out and f"{folder}/{train.BEST}" in out and "of none's" in out
+    status, out, err = run("--resume", "--out", folder, "--steps", 512)
+    assert status == 0, err
+    assert len((tmp_path / folder / train.CURVE).read_text().splitlines()) == 3
+    status, _, err = run(*TINY, "--steps", 256)
+    assert status == 2 and "holds a training already" in err
+    status, _, err = run("--resume", "--out", folder, "--seed", 4)
+    assert status == 2 and "is of seed 0, not 4" in err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("--algo", "dqn"), "unknown algorithm 'dqn'; known: ppo"),
+        (("--env", "sideslip/Yaw-v0"), "Yaw"),
+        (("--env", "Pendulum-v1"), "Pendulum-v1 has no native vector env"),
+        (("--estimator", "dakf"), "dakf needs the slow sensor gps"),
+        (("--scenario", "moon"), "unknown scenario 'moon'"),
+        (("--resume",), "holds no training to go on with"),
+        (("--steps", "0"), "steps is at least 1, got 0"),
+        (("--num-envs", "0"), "num_envs is at least 1, got 0"),
+        (("--seed", "-1"), "seed is at least 0, got -1"),
+    ],
+)
+def test_a_mistake_is_one_line_that_names_it(
+    run: Run, tmp_path: Path, arguments: tuple[str, ...], said: str
+) -> None:
+    status, out, err = run(*arguments)
+    assert status == 2
+    assert said in " ".join(err.split()) and "Traceback" not in out + err
+    assert not list(tmp_path.glob("**/*.safetensors"))
+
+
+@pytest.mark.parametrize("missing", ["torch", "stable_baselines3"])
+def test_without_the_extra_the_command_names_it(
+    run: Run, missing: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in list(sys.modules):
+        if name.split(".")[0] in ("torch", "stable_baselines3") or name in (
+            "sideslip.agents.train",
+            "sideslip.agents.algorithms",
+            "sideslip.agents.scaling",
+            "sideslip.agents.checkpoint",
+            "sideslip.agents.vec_env",
+        ):
+            monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, missing, None)
+    status, _, err = run()
+    assert status == 2 and "pip install 'sideslip[train]'" in err
+
+
+def test_the_folder_is_named_by_what_is_trained() -> None:
+    task = train.Task("sideslip/YawGps-v0", "ppo", "dakf", "gust", 7)
+    assert train_command._name_of(task) == "train-YawGps-v0-ppo-dakf-gust-7"
