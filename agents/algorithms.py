@@ -40,12 +40,22 @@ class Algorithm:
     log_std: float = -1.0
 
     def options(self, seconds: float, num_envs: int) -> dict[str, Any]:
-        """What the class is told of a control period and a number of environments; JSON types."""
+        """What else the class is told, from a control period and a number of environments."""
         rollout = num_envs * self.settings["n_steps"]
         return {
             **self.settings,
             "gamma": math.exp(-seconds / HORIZON),
             "batch_size": max(n for n in range(1, self.batch + 1) if rollout % n == 0),
+        }
+
+    def described(self, seconds: float, num_envs: int) -> dict[str, Any]:
+        """All settings, in JSON types, for a card."""
+        return {
+            **self.options(seconds, num_envs),
+            "num_envs": num_envs,
+            "learning_rate": f"{self.learning_rate} to 0",
+            "hidden": list(self.hidden),
+            "log_std_init": self.log_std,
         }
 
     def make(

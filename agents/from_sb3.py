@@ -12,15 +12,17 @@ _PRIOR = 1e-4  # samples that a VecNormalize starts with, of mean 0 and variance
 def network_from_sb3(model: Any, normaliser: Any = None) -> Network:
     """What `model.predict(..., deterministic=True)` computes of a `normaliser`'s observations.
 
-    model: PPO, A2C, SAC or TD3 with dense layers and an action within [-1, 1]. normaliser: the
-    VecNormalize of the training, or None. An entry that never varied in training told the network
-    nothing and is not read: scale 0.
+    model: PPO, A2C, SAC or TD3 with dense layers and an action within [-1, 1], with `Standardised`
+    before them or nothing. normaliser: the VecNormalize of the training, or None. An entry that
+    never varied in training told the network nothing and is not read: scale 0.
 
     Raises ValueError for a model that is none of these, or an observation of another width,
     ModuleNotFoundError without torch.
     """
     try:
         from stable_baselines3.common.torch_layers import FlattenExtractor
+
+        from .scaling import Standardised
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError(
             "networks come from stable-baselines3: pip install 'sideslip[train]'", name=error.name
@@ -30,13 +32,17 @@ def network_from_sb3(model: Any, normaliser: Any = None) -> Network:
     if not (np.all(bounds[0] == -1.0) and np.all(bounds[1] == 1.0)):
         raise ValueError(f"an action lies within [-1, 1], got {space}")
     layers, squashed, extractor = _actor(model.policy)
-    if not isinstance(extractor, FlattenExtractor):
+    if type(extractor) not in (FlattenExtractor, Standardised):
         raise ValueError(f"the observation goes through {type(extractor).__name__}, not as it is")
     weights, biases, activations, output = _dense(layers)
     if len(set(activations)) > 1:
         raise ValueError(f"one activation in all layers, got {', '.join(activations)}")
     wide = weights[0].shape[1]
     mean, scale, clip = _normalisation(normaliser, wide)
+    if isinstance(extractor, Standardised):
+        if clip is not None:
+            raise ValueError("the observation is normalised twice: outside and by the network")
+        mean, scale, clip = extractor.numbers
     return Network(
         mean,
         scale,

@@ -40,6 +40,12 @@ class Standardised(FlattenExtractor):
         self.register_buffer("mean", torch.tensor(mean, dtype=torch.float32))
         self.register_buffer("scale", torch.tensor(scale, dtype=torch.float32))
 
+    @property
+    def numbers(self) -> tuple[Array, Array, float]:
+        """(mean, scale, clip) as they are used."""
+        mean, scale = (each.cpu().numpy().astype(np.float64) for each in (self.mean, self.scale))
+        return mean, scale, CLIP
+
     def forward(self, observations: torch.Tensor) -> torch.Tensor:
         """(N, k) of observations (N, k)."""
         return torch.clamp((observations - self.mean) * self.scale, -CLIP, CLIP)

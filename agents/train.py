@@ -1,13 +1,14 @@
 """Training of a policy: rollouts on the batch engine, evaluations on other seeds, a checkpoint.
 
-A training's folder holds `checkpoint.safetensors` (all that `resume` needs), `best.zip` (the model
-of the best evaluation, stable-baselines3's format) and `curve.jsonl` (the evaluations).
+A training's folder holds `checkpoint.safetensors` (all that `resume` needs), `policy.safetensors`
+(the network of the best evaluation, with its card), `best.zip` (the same model in
+stable-baselines3's format) and `curve.jsonl` (the evaluations).
 """
 
 import json
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,6 +20,9 @@ from .algorithms import algorithm_of
 from .checkpoint import load_parameters, read_told, save_checkpoint, write_whole
 from .controller import NoControl
 from .costs import costs_of
+from .from_sb3 import network_from_sb3
+from .policy_card import Card
+from .policy_file import save_policy
 from .scaling import PerSecond, measured
 from .vec_env import make_native_env, make_vec_env
 
@@ -26,7 +30,8 @@ import torch  # isort: skip  # after ours, which say which extra is missing
 from stable_baselines3.common.base_class import BaseAlgorithm  # isort: skip
 from stable_baselines3.common.callbacks import BaseCallback  # isort: skip
 
-CHECKPOINT, BEST, CURVE = "checkpoint.safetensors", "best.zip", "curve.jsonl"
+CHECKPOINT, CURVE = "checkpoint.safetensors", "curve.jsonl"
+POLICY, BEST = "policy.safetensors", "best.zip"
 
 EPISODES = 256  # of an evaluation
 EVERY = 250_000  # steps from one evaluation to the next
@@ -42,8 +47,8 @@ class Task:
     """What is trained: it stays the same when a training goes on.
 
     env_id: of a native vector env. algo: a name of `ALGORITHMS`. estimator: of
-    `EstimateObservation`, "" for none. scenario: a name, "" for the id's own. seed: of the weights,
-    the episodes and the exploration. num_envs: side by side.
+    `EstimateObservation`, "" for none. env_options: of `gym.make`, JSON types. seed: of the
+    weights, the episodes and the exploration. num_envs: side by side.
 
     Raises ValueError for an unknown algorithm or a negative seed.
     """
@@ -51,7 +56,7 @@ class Task:
     env_id: str = "sideslip/YawVision-v0"
     algo: str = "ppo"
     estimator: str = ""
-    scenario: str = ""
+    env_options: dict[str, Any] = field(default_factory=dict)
     seed: int = 0
     num_envs: int = 256
 
@@ -59,11 +64,6 @@ class Task:
         algorithm_of(self.algo)
         if self.seed < 0:
             raise ValueError(f"seed is at least 0, got {self.seed}")
-
-    @property
-    def env_options(self) -> dict[str, Any]:
-        """Of `gym.make`."""
-        return {"scenario": self.scenario} if self.scenario else {}
 
     def vector_env(self, num_envs: int) -> VectorEnv[Any, Any, Any]:
         """Another vector env of the task, not the one that is trained on."""
@@ -109,11 +109,13 @@ def train(
     folder: str | Path,
     resume: bool = False,
     report: Callable[[Progress], None] | None = None,
+    command: str = "",
 ) -> Trained:
     """Train up to a number of steps (rounded up to whole rollouts), in a folder.
 
     resume: go on from the folder's checkpoint: weights, optimiser, step size, steps and evaluations
-    are those of the checkpoint, episodes are new. report: called after every rollout.
+    are those of the checkpoint, episodes are new. report: called after every rollout. command: for
+    the policy's card.
 
     Raises ValueError where the folder holds another training, FileNotFoundError where there is
     none to go on with, and what `make_vec_env` raises.
@@ -123,7 +125,7 @@ def train(
     torch.set_num_threads(1)  # on small matrices threads only wait for each other
     place = Path(folder)
     told = _start(task, place, resume)
-    keeper = _Keeper(task, place, told, report)
+    keeper = _Keeper(task, place, told, report, command)
     model = keeper.build(told)
     done = model.num_timesteps
     if done < steps:
@@ -173,11 +175,14 @@ class _Keeper(BaseCallback):
         folder: Path,
         told: Mapping[str, Any] | None,
         report: Callable[[Progress], None] | None,
+        command: str,
     ) -> None:
         super().__init__()
-        self.task, self.folder, self.report = task, folder, report
+        self.task, self.folder, self.report, self.command = task, folder, report, command
         self.seeds = [_EVALUATION + i for i in range(EPISODES)]
         self.tested = task.vector_env(EPISODES)
+        base: Any = self.tested.unwrapped
+        self.period: float = base.control_period * base.dt  # s
         saved = {} if told is None else told
         self.evaluations = [Evaluation(*each) for each in saved.get("evaluations", [])]
         self.none: float = saved.get("none") or self._cost(NoControl(self.tested))
@@ -198,7 +203,7 @@ class _Keeper(BaseCallback):
             estimator=task.estimator or None,
             env_kwargs=task.env_options,
         )
-        period = env.get_attr("control_period")[0] * env.get_attr("dt")[0]
+        period = self.period
         steps = 0 if told is None else int(told["steps"])
         seed = (task.seed + steps) % 2**32
         model = algorithm.make(PerSecond(env, period), period, self.scaling, seed)
@@ -234,7 +239,7 @@ class _Keeper(BaseCallback):
         cost = self._cost(self.model)
         now = Evaluation(self.model.num_timesteps, round(self.spent, 3), cost, cost / self.none)
         if all(cost < each.cost for each in self.evaluations):
-            self._keep_best()
+            self._keep_best(now)
         self.evaluations.append(now)
         told = {
             "sideslip": __version__,
@@ -249,7 +254,20 @@ class _Keeper(BaseCallback):
         write_whole(self.folder / CURVE, lines.encode())
         self.since = time.process_time()
 
-    def _keep_best(self) -> None:
+    def _keep_best(self, now: Evaluation) -> None:
+        task = self.task
+        card = Card.of(
+            task.env_id,
+            task.env_options,
+            task.estimator,
+            algorithm=task.algo,
+            algorithm_options=algorithm_of(task.algo).described(self.period, task.num_envs),
+            command=self.command,
+            seeds={"training": task.seed, "from": _TRAINING + task.seed * _ROOM},
+            steps=now.steps,
+            cpu_seconds=now.cpu_seconds,
+        )
+        save_policy(self.folder / POLICY, network_from_sb3(self.model), card)
         part = self.folder / f".part-{BEST}"
         self.model.save(part)
         part.replace(self.folder / BEST)

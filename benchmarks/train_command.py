@@ -1,5 +1,7 @@
 """`sideslip train`: a policy learns, with a progress bar; a stopped training goes on."""
 
+import json
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -8,11 +10,14 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
+from .tune_command import option_of
+
 if TYPE_CHECKING:
     from ..agents.train import Progress as Now
     from ..agents.train import Task, Trained
 
 STEPS = 2_000_000
+EPISODES = 256  # of the policy's test
 _Text = str | None
 
 
@@ -20,12 +25,15 @@ def train_command(
     algo: Annotated[_Text, typer.Option(help="An algorithm's name (ppo).")] = None,
     env: Annotated[_Text, typer.Option(help="An environment's id (sideslip/YawVision-v0).")] = None,
     estimator: Annotated[_Text, typer.Option(help="An estimator's name (none).")] = None,
-    scenario: Annotated[_Text, typer.Option(help="A scenario's name (the id's own).")] = None,
+    option: Annotated[
+        list[str] | None,
+        typer.Option(help="NAME=VALUE of the environment, as scenario=gust; repeatable."),
+    ] = None,
     steps: Annotated[int, typer.Option(help="Control periods, all in all.")] = STEPS,
     seed: Annotated[int | None, typer.Option(help="Of weights and episodes (0).")] = None,
     num_envs: Annotated[int | None, typer.Option(help="Side by side (256).")] = None,
     out: Annotated[
-        Path | None, typer.Option(help="Folder; default: train-ENV-ALGO[-ESTIMATOR]-SEED here.")
+        Path | None, typer.Option(help="Folder; default: train-ENV-ALGO...-SEED here.")
     ] = None,
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on with the training in the folder.")
@@ -35,13 +43,14 @@ def train_command(
 
     With --resume whatever is not given is that of the training in the folder.
     """
-    from ..agents.train import BEST, CURVE, task_in, train, with_defaults
+    from ..agents.train import CURVE, POLICY, task_in, train, with_defaults
+    from .enjoy import evaluate, evaluation
 
     wish: dict[str, Any] = {
         "env_id": env,
         "algo": algo,
         "estimator": estimator,
-        "scenario": scenario,
+        "env_options": dict(map(option_of, option)) if option else None,
         "seed": seed,
         "num_envs": num_envs,
     }
@@ -52,16 +61,30 @@ def train_command(
         task = task_in(folder, **given)
     console = Console()
     with _Bar(console, steps) as bar:
-        trained = train(task, steps, folder, resume, bar.show)
+        trained = train(task, steps, folder, resume, bar.show, shlex.join(_words(task, steps)))
     console.print(_table(trained))
-    console.print(f"best: {folder / BEST}", highlight=False, soft_wrap=True)
+    costs = evaluation(evaluate(folder / POLICY, EPISODES))["cost"]
+    said = ", ".join(f"{name} {each['mean']:.4g}" for name, each in costs.items())
+    console.print(f"mean cost on test seeds: {said}", highlight=False, soft_wrap=True)
+    console.print(f"policy: {folder / POLICY}", highlight=False, soft_wrap=True)
     console.print(f"curve: {folder / CURVE}", highlight=False, soft_wrap=True)
 
 
 def _name_of(task: "Task") -> str:
     """Of the folder where none is given."""
-    words = [task.env_id.rpartition("/")[2], task.algo, task.estimator, task.scenario]
+    options = [each if isinstance(each, str) else name for name, each in task.env_options.items()]
+    words = [task.env_id.rpartition("/")[2], task.algo, task.estimator, *options]
     return "-".join(["train", *filter(None, words), str(task.seed)])
+
+
+def _words(task: "Task", steps: int) -> list[str]:
+    """The command that trains this from the start."""
+    words = ["sideslip", "train", "--algo", task.algo, "--env", task.env_id]
+    words += ["--estimator", task.estimator] if task.estimator else []
+    for name, value in task.env_options.items():
+        words += ["--option", f"{name}={value if isinstance(value, str) else json.dumps(value)}"]
+    numbers = {"--steps": steps, "--seed": task.seed, "--num-envs": task.num_envs}
+    return words + [word for name, value in numbers.items() for word in (name, str(value))]
 
 
 class _Bar(Progress):

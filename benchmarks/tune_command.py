@@ -21,7 +21,7 @@ def face() -> None:
     """Find the numbers of a method by search."""
 
 
-def _option(text: str) -> tuple[str, Any]:
+def option_of(text: str) -> tuple[str, Any]:
     """NAME=VALUE; a value that is no JSON is a word."""
     name, equals, value = text.partition("=")
     if not (name and equals):
@@ -89,7 +89,7 @@ def tune_estimator(
         scenario,
         env or None,
         target,
-        dict(map(_option, option or [])),
+        dict(map(option_of, option or [])),
         dict(map(_searched, search)) if search else None,
         dict(map(_searched, noise or [])),
         seeds,

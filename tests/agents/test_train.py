@@ -11,19 +11,23 @@ import numpy as np
 import pytest
 
 from sideslip.agents.costs import costs_of
+from sideslip.agents.learned import Learned
 from sideslip.envs.vector import StabilityVectorEnv
 
 pytest.importorskip("stable_baselines3")
 import torch
 from safetensors.torch import save
 from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import VecNormalize
 
 from sideslip.agents import train
 from sideslip.agents.algorithms import ALGORITHMS
+from sideslip.agents.from_sb3 import network_from_sb3
 from sideslip.agents.scaling import CLIP, Standardised, measured
-from sideslip.agents.train import BEST, CHECKPOINT, CURVE, Progress, Task, task_in
+from sideslip.agents.train import BEST, CHECKPOINT, CURVE, POLICY, Progress, Task, task_in
+from sideslip.agents.vec_env import make_vec_env
 
-TINY = Task(num_envs=8, scenario="sine-with-dwell", seed=3)
+TINY = Task(num_envs=8, env_options={"scenario": "sine-with-dwell"}, seed=3)
 ROLLOUT = 256  # steps of 8 environments
 
 
@@ -69,10 +73,16 @@ def test_the_best_evaluation_is_kept(folder: Path) -> None:
     seeds = [train._EVALUATION + i for i in range(4)]
     best = min(line["cost"] for line in lines)
     assert costs_of(env, model, seeds).mean() == pytest.approx(best, rel=1e-6)
+    policy = Learned(env, folder / POLICY)
+    assert costs_of(env, policy, seeds).mean() == pytest.approx(best, rel=1e-4)
+    card, kept = policy.policy.card, min(lines, key=lambda line: line["cost"])
+    assert (card.steps, card.cpu_seconds) == (kept["steps"], kept["cpu_seconds"])
+    assert card.env_id == TINY.env_id and card.env_options == TINY.env_options
+    assert not policy.policy.reads[-1]  # gamma_ref: with zero slip it never varies
     still: Any = type("Still", (), {"predict": lambda *_, **__: (np.zeros((4, 1)), None)})()
     none = costs_of(env, still, seeds).mean()
     assert lines[0]["of_none"] == pytest.approx(lines[0]["cost"] / none, rel=1e-12)
-    assert sorted(os.listdir(folder)) == sorted([BEST, CHECKPOINT, CURVE])
+    assert sorted(os.listdir(folder)) == sorted([BEST, CHECKPOINT, CURVE, POLICY])
 
 
 def test_training_goes_on_where_the_checkpoint_is(folder: Path, tmp_path: Path) -> None:
@@ -127,7 +137,7 @@ def test_progress_is_told_after_every_rollout(
 ) -> None:
     monkeypatch.setattr(train, "EVERY", 10**6)
     told: list[Progress] = []
-    task = Task(num_envs=40, scenario="sine-with-dwell")
+    task = Task(num_envs=40, env_options=TINY.env_options)
     train.train(task, 20 * 40 * 32, tmp_path, report=told.append)
     assert [each.steps for each in told] == [40 * 32 * i for i in range(1, 21)]
     assert told[0].cost is None and told[0].evaluations[0].steps == 0
@@ -158,13 +168,13 @@ def test_a_kill_in_the_middle_of_saving_leaves_the_older_checkpoint(
     [
         ("env_id", "sideslip/YawFusion-v0"),
         ("estimator", "exact-kf"),
-        ("scenario", ""),
+        ("env_options", {}),
         ("seed", 4),
         ("num_envs", 16),
     ],
 )
 def test_a_checkpoint_of_another_training_is_refused(folder: Path, name: str, value: Any) -> None:
-    with pytest.raises(ValueError, match=f"is of {name} .*, not {value!r}: train that in another"):
+    with pytest.raises(ValueError, match=f"is of {name} .*, not .*: train that in another"):
         task_in(folder, **{name: value})
     assert task_in(folder) == TINY
     with pytest.raises(ValueError, match="train that in another folder"):
@@ -201,7 +211,7 @@ def test_what_cannot_be_trained_says_why_and_leaves_no_checkpoint(tmp_path: Path
     for task, said in (
         (Task(estimator="dakf"), "dakf needs the slow sensor gps"),
         (Task(estimator="kf"), "kf"),
-        (Task(scenario="moon"), "unknown scenario 'moon'"),
+        (Task(env_options={"scenario": "moon"}), "unknown scenario 'moon'"),
         (Task("CartPole-v1"), "has no native vector env"),
     ):
         with pytest.raises(ValueError, match=said):
@@ -220,6 +230,22 @@ def test_observations_are_standardised_by_the_network() -> None:
     given = layer(torch.tensor(obs, dtype=torch.float32)).numpy()
     assert given == pytest.approx(wanted, abs=1e-3)
     assert np.abs(wanted).max() == CLIP and not list(layer.parameters())
+
+
+def test_the_network_of_the_file_standardises_as_torch_does(folder: Path) -> None:
+    model = PPO.load(folder / BEST, device="cpu")
+    network = network_from_sb3(model)
+    env = TINY.vector_env(8)
+    obs, _ = env.reset(seed=0)
+    for _ in range(50):
+        actions, _ = model.predict(obs, deterministic=True)
+        assert np.clip(network(obs.astype(np.float64)), -1.0, 1.0) == pytest.approx(
+            actions, abs=1e-6
+        )
+        obs, *_ = env.step(actions)
+    twice = VecNormalize(make_vec_env(TINY.env_id, 2))
+    with pytest.raises(ValueError, match="normalised twice"):
+        network_from_sb3(model, twice)
 
 
 @pytest.mark.parametrize("num_envs", [1, 7, 100, 256, 1000])

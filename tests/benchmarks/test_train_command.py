@@ -1,11 +1,13 @@
 """`sideslip train`: what it leaves, how it goes on, and each way to type it wrong."""
 
+import shlex
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from sideslip.agents.policy_file import load_policy
 from sideslip.benchmarks import cli
 
 pytest.importorskip("stable_baselines3")
@@ -13,7 +15,7 @@ from sideslip.agents import train
 from sideslip.benchmarks import train_command
 
 Run = Callable[..., tuple[int, str, str]]
-TINY = ("--num-envs", 8, "--scenario", "sine-with-dwell")
+TINY = ("--num-envs", 8, "--option", "scenario=sine-with-dwell")
 
 
 @pytest.fixture
@@ -21,6 +23,7 @@ def run(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], tmp_
     """Call `sideslip train` in an empty folder; gives (exit status, stdout, stderr)."""
     for name, value in {"EPISODES": 4, "EVERY": 256, "_MEASURED": 8}.items():
         monkeypatch.setattr(train, name, value)
+    monkeypatch.setattr(train_command, "EPISODES", 4)
     monkeypatch.chdir(tmp_path)
 
     def call(*arguments: object) -> tuple[int, str, str]:
@@ -38,7 +41,13 @@ def test_it_trains_and_goes_on(run: Run, tmp_path: Path) -> None:
     status, out, err = run(*TINY, "--steps", 256)
     folder = "train-YawVision-v0-ppo-sine-with-dwell-0"
     assert status == 0, err
-    assert "best" in out and f"{folder}/{train.BEST}" in out and "of none's" in out
+    assert "best" in out and f"{folder}/{train.POLICY}" in out and "of none's" in out
+    card = load_policy(folder + "/" + train.POLICY).card
+    assert shlex.split(card.command)[1:] == [
+        "train", "--algo", "ppo", "--env", "sideslip/YawVision-v0",
+        "--option", "scenario=sine-with-dwell", "--steps", "256", "--seed", "0", "--num-envs", "8",
+    ]  # fmt: skip
+    assert {"policy", "none"} < card.evaluation["cost"].keys() and card.evaluation["salt"]
     status, out, err = run("--resume", "--out", folder, "--steps", 512)
     assert status == 0, err
     assert len((tmp_path / folder / train.CURVE).read_text().splitlines()) == 3
@@ -55,7 +64,7 @@ def test_it_trains_and_goes_on(run: Run, tmp_path: Path) -> None:
         (("--env", "sideslip/Yaw-v0"), "Yaw"),
         (("--env", "Pendulum-v1"), "Pendulum-v1 has no native vector env"),
         (("--estimator", "dakf"), "dakf needs the slow sensor gps"),
-        (("--scenario", "moon"), "unknown scenario 'moon'"),
+        (("--option", "scenario=moon"), "unknown scenario 'moon'"),
         (("--resume",), "holds no training to go on with"),
         (("--steps", "0"), "steps is at least 1, got 0"),
         (("--num-envs", "0"), "num_envs is at least 1, got 0"),
@@ -90,5 +99,5 @@ def test_without_the_extra_the_command_names_it(
 
 
 def test_the_folder_is_named_by_what_is_trained() -> None:
-    task = train.Task("sideslip/YawGps-v0", "ppo", "dakf", "gust", 7)
+    task = train.Task("sideslip/YawGps-v0", "ppo", "dakf", {"scenario": "gust"}, 7)
     assert train_command._name_of(task) == "train-YawGps-v0-ppo-dakf-gust-7"
