@@ -12,7 +12,7 @@ from sideslip.benchmarks import cli
 
 pytest.importorskip("stable_baselines3")
 from sideslip.agents import train
-from sideslip.benchmarks import train_command
+from sideslip.benchmarks import enjoy, train_command
 
 Run = Callable[..., tuple[int, str, str]]
 TINY = ("--num-envs", 8, "--option", "scenario=sine-with-dwell")
@@ -37,18 +37,29 @@ def run(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], tmp_
     return call
 
 
-def test_it_trains_and_goes_on(run: Run, tmp_path: Path) -> None:
-    status, out, err = run(*TINY, "--steps", 256)
-    folder = "train-YawVision-v0-ppo-sine-with-dwell-0"
+@pytest.mark.long
+def test_the_policys_card_says_how_it_was_made_and_what_it_costs(run: Run) -> None:
+    status, out, err = run(*TINY, "--steps", 256, "--out", "here")
     assert status == 0, err
-    assert "best" in out and f"{folder}/{train.POLICY}" in out and "of none's" in out
-    card = load_policy(folder + "/" + train.POLICY).card
+    assert "best" in out and f"here/{train.POLICY}" in out and "of none's" in out
+    card = load_policy(f"here/{train.POLICY}").card
     assert shlex.split(card.command)[1:] == [
         "train", "--algo", "ppo", "--env", "sideslip/YawVision-v0",
         "--option", "scenario=sine-with-dwell", "--steps", "256", "--seed", "0", "--num-envs", "8",
     ]  # fmt: skip
-    assert {"policy", "none"} < card.evaluation["cost"].keys() and card.evaluation["salt"]
-    status, out, err = run("--resume", "--out", folder, "--steps", 512)
+    costs = card.evaluation["cost"]
+    assert card.evaluation["salt"] and len(costs) == 3
+    assert f"policy {costs['policy']['mean']:.4g}" in out
+
+
+def test_it_goes_on_with_what_the_folder_holds(
+    run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(enjoy, "evaluate", lambda *_: None)
+    monkeypatch.setattr(enjoy, "evaluation", lambda _: {"cost": {}})
+    folder = "train-YawVision-v0-ppo-sine-with-dwell-0"
+    assert run(*TINY, "--steps", 256)[0] == 0
+    status, _, err = run("--resume", "--out", folder, "--steps", 512)
     assert status == 0, err
     assert len((tmp_path / folder / train.CURVE).read_text().splitlines()) == 3
     status, _, err = run(*TINY, "--steps", 256)
