@@ -4,7 +4,6 @@ Reading it runs no code, and a save that is stopped leaves the older file as it 
 """
 
 import json
-import os
 from pathlib import Path
 from typing import Any
 
@@ -12,20 +11,9 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
+from .whole_file import write_whole
+
 FORMAT = 1
-
-
-def write_whole(path: Path, content: bytes) -> None:
-    """Write a file or nothing: the bytes go to a neighbour first, which is then renamed."""
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        with part.open("wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def save_checkpoint(path: Path, model: Any, told: dict[str, Any]) -> None:

@@ -5,7 +5,6 @@ Reading it runs no code: safetensors are numbers, the card is JSON.
 
 import hashlib
 import json
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from safetensors.numpy import save
 
 from .network import Network
 from .policy_card import Card
+from .whole_file import write_whole
 
 FORMAT = 1
 """Counts up when an older sideslip could not read, or would misread, a newer file."""
@@ -86,16 +86,7 @@ def save_policy(path: str | Path, network: Network, card: Card) -> None:
         action_width=network.width,
     )
     metadata = {"format": str(FORMAT), "card": card.to_json(network=architecture)}
-    content = save(_tensors(network), metadata)
-    part = target.with_name(f".{target.name}.{os.getpid()}.part")
-    try:
-        with part.open("wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(target)
-    finally:
-        part.unlink(missing_ok=True)
+    write_whole(target, save(_tensors(network), metadata))
 
 
 def load_policy(path: str | Path) -> Policy:

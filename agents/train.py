@@ -17,7 +17,7 @@ from gymnasium.vector import VectorEnv
 
 from .. import __version__
 from .algorithms import algorithm_of
-from .checkpoint import load_parameters, read_told, save_checkpoint, write_whole
+from .checkpoint import load_parameters, read_told, save_checkpoint
 from .controller import NoControl
 from .costs import costs_of
 from .from_sb3 import network_from_sb3
@@ -25,6 +25,7 @@ from .policy_card import Card
 from .policy_file import save_policy
 from .scaling import PerSecond, measured
 from .vec_env import make_native_env, make_vec_env
+from .whole_file import write_whole
 
 import torch  # isort: skip  # after ours, which say which extra is missing
 from stable_baselines3.common.base_class import BaseAlgorithm  # isort: skip

@@ -3,6 +3,10 @@
 import dataclasses
 import json
 import os
+import signal
+import subprocess
+import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -22,6 +26,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sideslip.agents import train
 from sideslip.agents.algorithms import ALGORITHMS
+from sideslip.agents.checkpoint import read_told
 from sideslip.agents.from_sb3 import network_from_sb3
 from sideslip.agents.scaling import CLIP, Standardised, measured
 from sideslip.agents.train import BEST, CHECKPOINT, CURVE, POLICY, Progress, Task, task_in
@@ -161,6 +166,30 @@ def test_a_kill_in_the_middle_of_saving_leaves_the_older_checkpoint(
     assert after.keys() == before.keys()
     assert after[CHECKPOINT] == before[CHECKPOINT] and after[CURVE] == before[CURVE]
     assert train.train(TINY, 2 * ROLLOUT, tmp_path, resume=True).model.num_timesteps == 2 * ROLLOUT
+
+
+@pytest.mark.long
+def test_a_kill_at_any_time_leaves_a_checkpoint_that_goes_on(tmp_path: Path) -> None:
+    code = (
+        "import sys\n"
+        "from sideslip.agents import train\n"
+        "train.EPISODES, train.EVERY, train._MEASURED = 4, 256, 8\n"
+        "task = train.Task(num_envs=8, env_options={'scenario': 'sine-with-dwell'})\n"
+        "train.train(task, 10**8, sys.argv[1], resume=len(sys.argv) > 2)\n"
+    )
+    path, reached = tmp_path / CHECKPOINT, [-1]
+    for wait in np.random.default_rng(0).uniform(0.0, 0.5, 4):
+        command = [sys.executable, "-c", code, str(tmp_path), *(["on"] if path.exists() else [])]
+        environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+        child = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE)
+        before = path.read_bytes() if path.exists() else b""
+        while child.poll() is None and (path.read_bytes() if path.exists() else b"") == before:
+            time.sleep(0.01)
+        time.sleep(wait)
+        child.kill()
+        assert child.communicate()[1] == b"" and child.returncode == -signal.SIGKILL
+        reached.append(read_told(path)["steps"])
+        assert reached[-1] > reached[-2]
 
 
 @pytest.mark.parametrize(
