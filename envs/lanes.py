@@ -1,5 +1,5 @@
 # numba's own types say too little about itself:
-# mypy: disable-error-code="no-untyped-call,no-untyped-def,misc,untyped-decorator"
+# mypy: disable-error-code="attr-defined,no-untyped-call,no-untyped-def,misc,untyped-decorator"
 """Lanes: sixteen numbers in one SIMD value, for which the compiler takes the equations unchanged.
 
 A numba type whose machine value is LLVM's vector of doubles, with the integers and the truth values

@@ -85,8 +85,8 @@ def test_a_folder_that_cannot_be_written_costs_only_time(
     variable: str, copy: Path, tmp_path: Path
 ) -> None:
     (tmp_path / "file").write_text("not a folder")
-    printed = run(UNIFORM, copy, **{variable: str(tmp_path / "file")})
-    assert float(printed) == (2**31 - 0.5) / 2.0**32
+    printed = run(SHIFT, copy, **{variable: str(tmp_path / "file")})
+    assert float(printed) == 0.25**2 * (3.0 - 2.0 * 0.25)
     assert (tmp_path / "file").read_text() == "not a folder"
     assert not list(copy.rglob("*.nbc"))  # numba's own fallback would write beside the sources
 
