@@ -8,20 +8,20 @@ from typing import Any
 
 import numpy as np
 
-from ..envs.backend import jit, maximum
+from ..envs.backend import counted, maximum
 from .compiled import entry
 from .memory import FILTER
 from .observing import observe
 
 
-@jit
+@counted
 def gains_of(pool: Any, place: Any) -> Any:
     """The gains that lie in the pool at a place: (offset, then their shape)."""
     start, cells, height, width = place[0], place[1], place[2], place[3]
     return pool[start : start + cells * height * width].reshape((cells, height, width))
 
 
-@jit
+@counted
 def observe_batch(
     filters: Any,
     pool: Any,

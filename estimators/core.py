@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ..envs.backend import apart, jit, maximum, sqrt
+from ..envs.backend import apart, counted, jit, maximum, sqrt
 from ..envs.record import FAST, PACKET
 from .arrivals import receive, use_waiting
 from .delay import BUFFER, latch_due
@@ -177,7 +177,7 @@ def advance(
     return rows
 
 
-@jit
+@counted
 def step_all(layers: Any, gains: Any, fast: Any, packets: Any, count: int) -> int:
     """`advance` over all rows with nothing to be filled: fewer arguments to hand over."""
     nothing = fast[:0]

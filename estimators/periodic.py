@@ -82,10 +82,12 @@ def _copy(source: Any, target: Any, size: int) -> Any:
 
 
 @jit
-def settle_filter(filters: Any, s: int, lags: Any, cycles: int, table: Any, before: Any) -> None:
+def settle_filter(
+    filters: Any, s: int, lags: Any, cycles: int, table: Any, before: Any, none: Any
+) -> None:
     """`settle` for the first filter of an array, from its beginning."""
     begin(filters[0], 0)
-    settle(filters[0], s, lags, cycles, table, before, np.zeros((1, 1, 1)))
+    settle(filters[0], s, lags, cycles, table, before, none)
 
 
 @jit
@@ -134,7 +136,7 @@ def design(f: Any, schedule: Schedule, speed: float, wish: Any) -> tuple[Array, 
     lags = np.array(schedule.lags, np.int64) * int(f.late == CLONE)
     cycles = max(2, int(LONGEST / float(twin.step)) // schedule.cycle)
     before = np.zeros((int(f.total), int(f.total)))
-    settle_filter(twins, s, lags, cycles, table, before)
+    settle_filter(twins, s, lags, cycles, table, before, np.zeros((1, 1, 1)))
     if f.between == PSEUDO:
         C = measured_rows(f, s, 0)
         R = np.diag([*twin.r_fast[: twin.fasts], *twin.r[s, : twin.rows[s]]])
