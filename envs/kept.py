@@ -20,6 +20,7 @@ import llvmlite
 import numba
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import compile_result
+from numba.core.environment import _rebuild_env
 from numba.core.runtime import rtsys
 from numba.core.serialize import dumps
 
@@ -65,7 +66,7 @@ class Kept:
         result.fndesc.typemap = result.fndesc.calltypes = None
         code = result.library._get_compiled_object()
         told = (result.signature, result.fndesc, result.environment, result.reload_init)
-        data = dumps((code, told, tuple(environments), needed))
+        data = dumps((code, told, tuple(map(_noted, environments)), needed))
         with contextlib.suppress(OSError):
             _write(path, hashlib.sha256(data).digest() + data)
 
@@ -88,7 +89,7 @@ class Kept:
             getattr(importlib.import_module(module), name).compile(types)
         library = _loaded(target.codegen(), fndesc, code)
         entry = target.get_executable(library, fndesc, environment)
-        link_environments(library, environments)
+        link_environments(library, [_rebuild_env(*noted) for noted in environments])
         return compile_result(
             typing_context=target.typing_context,
             target_context=target,
@@ -101,6 +102,13 @@ class Kept:
             environment=environment,
             reload_init=reload_init,
         )
+
+
+def _noted(environment: Any) -> tuple[str, list[Any], str]:
+    """What numba rebuilds an environment from. Functions that numba itself writes, for expressions
+    of whole arrays, are of no module."""
+    module = environment.globals.get("__name__", "builtins")
+    return module, list(environment.consts), environment.env_name
 
 
 def _loaded(codegen: Any, fndesc: Any, code: bytes) -> JITCodeLibrary:

@@ -60,6 +60,11 @@ def first(x):
 @kernel
 def second(x):
     return negative(x) + 2.0
+
+
+@kernel
+def blend(target, share, vector):
+    target[1:] = (1.0 - share) * vector[1:]
 '''
 USE = """
 print(total(np.arange(5.0), 0.5).hex())
@@ -110,6 +115,13 @@ def test_a_second_process_loads_what_the_first_compiled(folder: Path) -> None:
     second, told = run(folder)
     assert second == EXPECTED and told == ""
     assert {path: path.read_bytes() for path in folder.iterdir()} == files
+
+
+def test_expressions_of_whole_arrays_come_back(folder: Path) -> None:
+    """Numba writes functions of its own for them, which are of no module."""
+    code = "a = np.zeros(3); blend(a, 0.25, np.arange(3.0)); print(a.tolist())"
+    assert run(folder, code)[0] == ["[0.0, 0.75, 1.5]"]
+    assert run(folder, code) == (["[0.0, 0.75, 1.5]"], "")
 
 
 @pytest.mark.parametrize("left", [0, 31, 1000, -1], ids=["empty", "digest", "cut", "last byte"])
