@@ -142,7 +142,8 @@ def _compiled(function: F, apart: bool = False, **more: bool) -> F:
     layer = function.__module__.removeprefix(_PREFIX).partition(".")[0]
     ours = function.__module__.startswith(_PREFIX) and layer in _LAYERS
     kept = _kept_folder(layer) if ours else None  # the stamp knows of no other sources
-    told = {"nopython": True, "boundscheck": None, "error_model": "numpy", "fastmath": False}
+    told: dict[str, Any] = {"nopython": True, "boundscheck": None}
+    told |= {"error_model": "numpy", "fastmath": False, "forceinline": False}
     told |= {"_nrt": layer not in ("envs", "estimators")} | more
     return Kernel(function, targetoptions=told, kept=kept, apart=apart)  # type: ignore[return-value]
 

@@ -10,6 +10,7 @@ and emitted then; that alone is kept on disk.
 
 import contextlib
 import gc
+import hashlib
 import logging
 import multiprocessing
 import os
@@ -26,6 +27,7 @@ from numba.core.compiler import Compiler
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.dispatcher import _FunctionCompiler
 from numba.core.environment import lookup_environment
+from numba.core.funcdesc import default_mangler
 from numba.core.registry import CPUDispatcher
 from numba.core.sigutils import normalize_signature
 from numba.core.typing import make_concrete_template
@@ -98,10 +100,16 @@ class _PartPipeline(Compiler):
 
 
 class _ApartPipeline(_PartPipeline):
-    def _compile_bytecode(self) -> Any:
-        """Callers' files know the function by a name without numba's count of this process."""
-        self.state.func_id.unique_id = 0
-        return super()._compile_bytecode()
+    def compile_extra(self, func: Any) -> Any:
+        """Callers' files know the function by a name that is the same in every process: numba's
+        counts functions and types as they come."""
+
+        def mangler(name: str, types: Any, **_: Any) -> str:
+            told = hashlib.sha256(str(tuple(types)).encode()).hexdigest()[:16]
+            return str(default_mangler(f"{name}_{told}", ()))
+
+        self.state.targetctx = self.state.targetctx.subtarget(mangler=mangler)
+        return super().compile_extra(func)
 
 
 class _PartCompiler(_FunctionCompiler):

@@ -62,6 +62,16 @@ def second(x):
     return negative(x) + 2.0
 
 
+@_apart
+def mass_of(car):
+    return car["m"]
+
+
+@kernel
+def weight(car):
+    return 9.81 * mass_of(car)
+
+
 @kernel
 def blend(target, share, vector):
     target[1:] = (1.0 - share) * vector[1:]
@@ -115,6 +125,17 @@ def test_a_second_process_loads_what_the_first_compiled(folder: Path) -> None:
     second, told = run(folder)
     assert second == EXPECTED and told == ""
     assert {path: path.read_bytes() for path in folder.iterdir()} == files
+
+
+def test_machine_code_is_found_by_a_name_without_a_process_counts(folder: Path) -> None:
+    """Numba numbers record types as it meets them; a kernel may be made anew after its callers."""
+    code = "print(weight(np.ones(1, [('m', float)])[0]))"
+    others = "import numba; [numba.typeof(np.ones(1, [(f'a{i}', float)])[0]) for i in range(9)]\n"
+    assert run(folder, code)[0] == ["9.81"]
+    (made,) = (path for path in folder.iterdir() if "mass_of" in path.name)
+    made.unlink()
+    assert run(folder, others + code)[0] == ["9.81"]
+    assert run(folder, code) == (["9.81"], "")
 
 
 def test_expressions_of_whole_arrays_come_back(folder: Path) -> None:
