@@ -174,6 +174,7 @@ def _rebuild(function: Any, table: dict[str, Any], done: dict[Any, Any]) -> Any:
         return done[source]
     names: dict[str, Any] = dict(source.__globals__)
     rebuilt = types.FunctionType(source.__code__, names, source.__name__, source.__defaults__)
+    del names["__name__"]  # by which torch.compile would look the names up in the module itself
     done[source] = rebuilt
     for name in source.__code__.co_names:
         callee = names.get(name)

@@ -46,7 +46,8 @@ _BAD = Switches._fields.index("fail_bad")
 
 
 @jit
-def _fixed(p: Any) -> Fixed:
+def fixed_of(p: Any) -> Fixed:
+    """What does not change within an env-step."""
     return Fixed(
         Car(*fixed_tuple(p, _CAR)),
         Road(*fixed_tuple(p[P.road :], _ROAD)),
@@ -94,7 +95,7 @@ def drive_on(
     rows and scratch have one axis more then. Where one of these fails or ends before the others
     nothing is changed and 0 returned.
     """
-    fixed = _fixed(p)
+    fixed = fixed_of(p)
     motion = Motion(*fixed_tuple(z[Z.motion :], _MOTION))
     drive = Drive(*fixed_tuple(z[Z.drive :], _DRIVE))
     tick = at(z, Z.clock + 2)

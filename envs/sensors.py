@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .backend import floor, jit, maximum, minimum, select, sqrt
+from .backend import floor, jit, maximum, minimum, select, sqrt, whole
 from .dynamics import curvature_at, sideslip_angle
 from .elementary import sincos, wrap
 from .noise import CHANNELS, uniforms
@@ -75,19 +75,10 @@ def link_of(sensor: SlowSensor | None, outage: tuple[float, float] | None = None
     """
     if sensor is None:
         return Link._make([0.0] * len(Link._fields))
-    longest = max(ticks(delay) for delay in sensor.delays) + ticks(sensor.jitter)
-    most = int(longest // ticks(sensor.period)) + 1
-    if sensor.duplicate > 0.0:
-        most = 2 * (most + 1)
-    if most > IN_FLIGHT:
-        raise ValueError(
-            f"a period of {sensor.period} s with delays up to {sensor.longest_delay:g} s puts "
-            f"{most} packets under way at once; there is room for {IN_FLIGHT}"
-        )
     delays = [ticks(delay) for delay in sensor.delays]
     start, end = outage if outage is not None else (0.0, 0.0)
     d_0, d_1, d_2, d_3 = delays + [0.0] * (4 - len(delays))
-    return Link(
+    link = Link(
         ticks(sensor.period),
         -1.0 if sensor.phase is None else ticks(sensor.phase),
         float(len(delays)),
@@ -101,6 +92,20 @@ def link_of(sensor: SlowSensor | None, outage: tuple[float, float] | None = None
         ticks(start),
         ticks(end),
     )
+    most = most_under_way(link)
+    if most > IN_FLIGHT:
+        raise ValueError(
+            f"a period of {sensor.period} s with delays up to {sensor.longest_delay:g} s puts "
+            f"{most} packets under way at once; there is room for {IN_FLIGHT}"
+        )
+    return link
+
+
+def most_under_way(link: Link) -> int:
+    """How many packets of a sensor that is there are under way at once, duplicates included."""
+    longest = max(link.delay_0, link.delay_1, link.delay_2, link.delay_3) + link.jitter
+    most = int(longest // link.period) + 1
+    return 2 * (most + 1) if link.duplicate > 0.0 else most
 
 
 @jit
@@ -109,7 +114,7 @@ def arrivals(link: Any, frame: Any, tick: Any, key_low: int, key_high: int, bloc
 
     Loss, outage, duplication, latency and jitter are this one function.
     """
-    late, lost, twice, again = uniforms(key_low, key_high, int(tick), block)
+    late, lost, twice, again = uniforms(key_low, key_high, whole(tick), block)
     which = frame - link.patterns * floor(frame / link.patterns)
     delay = select(which == 1.0, link.delay_1, link.delay_0)
     delay = select(which == 2.0, link.delay_2, delay)

@@ -1,0 +1,248 @@
+"""DeviceVectorEnv: many cars on torch tensors; observations and rewards stay on the device."""
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.error import ResetNeeded
+from gymnasium.vector import AutoresetMode, VectorEnv
+
+from .border import count_of, mask_of, mode_of, named
+from .device_numbers import torch
+from .device_rows import Rows
+from .device_slow import Most, most_of
+from .device_state import device_of, dtype_of, told_actions
+from .device_step import Step
+from .kernel import kind_of
+from .layout import P
+from .record import CAMERA, SLOW_NAMES
+from .sensors import Link
+from .switches import REPORT, RUNNING, Report, Switches
+from .template import Template
+from .tick import Kind
+from .vector import StabilityVectorEnv
+
+Tensor = torch.Tensor
+Infos = dict[str, Any]
+_ALL = Switches._fields.index("all_samples")
+
+
+class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
+    """`num_envs` environments on a device: the equations, the noise and the episodes of
+    `StabilityVectorEnv`, seed by seed, in tensors.
+
+    In float64 an env-step agrees with the other engines' from the same state to rounding; float32
+    is faster on a GPU and less exact. `DeviceVectorEnv.make(id, num_envs=N, device="cuda")` builds
+    the one of an id. Needs torch, of the extra `train`.
+
+    ## Arguments
+    arguments: those of `StabilityEnv`. device: "cpu", "cuda", "cuda:1", ... dtype: "float64" or
+    "float32". autoreset_mode: "NextStep", "SameStep" or "Disabled", as of `StabilityVectorEnv`.
+    compile: a tick and what follows the ticks go through `torch.compile`, which takes minutes
+    once, and on the CPU needs a C++ compiler.
+
+    ## Tensors
+    Observations are (N, k) float32, rewards (N,), `terminated` and `truncated` (N,) of bool.
+    Infos are tensors (N,), told of every row. All are new ones each time. After a step `rows`
+    (N, n, FAST_WIDTH), of which `ticks_done` (N,) are there, and `packets` (N, most, PACKET_WIDTH),
+    of which `delivered` (N,) are, make the record.
+
+    Actions are tensors (N, width) on the device. A bad one does what it does in the vector env. A
+    step waits for the device once, to learn whether one was bad and whether an episode ended.
+
+    ## Reset
+    By the compiled engine, on the host, from each row's own generator; what it drew is copied over.
+    Options are those of `StabilityVectorEnv`, but all rows have a plant of one kind: tyres, roll,
+    lags, small angles and whether a driver reacts to the car are those of the env's own scenario.
+
+    Raises TypeError or ValueError for an argument out of place and a device that is not there.
+    """
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        device: Any = "cpu",
+        dtype: Any = "float64",
+        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+        compile: bool = False,
+        **arguments: Any,
+    ) -> None:
+        self.num_envs = count_of(num_envs)
+        self._mode = mode_of(autoreset_mode)
+        self.device, self.dtype, self._compiled = device_of(device), dtype_of(dtype), compile
+        self._host = host = StabilityVectorEnv(num_envs, **arguments)  # it resets the rows
+        self.layout, self.control_period = host.layout, host.control_period
+        self.reference = host.reference
+        self.metadata = {**host.metadata, "autoreset_mode": self._mode}
+        self.single_observation_space = host.single_observation_space
+        self.single_action_space = host.single_action_space
+        self.observation_space = host.observation_space
+        self.action_space = host.action_space
+        self._started = self._waiting = False
+        self._kind = _kind_of(host.setting.base)
+        self._links: dict[int, set[Link]] = {
+            i: set() for i, name in enumerate(SLOW_NAMES) if name in host.setting.slow
+        }
+        self._build(self._most_of([host.setting.base]))
+
+    @classmethod
+    def make(cls, env_id: str, num_envs: int = 1, **arguments: Any) -> "DeviceVectorEnv":
+        """The environments of an id; its own arguments are replaced by those given."""
+        spec = gym.spec(env_id)
+        if spec.vector_entry_point != "sideslip.envs.vector:StabilityVectorEnv":
+            raise ValueError(f"{env_id} has no environment on the device")
+        return cls(num_envs, **{**spec.kwargs, **arguments})
+
+    def _most_of(self, templates: Iterable[Template]) -> dict[int, Most]:
+        """What the slow sensors need room for with these templates and those before; ValueError
+        for a template of another kind of plant."""
+        for template in templates:
+            kind = _kind_of(template)
+            if kind != self._kind:
+                raise ValueError(
+                    f"on a device all rows have one kind of plant, {self._kind}; "
+                    f"scenario {template.scenario.name!r} has {kind}"
+                )
+            for sensor, links in self._links.items():
+                at = P.camera if sensor == CAMERA else P.gps
+                links.add(Link(*template.params[at : at + len(Link._fields)].tolist()))
+        n = self.control_period
+        return {sensor: most_of(list(links), n) for sensor, links in self._links.items()}
+
+    def _build(self, most: dict[int, Most]) -> None:
+        """The step with this room, and all rows on the device."""
+        host = self._host
+        all_samples = bool(host.setting.base.switches[_ALL])
+        self._step = Step(
+            self._kind,
+            self.control_period,
+            most,
+            all_samples,
+            host.setting.bounds,
+            self.dtype,
+            self.device,
+            self._compiled,
+        )
+        self._rows = Rows(host, most, self.device, self.dtype)
+
+    def reset(
+        self, *, seed: Any = None, options: Mapping[str, Any] | None = None
+    ) -> tuple[Tensor, Infos]:
+        """Start episodes; seeds, options and errors are those of `StabilityVectorEnv`."""
+        host, told = self._host, dict(options or {})
+        mask = told.get("reset_mask")
+        if isinstance(mask, torch.Tensor):
+            mask = told["reset_mask"] = mask.cpu().numpy()
+        chosen = np.flatnonzero(mask_of(mask, self.num_envs))
+        free = {name: value for name, value in told.items() if name != "reset_mask"}
+        made, _ = host.optioned(free, chosen.tolist())
+        most = self._most_of(template for template, _ in made)
+        if most == self._rows.most:
+            host.reset(seed=seed, options=told)
+            self._rows.take_over(host, chosen)
+        else:
+            self._rows.give_back(host)
+            host.reset(seed=seed, options=told)
+            self._build(most)
+        self._started, self._waiting = True, bool(self._rows.held.over.any())
+        return self._rows.brought.obs, self._infos()
+
+    def step(self, actions: Any) -> tuple[Tensor, Tensor, Tensor, Tensor, Infos]:
+        """Hold each row's action for one control period."""
+        if not self._started:
+            raise ResetNeeded("no episode was started: call reset() first")
+        if self._waiting and self._mode == AutoresetMode.DISABLED:
+            over = self._rows.held.over.nonzero()[:, 0].tolist()
+            raise ResetNeeded(
+                f"the episode is over in {named(over)}: call reset() with a reset_mask"
+            )
+        setting, rows = self._host.setting, self._rows
+        fail = setting.on_bad_action == "fail"
+        told = told_actions(
+            actions, self.num_envs, setting.action_width, fail, self.device, self.dtype
+        )
+        with torch.no_grad():
+            held, brought = self._step(rows.params, rows.keys, rows.held, told)
+        flags = torch.stack((brought.refused.any(), held.over.any()))
+        refused, ended = flags.tolist()  # the one time the device is waited for
+        if refused and not fail:
+            bad = brought.refused.nonzero()[:, 0].tolist()
+            raise ValueError(
+                f"the action of {named(bad)} is not finite, {told[bad[0]].tolist()}; "
+                "nothing was stepped"
+            )
+        resting = rows.held.over if self._waiting else None
+        rows.held, rows.brought, self._waiting = held, brought, ended
+        infos: Infos = {}
+        if resting is not None:
+            self._restart(resting)
+        if ended and self._mode == AutoresetMode.SAME_STEP:
+            infos = {"final_obs": brought.obs, "final_info": self._infos()}
+            infos |= {f"_{key}": held.over for key in infos}
+            self._restart(held.over)
+            self._waiting = False
+        infos |= self._infos()
+        return rows.brought.obs, brought.rewards, brought.terminated, brought.truncated, infos
+
+    def _restart(self, over: Tensor) -> None:
+        """Reset these rows (N,) without options."""
+        chosen = over.nonzero()[:, 0].cpu().numpy()
+        self._host.restart(chosen)
+        self._host.over[chosen] = False
+        self._rows.take_over(self._host, chosen)
+
+    def _infos(self) -> Infos:
+        """The numbers of `info` of every row, (N,) each."""
+        report = self._rows.held.report
+        infos: Infos = dict(zip(Report._fields, report[: REPORT.failure].unbind(0), strict=False))
+        infos["failure"] = failure = report[REPORT.failure].to(torch.int64)
+        infos["is_success"] = (report[REPORT.ended] == 1.0) & (failure == RUNNING)
+        return infos
+
+    @property
+    def rows(self) -> Tensor:
+        """The fast rows of the newest record, (N, n, FAST_WIDTH)."""
+        return self._rows.brought.rows.permute(2, 0, 1)
+
+    @property
+    def packets(self) -> Tensor:
+        """The packets of the newest record, (N, most, PACKET_WIDTH)."""
+        return self._rows.brought.packets.permute(2, 0, 1)
+
+    @property
+    def ticks_done(self) -> Tensor:
+        """How many of `rows` are there, (N,)."""
+        return self._rows.brought.done.to(torch.int64)
+
+    @property
+    def delivered(self) -> Tensor:
+        """How many of `packets` are there, (N,)."""
+        return self._rows.brought.delivered.to(torch.int64)
+
+    @property
+    def motion(self) -> Tensor:
+        """The true `Motion` of each row now, (N, len(Motion)), in SI units."""
+        return self._rows.held.motion.T.clone()
+
+    def get_state(self) -> dict[str, Any]:
+        """A snapshot of all rows, which `StabilityVectorEnv.set_state` takes too."""
+        self._rows.give_back(self._host)
+        return self._host.get_state()
+
+    def set_state(self, snapshot: Mapping[str, Any]) -> None:
+        """Go back to a snapshot of this env, or of a `StabilityVectorEnv` built with the same
+        arguments.
+
+        Raises ValueError for one of another number of rows, control period or observation, and one
+        whose rows have another kind of plant.
+        """
+        templates = {id(each): each for each in snapshot["templates"]}
+        most = self._most_of(templates.values())
+        self._host.set_state(snapshot)
+        self._build(most)
+        self._started, self._waiting = snapshot["started"], bool(self._rows.held.over.any())
+
+
+def _kind_of(template: Template) -> Kind:
+    return Kind(*map(int, kind_of(template.params, template.switches)))

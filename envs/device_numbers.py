@@ -1,0 +1,58 @@
+"""Tensors for the equations' text: torch's table of primitives.
+
+`plain(function, numbers(torch.float64))` is the plant's own text on tensors with a vehicle in each
+place. Both sides of a condition are computed, so nothing ever waits for the device.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+from .backend import plain
+
+try:
+    import torch as torch  # for the other modules of the device engine
+except ModuleNotFoundError:
+    raise ModuleNotFoundError(
+        "the device engine needs torch: pip install 'sideslip[train]'"
+    ) from None
+
+DTYPES = {"float64": torch.float64, "float32": torch.float32}
+
+
+def numbers(dtype: torch.dtype) -> dict[str, Callable[..., Any]]:
+    """The primitives for tensors whose floats are of `dtype`, by the names the equations use.
+
+    Numbers that are no tensors are computed as Python's. What is not a number is treated as by the
+    compiled text: the smaller and the larger of NaN and b are b.
+    """
+
+    def select(condition: Any, a: Any, b: Any) -> Any:
+        if not isinstance(condition, torch.Tensor):
+            return a if condition else b
+        if isinstance(a, float) and not isinstance(b, torch.Tensor):
+            a = torch.full((), a, dtype=dtype, device=condition.device)  # else: torch's default
+        return torch.where(condition, a, b)
+
+    def to_float(a: Any) -> Any:
+        return a.to(dtype) if isinstance(a, torch.Tensor) else a * 1.0
+
+    return {
+        "minimum": lambda a, b: select(a < b, a, b),
+        "maximum": lambda a, b: select(a > b, a, b),
+        "absolute": lambda a: torch.abs(a) if isinstance(a, torch.Tensor) else abs(a),
+        "floor": lambda a: torch.floor(a) if isinstance(a, torch.Tensor) else math.floor(a) * 1.0,
+        "sqrt": lambda a: torch.sqrt(a) if isinstance(a, torch.Tensor) else math.sqrt(a),
+        "select": select,
+        "to_float": to_float,
+        "whole": lambda a: a.to(torch.int64) if isinstance(a, torch.Tensor) else int(a),
+        "anywhere": lambda condition: isinstance(condition, torch.Tensor) or condition,
+        "fixed_tuple": lambda vector, length: vector[:length].unbind(0),
+        "at": lambda array, *index: array[index],
+    }
+
+
+def on_tensors(dtype: torch.dtype, *functions: Callable[..., Any]) -> list[Any]:
+    """The functions' text on tensors whose floats are of `dtype`."""
+    table = numbers(dtype)
+    return [plain(function, table) for function in functions]

@@ -1,0 +1,234 @@
+"""The slow sensors of an env-step on tensors: captures, packets under way, deliveries.
+
+A row's packets lie in the order of their arrival, (arrived, captured, sensor), those under way
+first and nothing behind them. An env-step puts the new ones to them, puts all in order, and takes
+off the front what has arrived.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from .backend import select
+from .delivery import FAR
+from .device_numbers import on_tensors, torch
+from .dynamics import Motion, Road
+from .elementary import exp
+from .layout import P, Slow, Z
+from .noise import CHANNELS, normals
+from .record import CAMERA, PACKET, PACKET_WIDTH, VALUES
+from .sensors import (
+    NEVER,
+    Link,
+    Noise,
+    Sky,
+    arrivals,
+    camera_sample,
+    gps_sample,
+    most_under_way,
+    sky_deviation,
+)
+
+Tensor = torch.Tensor
+_NEWEST = Slow._fields.index("captured")
+_LATE = 1 << 62  # the place of what never arrives
+_AT = {
+    name: (start, start + len(part._fields))
+    for name, start, part in (
+        ("road", P.road, Road),
+        ("noise", P.noise, Noise),
+        ("camera", P.camera, Link),
+        ("gps", P.gps, Link),
+        ("sky", P.sky, Sky),
+    )
+}
+
+
+class Under(NamedTuple):
+    """The slow sensors' part of the rows' state."""
+
+    slow: Tensor  # (2, len(Slow), N)
+    sky: Tensor  # (N,)
+    queue: Tensor  # (room, PACKET_WIDTH, N), by arrival
+
+
+class Delivered(NamedTuple):
+    """What arrived in an env-step."""
+
+    packets: Tensor  # (most, PACKET_WIDTH, N)
+    count: Tensor  # (N,), how many of them are there
+
+
+class Window(NamedTuple):
+    """The ticks of an env-step: after `first`, up to `last`, (N,) each."""
+
+    first: Tensor
+    last: Tensor
+    running: Tensor  # rows that were stepped
+    track: Tensor  # (n, len(Motion), N), where the car was at each tick
+
+
+class Most(NamedTuple):
+    """What a sensor needs room for."""
+
+    frames: int  # captured in an env-step
+    under_way: int  # packets at once
+    copies: int  # of a packet
+
+
+def most_of(links: Sequence[Link], n: int) -> Most:
+    """What sensors with any of these links need in an env-step of n ticks."""
+    return Most(
+        max(-int(-n // link.period) for link in links),
+        max(most_under_way(link) for link in links),
+        2 if any(link.duplicate > 0.0 for link in links) else 1,
+    )
+
+
+class SlowSensors:
+    """The slow sensors of a batch: those present, and what each one needs room for."""
+
+    def __init__(self, most: dict[int, Most], small_angle: int, dtype: torch.dtype) -> None:
+        self.most, self._small_angle = most, small_angle
+        self._normals, self._arrivals, self._camera, self._gps = on_tensors(
+            dtype, normals, arrivals, camera_sample, gps_sample
+        )
+        self._sky, self._exp, self._select = on_tensors(dtype, sky_deviation, exp, select)
+
+    def __call__(
+        self, p: Tensor, keys: Tensor, under: Under, window: Window
+    ) -> tuple[Under, Delivered]:
+        """The slow sensors' state after an env-step, and what arrived in it."""
+        sensors, sky = [each.unbind(0) for each in under.slow.unbind(0)], under.sky
+        new: list[Tensor] = []
+        for sensor, most in self.most.items():
+            for _ in range(most.frames):
+                sensors[sensor], sky, packets = self._capture(
+                    sensor, p, keys, sensors[sensor], sky, window
+                )
+                new += packets
+        queue = in_order(torch.cat([under.queue, torch.stack(new)]))
+        arrived = queue[:, PACKET.arrived]
+        due = (arrived != NEVER) & (arrived <= window.last) & window.running
+        count = due.sum(0)
+        slow = self._newest([list(each) for each in sensors], queue, due)
+        left = taken_off(queue, count)[: len(under.queue)]
+        return Under(slow, sky, left), Delivered(queue, count)
+
+    def _capture(
+        self, sensor: int, p: Tensor, keys: Tensor, slow: Any, sky: Tensor, window: Window
+    ) -> tuple[Any, Tensor, list[Tensor]]:
+        """The next frame of a sensor where it falls into the window: (the sensor's and the sky's
+        state then, its packets, of which those that are none never arrive)."""
+        pick = self._select
+        frame, tick = slow[0], slow[1]
+        active = window.running & (tick > window.first) & (tick <= window.last)
+        when = tick.to(torch.int64)
+        j = (when - window.first.to(torch.int64) - 1).clamp(0, len(window.track) - 1)
+        width = window.track.shape[1]
+        place = j.expand(1, width, -1)
+        motion = Motion(*window.track.gather(0, place)[0].unbind(0))
+        noise = Noise(*p[slice(*_AT["noise"])].unbind(0))
+        zero, one = torch.zeros_like(tick), torch.ones_like(tick)
+        if sensor == CAMERA:
+            link = Link(*p[slice(*_AT["camera"])].unbind(0))
+            road = Road(*p[slice(*_AT["road"])].unbind(0))
+            n = self._normals(keys[0], keys[1], when, CHANNELS.camera)
+            psi, y_l = self._camera(motion, road, p[P.car + 11], noise, n)
+            values, quality = (psi, y_l, zero, zero, zero, zero), one
+        else:
+            link = Link(*p[slice(*_AT["gps"])].unbind(0))
+            law = Sky(*p[slice(*_AT["sky"])].unbind(0))
+            n = self._normals(keys[0], keys[1], when, CHANNELS.gps)
+            seen = self._normals(keys[0], keys[1], when, CHANNELS.sky)
+            sky = pick(active, self._sky(sky, law, link, tick, seen), sky)
+            *values, quality = self._gps(
+                motion,
+                p[P.car + 17],
+                p[P.car + 18],
+                self._exp(law.median + sky),
+                law.weight,
+                noise,
+                n,
+                self._small_angle,
+            )
+        block = CHANNELS.camera_link if sensor == CAMERA else CHANNELS.gps_link
+        packets = []
+        both = self._arrivals(link, frame, tick, keys[0], keys[1], block)
+        for arrived in both[: self.most[sensor].copies]:
+            due = pick(active, arrived, NEVER)
+            packets.append(
+                torch.stack((torch.full_like(tick, sensor), tick, due, quality, frame, *values))
+            )
+        following = (pick(active, frame + 1.0, frame), pick(active, tick + link.period, tick))
+        return (*following, *slow[2:]), sky, packets
+
+    def _newest(self, sensors: list[Any], queue: Tensor, due: Tensor) -> Tensor:
+        """The sensors' state (2, len(Slow), N) once the due packets were looked at in order."""
+        pick = self._select
+        for i in range(len(queue)):
+            packet = queue[i].unbind(0)
+            for sensor in self.most:
+                slow = sensors[sensor]
+                better = due[i] & (packet[PACKET.sensor] == sensor)
+                better = better & (packet[PACKET.captured] > slow[_NEWEST])
+                told = (
+                    packet[PACKET.captured],
+                    *packet[PACKET.value : PACKET.value + VALUES],
+                    packet[PACKET.arrived],
+                )
+                for k, value in enumerate(told, _NEWEST):
+                    slow[k] = pick(better, value, slow[k])
+        return torch.stack([torch.stack(tuple(each)) for each in sensors])
+
+
+def in_order(queue: Tensor) -> Tensor:
+    """Packets (count, PACKET_WIDTH, N) by (arrived, captured, sensor), those that never arrive
+    last."""
+    whole = queue[:, :3].to(torch.int64)
+    arrived = whole[:, PACKET.arrived]
+    key = (arrived << 32) + 2 * whole[:, PACKET.captured] + whole[:, PACKET.sensor]
+    key = torch.where(queue[:, PACKET.arrived] == NEVER, _LATE, key)
+    place = torch.arange(len(queue), device=queue.device)[:, None]
+    mine, other = key[:, None], key[None]
+    ahead = (other < mine) | ((other == mine) & (place[None] < place[:, None]))
+    rank = ahead.sum(1)
+    order = torch.empty_like(rank).scatter_(0, rank, place.expand_as(rank))
+    return queue.gather(0, order[:, None].expand(-1, PACKET_WIDTH, -1))
+
+
+def taken_off(queue: Tensor, count: Tensor) -> Tensor:
+    """What is left of packets in order, (room, PACKET_WIDTH, N), without the first `count` (N,)."""
+    place = torch.arange(len(queue), device=queue.device)[:, None] + count
+    gone = place >= len(queue)
+    place = place.clamp(max=len(queue) - 1)
+    left = queue.gather(0, place[:, None].expand(-1, PACKET_WIDTH, -1))
+    head, arrived, tail = left.split((PACKET.arrived, 1, PACKET_WIDTH - PACKET.arrived - 1), 1)
+    return torch.cat((head, arrived.masked_fill(gone[:, None], NEVER), tail), 1)
+
+
+def unpacked(states: Tensor, room: int) -> Under:
+    """The slow sensors' part of packed states (Z.end, N); ValueError where more packets are under
+    way than there is room for."""
+    slow = states[Z.camera : Z.queue].reshape(2, len(Slow._fields), -1)
+    queue = states[Z.queue : Z.sky].reshape(-1, PACKET_WIDTH, states.shape[1]).clone()
+    place = torch.arange(len(queue), device=queue.device)[:, None]
+    queue[:, PACKET.arrived] = torch.where(
+        place < states[Z.under_way], queue[:, PACKET.arrived], NEVER
+    )
+    queue = in_order(queue)
+    if bool((queue[room:, PACKET.arrived] != NEVER).any()):
+        raise ValueError(f"a state has more than {room} packets under way")
+    return Under(slow.clone(), states[Z.sky].clone(), queue[:room].clone())
+
+
+def packed(under: Under, states: Tensor) -> None:
+    """Write the slow sensors' part into packed states (Z.end, N)."""
+    count = states.shape[1]
+    states[Z.camera : Z.queue] = under.slow.reshape(-1, count)
+    states[Z.queue : Z.sky] = 0.0
+    flat = under.queue.reshape(-1, count)
+    states[Z.queue : Z.queue + len(flat)] = flat
+    states[Z.sky] = under.sky
+    arrived = under.queue[:, PACKET.arrived]
+    states[Z.under_way] = (arrived != NEVER).sum(0).to(states.dtype)
+    states[Z.clock + 5] = torch.where(arrived[0] == NEVER, FAR, arrived[0])

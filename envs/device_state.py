@@ -1,0 +1,108 @@
+"""What is told and kept at the border of the device engine: the device, the floats, the actions,
+and the rows' state in the packed form of the other engines."""
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from .border import actions_of
+from .device_numbers import DTYPES, torch
+from .device_slow import packed, unpacked
+from .device_step import Held
+from .dynamics import Motion
+from .layout import Array, Drive, Z
+
+Tensor = torch.Tensor
+_MOTION, _DRIVE = len(Motion._fields), len(Drive._fields)
+
+
+def device_of(device: Any) -> torch.device:
+    """The device of a name or itself; ValueError for an unknown one and one that is not there."""
+    try:
+        made = torch.device(device)
+    except (RuntimeError, TypeError):
+        made = None
+    if made is None or made.type not in ("cpu", "cuda"):
+        raise ValueError(f"unknown device {device!r}; known: 'cpu', 'cuda', 'cuda:0', ...")
+    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    if made.type == "cuda" and (made.index or 0) >= count:
+        there = ", ".join(["cpu", *(f"cuda:{i}" for i in range(count))])
+        raise ValueError(
+            f"device {str(device)!r} is not there: torch {torch.__version__} finds {there}"
+        )
+    return made
+
+
+def dtype_of(dtype: Any) -> torch.dtype:
+    """The type of floats of a name or itself; ValueError for another."""
+    known = DTYPES | {each: each for each in DTYPES.values()}
+    if dtype not in known:
+        raise ValueError(f"dtype is 'float64' or 'float32', got {dtype!r}")
+    return known[dtype]
+
+
+def told_actions(
+    actions: Any, count: int, width: int, fail: bool, device: torch.device, dtype: torch.dtype
+) -> Tensor:
+    """Actions (count, width) rounded to float32 as the other engines take them.
+
+    Of a tensor the shape and the device must be right, else ValueError; with `fail` a wrong shape
+    is NaN. Anything else is brought to the device as the vector env takes it.
+    """
+    if not isinstance(actions, torch.Tensor):
+        force: Tensor = torch.as_tensor(actions_of(actions, count, width, fail))
+        return force.to(device, dtype)
+    if actions.device.type != device.type:
+        raise ValueError(
+            f"actions are on {actions.device}, the env on {device}; nothing was stepped"
+        )
+    if actions.shape != (count, width):
+        if not fail:
+            raise ValueError(
+                f"actions have shape ({count}, {width}), got {tuple(actions.shape)}; "
+                "nothing was stepped"
+            )
+        actions = torch.full((count, width), torch.nan, device=device)
+    force = actions.detach().to(torch.float32)
+    return force.to(dtype)
+
+
+def held_of(
+    states: Array,
+    over: npt.NDArray[np.bool_],
+    reports: Array,
+    room: int,
+    device: torch.device,
+    dtype: torch.dtype,
+) -> tuple[Held, Tensor]:
+    """The state on the device, and the keys (2, N), of packed states (N, Z.end)."""
+    whole = torch.as_tensor(states.T.copy())
+    under = unpacked(whole, room)
+    held = Held(
+        whole[Z.motion : Z.motion + _MOTION],
+        whole[Z.drive : Z.drive + _DRIVE],
+        whole[Z.driver],
+        whole[Z.clock + 2],
+        whole[Z.clock + 3],
+        *under,
+        torch.as_tensor(over.copy()),
+        torch.as_tensor(reports.T.copy()),
+    )
+    moved = [each.to(device, None if each.dtype == torch.bool else dtype) for each in held]
+    return Held(*moved), whole[Z.clock : Z.clock + 2].to(device, torch.int64)
+
+
+def write_states(held: Held, states: Array) -> None:
+    """Write the state into packed states (N, Z.end), whose keys and redraws are already there."""
+    whole = torch.as_tensor(states.T.copy())
+    here = Held(
+        *(each.cpu() if each.dtype == torch.bool else each.cpu().to(torch.float64) for each in held)
+    )
+    whole[Z.motion : Z.motion + _MOTION] = here.motion
+    whole[Z.drive : Z.drive + _DRIVE] = here.drive
+    whole[Z.driver] = here.driver
+    whole[Z.clock + 2] = here.tick
+    whole[Z.clock + 3] = here.failure
+    packed(here.under, whole)
+    states[:] = whole.numpy().T

@@ -1,0 +1,136 @@
+"""One env-step of all rows on tensors, from their state to the next and what they tell: a pure
+function that never waits for the device."""
+
+from typing import NamedTuple
+
+from .backend import select
+from .device_numbers import on_tensors, torch
+from .device_slow import Most, SlowSensors, Under, Window
+from .device_tell import Telling
+from .device_ticks import Now, Ticks, start_of
+from .layout import Array, P
+from .summary import clip
+from .switches import BAD_ACTION, REPORT, RUNNING
+from .tick import Kind
+
+Tensor = torch.Tensor
+
+
+class Held(NamedTuple):
+    """What an env-step changes of the rows' state; the rows are the last axis."""
+
+    motion: Tensor  # (len(Motion), N)
+    drive: Tensor  # (len(Drive), N)
+    driver: Tensor  # (N,)
+    tick: Tensor
+    failure: Tensor
+    slow: Tensor  # the fields of `Under`
+    sky: Tensor
+    queue: Tensor
+    over: Tensor  # (N,) of bool
+    report: Tensor  # (len(Report), N)
+
+    @property
+    def under(self) -> Under:
+        """The slow sensors' part."""
+        return Under(self.slow, self.sky, self.queue)
+
+
+class Brought(NamedTuple):
+    """What an env-step brings."""
+
+    obs: Tensor  # (N, k), float32; zeros where the row had no tick
+    rewards: Tensor  # (N,)
+    terminated: Tensor
+    truncated: Tensor
+    refused: Tensor  # (N,), the action is not finite and counts
+    rows: Tensor  # (n, FAST_WIDTH, N)
+    packets: Tensor  # (most, PACKET_WIDTH, N)
+    done: Tensor  # (N,), how many ticks and packets there are
+    delivered: Tensor
+
+
+class Step:
+    """The env-steps of rows of one kind.
+
+    kind: what chooses the plant's text. most: the slow sensors present and their room. compiled:
+    through `torch.compile`.
+    """
+
+    def __init__(
+        self,
+        kind: Kind,
+        n: int,
+        most: dict[int, Most],
+        all_samples: bool,
+        bounds: Array,
+        dtype: torch.dtype,
+        device: torch.device,
+        compiled: bool,
+    ) -> None:
+        self._n = n
+        self._ticks = Ticks(kind, dtype, compiled)
+        self._slow = SlowSensors(most, kind.small_angle, dtype)
+        told = torch.as_tensor(bounds, dtype=dtype, device=device)
+        self._telling = Telling(tuple(most), all_samples, told, dtype)
+        self._clip, self._select = on_tensors(dtype, clip, select)
+        self._conclude = (
+            torch.compile(self._concluded, fullgraph=True) if compiled else self._concluded
+        )
+
+    def __call__(
+        self, p: Tensor, keys: Tensor, held: Held, actions: Tensor
+    ) -> tuple[Held, Brought]:
+        """(the state after it, what it brings) of one env-step.
+
+        p: (P.end, N). keys: (2, N), int64. actions: (N, width), of the floats of p; rows whose
+        action is not finite fail. Rows that are over stand still.
+        """
+        finite = torch.isfinite(actions).all(1)
+        shares = self._clip(torch.where(finite[:, None], actions, 0.0), -1.0, 1.0)
+        turn = shares[:, 1] if actions.shape[1] > 1 else torch.zeros_like(held.tick)
+        running = finite & ~held.over
+        start = start_of(held.motion, held.drive, held.driver, held.tick, running)
+        now, rows, track = self._ticks.drive_on(p, keys, start, shares[:, 0], turn, self._n)
+        refused = ~finite & ~held.over
+        return self._conclude(p, keys, held, now, rows, track, running, refused)
+
+    def _concluded(
+        self,
+        p: Tensor,
+        keys: Tensor,
+        held: Held,
+        now: Now,
+        rows: Tensor,
+        track: Tensor,
+        running: Tensor,
+        refused: Tensor,
+    ) -> tuple[Held, Brought]:
+        done, duration = now.tick - held.tick, p[P.task]
+        window = Window(held.tick, now.tick, running, track)
+        under, came = self._slow(p, keys, held.under, window)
+        obs = self._telling.observe(rows, done, now, under.slow, came)
+        obs = torch.where(running[:, None], obs, 0.0)
+        told = self._telling.report(now, duration, came.count)
+        report = torch.where(running, told, held.report)
+        refusal = self._telling.refusal(now, duration, held.report)
+        report = torch.where(refused, refusal, report)
+        failure = self._select(running, now.failure, held.failure)
+        failure = self._select(refused, BAD_ACTION * 1.0, failure)
+        stepped = ~held.over
+        terminated = stepped & (failure != RUNNING)
+        truncated = running & (report[REPORT.ended] == 1.0) & ~terminated
+        after = Held(
+            torch.stack(now.motion),
+            torch.stack(now.drive),
+            now.driver,
+            now.tick,
+            failure,
+            *under,
+            terminated | truncated,
+            report,
+        )
+        rewards = torch.where(stepped, -report[REPORT.cost], 0.0)
+        return after, Brought(
+            obs, rewards, terminated, truncated, refused, rows, came.packets, done, came.count
+        )

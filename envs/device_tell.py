@@ -1,0 +1,103 @@
+"""What an env-step tells on tensors: the float32 observation and the numbers of `info`."""
+
+from typing import Any
+
+from .backend import select
+from .device_numbers import on_tensors, torch
+from .device_slow import Delivered
+from .device_ticks import Now, Told
+from .layout import AGE_CAP, SAMPLED, Slow
+from .record import CAMERA, FAST, PACKET, TICK, VALUES
+from .reference import COST_CAP
+from .sensors import NEVER
+from .summary import clip
+from .switches import BAD_ACTION, RUNNING, Report
+
+Tensor = torch.Tensor
+_CAPTURED, _ARRIVED = Slow._fields.index("captured"), Slow._fields.index("arrived")
+_VALUES = _CAPTURED + 1
+
+
+class Telling:
+    """What the rows of a batch tell: `sensors` are the slow ones present."""
+
+    def __init__(
+        self, sensors: tuple[int, ...], all_samples: bool, bounds: Tensor, dtype: torch.dtype
+    ) -> None:
+        """bounds: (2, k), of the observation's entries."""
+        self._sensors, self._all_samples = sensors, all_samples
+        self._bounds = bounds[:, :, None]
+        self._clip, self._select = on_tensors(dtype, clip, select)
+
+    def observe(
+        self, rows: Tensor, done: Tensor, now: Now, slow: Tensor, delivered: Delivered
+    ) -> Tensor:
+        """The summary (N, k), float32.
+
+        rows: (n, FAST_WIDTH, N), of which the first `done` (N,) count. slow: (2, len(Slow), N).
+        """
+        entries: list[Tensor] = []
+        sampled = rows[:, :SAMPLED]
+        if self._all_samples:
+            entries += sampled.transpose(0, 1).flatten(0, 1).unbind(0)
+        else:
+            total: Any = 0.0
+            for j in range(len(rows)):
+                total = total + self._select(j < done, sampled[j], 0.0)
+            entries += torch.stack((sampled[-1], total / done), 1).flatten(0, 1).unbind(0)
+        entries += rows[-1, FAST.steer : FAST.steer + 4].unbind(0)
+        for sensor in self._sensors:
+            entries += self._sensor(sensor, now.tick, slow[sensor], delivered)
+        told = Told(*now.told)
+        entries += [told.beta_ref, told.gamma_ref]
+        low, high = self._bounds.unbind(0)
+        return self._clip(torch.stack(entries), low, high).T.to(torch.float32).contiguous()
+
+    def _sensor(
+        self, sensor: int, tick: Tensor, slow: Tensor, delivered: Delivered
+    ) -> list[Tensor]:
+        """Values, age and freshness of one sensor's newest sample."""
+        captured = slow[_CAPTURED]
+        age = self._select(captured != NEVER, (tick - captured) * TICK, AGE_CAP)
+        packets = delivered.packets
+        place = torch.arange(len(packets), device=tick.device)[:, None]
+        newest = packets[:, PACKET.arrived] == slow[_ARRIVED]  # neither late nor a duplicate
+        fresh = (place < delivered.count) & (packets[:, PACKET.sensor] == sensor) & newest
+        width = 2 if sensor == CAMERA else VALUES
+        values = slow[_VALUES : _VALUES + width].unbind(0)
+        return [*values, age, fresh.any(0).to(tick.dtype)]
+
+    def report(self, now: Now, duration: Tensor, count: Tensor) -> Tensor:
+        """The reports (len(Report), N) of rows that were stepped."""
+        # the rest of the episode is charged: failing never pays
+        rest = COST_CAP * (duration - now.tick) * TICK
+        cost = now.cost + self._select(now.failure != RUNNING, rest, 0.0)
+        told = Told(*now.told)
+        named = {
+            "t": now.tick * TICK,
+            "beta": told.beta,
+            "gamma": now.motion[2],
+            "psi": now.motion[3],
+            "beta_ref": told.beta_ref,
+            "gamma_ref": told.gamma_ref,
+            "steer": told.steer,
+            "yaw_moment": told.moment,
+            "cost": cost,
+            "failure": now.failure,
+            "packets": count.to(cost.dtype),
+            "reward": -cost,
+            "ended": (now.tick >= duration).to(cost.dtype),
+        }
+        return torch.stack([named[name] for name in Report._fields])
+
+    def refusal(self, now: Now, duration: Tensor, before: Tensor) -> Tensor:
+        """The reports of rows that an action which is not finite fails; the rest stays."""
+        cost = COST_CAP * (duration - now.tick) * TICK
+        named = dict(zip(Report._fields, before.unbind(0), strict=True))
+        named |= {
+            "cost": cost,
+            "failure": torch.full_like(cost, BAD_ACTION),
+            "packets": torch.zeros_like(cost),
+            "reward": -cost,
+        }
+        return torch.stack([named[name] for name in Report._fields])

@@ -1,0 +1,155 @@
+"""The ticks of an env-step on tensors: the text of `advance` for all rows, each frozen where its
+episode ends.
+
+A row that fails or whose time is over stands still from then on while the others drive on: nothing
+branches on values, so the device never waits for the host.
+"""
+
+from typing import Any, NamedTuple
+
+from .backend import select
+from .delivery import Chance
+from .device_numbers import on_tensors, torch
+from .dynamics import Motion
+from .kernel import fixed_of
+from .layout import Drive, P
+from .noise import CHANNELS, normals
+from .programme import STEERING_WIDTH, steering_at
+from .record import FAST_WIDTH, TICK
+from .switches import NOT_FINITE, OFF_ROAD, RUNNING, SPIN
+from .tick import Kind, Moving, advance, changed
+
+Tensor = torch.Tensor
+Numbers = tuple[Tensor, ...]
+
+
+class Told(NamedTuple):
+    """What the last tick of a row tells `info`; (N,) each."""
+
+    beta: Any
+    beta_ref: Any
+    gamma_ref: Any
+    steer: Any
+    moment: Any
+
+
+class Now(NamedTuple):
+    """Where the rows are within an env-step; (N,) each, or tuples of such."""
+
+    alive: Tensor  # not frozen yet
+    motion: Numbers
+    drive: Numbers
+    driver: Tensor
+    tick: Tensor
+    failure: Tensor  # codes as floats
+    cost: Tensor
+    told: Numbers
+    row: Numbers  # the newest fast row
+    track: Numbers  # the newest motion, fit for `info` or not
+
+
+class Ticks:
+    """The ticks of rows of one kind."""
+
+    def __init__(self, kind: Kind, dtype: torch.dtype, compiled: bool) -> None:
+        """compiled: a tick, and the chances of all ticks, are one call of `torch.compile` each."""
+        self.kind = kind
+        self._normals, self._steering_at = on_tensors(dtype, normals, steering_at)
+        self._fixed, self._advance, self._changed, self._select = on_tensors(
+            dtype, fixed_of, advance, changed, select
+        )
+        self._dtype = dtype
+        self.tick: Any = torch.compile(self._tick, fullgraph=True) if compiled else self._tick
+        self.foresee: Any = (
+            torch.compile(self._foresee, fullgraph=True) if compiled else self._foresee
+        )
+
+    def _foresee(self, p: Tensor, keys: Tensor, first: Tensor, n: int) -> tuple[Numbers, Any]:
+        """(eight normal numbers, the programme's steering) of n ticks from `first` on, (n, N)."""
+        ticks = first + torch.arange(n, device=first.device)[:, None]
+        whole = ticks.to(torch.int64)
+        inertial = self._normals(keys[0], keys[1], whole, CHANNELS.inertial)
+        wheels = self._normals(keys[0], keys[1], whole, CHANNELS.wheels)
+        if self.kind.follows:
+            return inertial + wheels, None
+        programme = p[P.steering : P.steering + STEERING_WIDTH].unbind(0)
+        return inertial + wheels, self._steering_at(ticks.to(self._dtype), programme)
+
+    def _tick(
+        self, p: Tensor, share: Tensor, turn: Tensor, now: Now, chance: Numbers, ahead: Any
+    ) -> Now:
+        """One tick of the rows that are alive.
+
+        p: (P.end, N). share, turn: (N,), of the yaw moment and the added steering.
+        """
+        pick = self._select
+        fixed = self._fixed(p)
+        task = fixed.task
+        car = self._changed(fixed.car, fixed.change, now.tick > fixed.change.tick)
+        # the load at the tick's start is computed anew where `anywhere` holds, and here it does
+        before = Moving(Motion(*now.motion), Drive(*now.drive), None, now.driver, car)
+        after, seen = self._advance(
+            fixed,
+            share * task.yaw_scale,
+            turn * task.authority,
+            before,
+            now.tick,
+            Chance(chance[:4], chance[4:]),
+            ahead,
+            self.kind,
+        )
+        alive, fit = now.alive, now.alive & ~seen.lost
+        tick = now.tick + alive
+        failure = pick(seen.spun, SPIN * 1.0, pick(seen.off, OFF_ROAD * 1.0, RUNNING * 1.0))
+        failure = pick(seen.lost, NOT_FINITE * 1.0, failure)
+        refs = [pick(seen.lost, 0.0, each) for each in seen.refs]
+        told = (pick(seen.lost, 0.0, seen.beta), *refs, seen.steer, seen.moment)
+
+        def kept(where: Tensor, new: Any, old: Any) -> Numbers:
+            return tuple(pick(where, a, b) for a, b in zip(new, old, strict=True))
+
+        return Now(
+            alive & (failure == RUNNING) & (tick < task.duration),
+            kept(fit, after.motion, now.motion),
+            kept(alive, after.drive, now.drive),
+            pick(alive, after.driver, now.driver),
+            tick,
+            pick(alive, failure, now.failure),
+            now.cost + pick(alive, seen.cost * TICK, 0.0),
+            kept(alive, told, now.told),
+            kept(alive, seen.row, now.row),
+            kept(alive, after.motion, now.track),
+        )
+
+    def drive_on(
+        self, p: Tensor, keys: Tensor, start: Now, share: Tensor, turn: Tensor, n: int
+    ) -> tuple[Now, Tensor, Tensor]:
+        """n ticks, fewer for rows that fail or end: (where they are then, the fast rows, the
+        motions), of the latter (n, width, N); a row's last ones stand for those it does not have.
+        """
+        chances, ahead = self.foresee(p, keys, start.tick + 1, n)
+        now, rows, track = start, [], []
+        for j in range(n):
+            chance = tuple(each[j] for each in chances)
+            now = self.tick(p, share, turn, now, chance, None if ahead is None else ahead[j])
+            rows.append(torch.stack(now.row))
+            track.append(torch.stack(now.track))
+        return now, torch.stack(rows), torch.stack(track)
+
+
+def start_of(motion: Tensor, drive: Tensor, driver: Tensor, tick: Tensor, alive: Tensor) -> Now:
+    """Where rows are at the start of an env-step."""
+    zero = torch.zeros_like(tick)
+    motions = motion.unbind(0)
+    return Now(
+        alive,
+        motions,
+        drive.unbind(0),
+        driver,
+        tick,
+        zero,
+        zero,
+        (zero,) * len(Told._fields),
+        (zero,) * FAST_WIDTH,
+        motions,
+    )
