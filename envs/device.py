@@ -213,17 +213,22 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
     @property
     def ticks_done(self) -> Tensor:
         """How many of `rows` are there, (N,)."""
-        return self._rows.brought.done.to(torch.int64)
+        return self._rows.brought.done
 
     @property
     def delivered(self) -> Tensor:
         """How many of `packets` are there, (N,)."""
-        return self._rows.brought.delivered.to(torch.int64)
+        return self._rows.brought.delivered
 
     @property
     def motion(self) -> Tensor:
         """The true `Motion` of each row now, (N, len(Motion)), in SI units."""
         return self._rows.held.motion.T.clone()
+
+    @property  # type: ignore[misc]  # without a setter, as in the vector env
+    def np_random(self) -> tuple[np.random.Generator, ...]:  # type: ignore[override]
+        """Each row's generator, on the host, which draws one 64-bit key a reset."""
+        return self._host.np_random
 
     def get_state(self) -> dict[str, Any]:
         """A snapshot of all rows, which `StabilityVectorEnv.set_state` takes too."""

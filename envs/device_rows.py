@@ -83,7 +83,7 @@ class Rows:
             none,
             there(fleet.rows[rows], 1, 2, 0),
             there(packets, 1, 2, 0),
-            there(fleet.ticks_done[rows], 0),
-            there(fleet.delivered[rows], 0),
+            torch.as_tensor(fleet.ticks_done[rows]).to(device),
+            torch.as_tensor(fleet.delivered[rows]).to(device),
         )
         return there(fleet.params[rows], 1, 0), keys, held, brought

@@ -55,7 +55,7 @@ class Delivered(NamedTuple):
     """What arrived in an env-step."""
 
     packets: Tensor  # (most, PACKET_WIDTH, N)
-    count: Tensor  # (N,), how many of them are there
+    number: Tensor  # (N,), how many of them are there
 
 
 class Window(NamedTuple):
@@ -202,8 +202,9 @@ def taken_off(queue: Tensor, count: Tensor) -> Tensor:
     gone = place >= len(queue)
     place = place.clamp(max=len(queue) - 1)
     left = queue.gather(0, place[:, None].expand(-1, PACKET_WIDTH, -1))
-    head, arrived, tail = left.split((PACKET.arrived, 1, PACKET_WIDTH - PACKET.arrived - 1), 1)
-    return torch.cat((head, arrived.masked_fill(gone[:, None], NEVER), tail), 1)
+    before, after = left[:, : PACKET.arrived], left[:, PACKET.arrived + 1 :]
+    arrived = left[:, PACKET.arrived].masked_fill(gone, NEVER)
+    return torch.cat((before, arrived[:, None], after), 1)
 
 
 def unpacked(states: Tensor, room: int) -> Under:

@@ -46,7 +46,7 @@ class Brought(NamedTuple):
     refused: Tensor  # (N,), the action is not finite and counts
     rows: Tensor  # (n, FAST_WIDTH, N)
     packets: Tensor  # (most, PACKET_WIDTH, N)
-    done: Tensor  # (N,), how many ticks and packets there are
+    done: Tensor  # (N,), how many ticks and packets there are, int64
     delivered: Tensor
 
 
@@ -111,7 +111,7 @@ class Step:
         under, came = self._slow(p, keys, held.under, window)
         obs = self._telling.observe(rows, done, now, under.slow, came)
         obs = torch.where(running[:, None], obs, 0.0)
-        told = self._telling.report(now, duration, came.count)
+        told = self._telling.report(now, duration, came.number)
         report = torch.where(running, told, held.report)
         refusal = self._telling.refusal(now, duration, held.report)
         report = torch.where(refused, refusal, report)
@@ -132,5 +132,13 @@ class Step:
         )
         rewards = torch.where(stepped, -report[REPORT.cost], 0.0)
         return after, Brought(
-            obs, rewards, terminated, truncated, refused, rows, came.packets, done, came.count
+            obs,
+            rewards,
+            terminated,
+            truncated,
+            refused,
+            rows,
+            came.packets,
+            done.to(torch.int64),
+            came.number,
         )

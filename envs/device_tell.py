@@ -51,7 +51,8 @@ class Telling:
         told = Told(*now.told)
         entries += [told.beta_ref, told.gamma_ref]
         low, high = self._bounds.unbind(0)
-        return self._clip(torch.stack(entries), low, high).T.to(torch.float32).contiguous()
+        clipped: Tensor = self._clip(torch.stack(entries), low, high)
+        return clipped.T.to(torch.float32).contiguous()
 
     def _sensor(
         self, sensor: int, tick: Tensor, slow: Tensor, delivered: Delivered
@@ -62,7 +63,7 @@ class Telling:
         packets = delivered.packets
         place = torch.arange(len(packets), device=tick.device)[:, None]
         newest = packets[:, PACKET.arrived] == slow[_ARRIVED]  # neither late nor a duplicate
-        fresh = (place < delivered.count) & (packets[:, PACKET.sensor] == sensor) & newest
+        fresh = (place < delivered.number) & (packets[:, PACKET.sensor] == sensor) & newest
         width = 2 if sensor == CAMERA else VALUES
         values = slow[_VALUES : _VALUES + width].unbind(0)
         return [*values, age, fresh.any(0).to(tick.dtype)]
