@@ -9,11 +9,12 @@ from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, VectorEnv
 
 from .border import count_of, mask_of, mode_of, named
+from .device_graph import Graphed
 from .device_numbers import torch
 from .device_rows import Rows
 from .device_slow import Most, most_of
-from .device_state import device_of, dtype_of, told_actions
-from .device_step import Step
+from .device_state import compiles, device_of, dtype_of, told_actions
+from .device_step import Brought, Held, Step
 from .kernel import kind_of
 from .layout import P
 from .record import CAMERA, SLOW_NAMES
@@ -40,7 +41,8 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
     arguments: those of `StabilityEnv`. device: "cpu", "cuda", "cuda:1", ... dtype: "float64" or
     "float32". autoreset_mode: "NextStep", "SameStep" or "Disabled", as of `StabilityVectorEnv`.
     compile: a tick and what follows the ticks go through `torch.compile`, which takes minutes
-    once, and on the CPU needs a C++ compiler.
+    once, and on the CPU needs a C++ compiler (without one it warns and does not). graph: a step is
+    the launch of one CUDA graph.
 
     ## Tensors
     Observations are (N, k) float32, rewards (N,), `terminated` and `truncated` (N,) of bool.
@@ -66,11 +68,16 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
         dtype: Any = "float64",
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         compile: bool = False,
+        graph: bool = False,
         **arguments: Any,
     ) -> None:
         self.num_envs = count_of(num_envs)
         self._mode = mode_of(autoreset_mode)
-        self.device, self.dtype, self._compiled = device_of(device), dtype_of(dtype), compile
+        self.device, self.dtype = device_of(device), dtype_of(dtype)
+        self._compiled = compiles(compile, self.device)
+        self._graphed = graph
+        if graph and self.device.type != "cuda":
+            raise ValueError(f"graph=True needs a CUDA device, got {self.device}")
         self._host = host = StabilityVectorEnv(num_envs, **arguments)  # it resets the rows
         self.layout, self.control_period = host.layout, host.control_period
         self.reference = host.reference
@@ -114,7 +121,7 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
         """The step with this room, and all rows on the device."""
         host = self._host
         all_samples = bool(host.setting.base.switches[_ALL])
-        self._step = Step(
+        step = Step(
             self._kind,
             self.control_period,
             most,
@@ -124,6 +131,7 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
             self.device,
             self._compiled,
         )
+        self._step = Graphed(step) if self._graphed else step
         self._rows = Rows(host, most, self.device, self.dtype)
 
     def reset(
@@ -224,6 +232,10 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
     def motion(self) -> Tensor:
         """The true `Motion` of each row now, (N, len(Motion)), in SI units."""
         return self._rows.held.motion.T.clone()
+
+    def tensors(self) -> tuple[Held, Brought]:
+        """What the device holds of the rows, and what the newest step brought; the env's own."""
+        return self._rows.held, self._rows.brought
 
     @property  # type: ignore[misc]  # without a setter, as in the vector env
     def np_random(self) -> tuple[np.random.Generator, ...]:  # type: ignore[override]

@@ -34,15 +34,17 @@ class Rows:
         """Bring rows of the fleet that were reset to the device."""
         params, keys, held, brought = self._of(fleet, rows)
         if len(rows) == len(fleet.params):
-            self.params, self.keys, self.held, self.brought = params, keys, held, brought
+            self.params.copy_(params)  # in place: a graph reads them where they are
+            self.keys.copy_(keys)
+            self.held, self.brought = held, brought
             return
         place = torch.as_tensor(rows, device=self._device)
 
         def merged(old: Tensor, new: Tensor, axis: int = -1) -> Tensor:
             return old.index_copy(axis, place, new)
 
-        self.params.index_copy_(-1, place, params)  # large, and nobody else's
-        self.keys = merged(self.keys, keys)
+        self.params.index_copy_(-1, place, params)
+        self.keys.index_copy_(-1, place, keys)
         self.held = Held(*map(merged, self.held, held))
         before = self.brought
         record = map(merged, before[_RECORD:], brought[_RECORD:])

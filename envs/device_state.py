@@ -1,6 +1,9 @@
 """What is told and kept at the border of the device engine: the device, the floats, the actions,
 and the rows' state in the packed form of the other engines."""
 
+import os
+import shutil
+import warnings
 from typing import Any
 
 import numpy as np
@@ -32,6 +35,21 @@ def device_of(device: Any) -> torch.device:
             f"device {str(device)!r} is not there: torch {torch.__version__} finds {there}"
         )
     return made
+
+
+def compiles(wanted: bool, device: torch.device) -> bool:
+    """Whether `torch.compile` is used: where it is wanted, and a C++ compiler is there for the
+    CPU; without one a warning says so."""
+    compiler = os.environ.get("CXX", "g++")  # where torch looks for it
+    if wanted and device.type == "cpu" and shutil.which(compiler) is None:
+        warnings.warn(
+            f"compile=True needs a C++ compiler on the CPU, and there is no {compiler!r}: "
+            "ticks are not compiled",
+            RuntimeWarning,
+            stacklevel=3,
+        )
+        return False
+    return wanted
 
 
 def dtype_of(dtype: Any) -> torch.dtype:

@@ -45,9 +45,9 @@ def drive(env: StabilityVectorEnv, steps: int, every: int = 1, options: Any = No
         if step % every == 0 or (going & (terminated | truncated)).any():
             numbers = (told[going], rewards[going], terminated[going], truncated[going])
             held.append((_of(before, going), _of(env.get_state(), going), *numbers))
-    before, after, *rest = zip(*held, strict=True)
+    befores, afters, *rest = zip(*held, strict=True)
     actions, rewards, terminated, truncated = [np.concatenate(each) for each in rest]
-    return Moments(_joined(before), actions, _joined(after), rewards, terminated, truncated)
+    return Moments(_joined(befores), actions, _joined(afters), rewards, terminated, truncated)
 
 
 def _of(snapshot: dict[str, Any], going: np.ndarray) -> dict[str, Any]:
@@ -61,7 +61,7 @@ def _joined(snapshots: Any) -> dict[str, Any]:
     templates = [template for each in snapshots for template in each["templates"]]
     nobody: list[None] = [None] * len(templates)
     lists = {"templates": templates, "rng": nobody, "seeds": nobody}
-    return snapshots[0] | joined | lists
+    return {**snapshots[0], **joined, **lists}
 
 
 def episodes(env_id: str, steps: int, every: int = 1, **arguments: Any) -> Moments:

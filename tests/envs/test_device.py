@@ -157,7 +157,7 @@ def test_episodes_follow_each_other_as_in_the_vector_env(mode: str) -> None:
         *wanted, infos = one.step(actions)
         *found, device_infos = other.step(torch.as_tensor(actions))
         for a, b in zip(wanted, found, strict=True):
-            np.testing.assert_allclose(a, b, rtol=0.0, atol=1e-6)
+            np.testing.assert_allclose(np.asarray(a), b, rtol=0.0, atol=1e-6)
         if "final_obs" in infos:
             over = infos["_final_obs"]
             assert device_infos["_final_obs"].tolist() == over.tolist()
@@ -246,6 +246,26 @@ def test_compiled_ticks_are_the_same_and_compiled_once() -> None:
     with torch.compiler.set_stance("fail_on_recompile"):
         for _ in range(3):
             env.step(torch.zeros(env.num_envs, 1))
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@pytest.mark.parametrize("mode", MODES)
+def test_a_graph_gives_the_same_steps(mode: str) -> None:
+    told: dict[str, Any] = {
+        "scenario": {"base": "random-steering", "duration": 0.07},
+        "autoreset_mode": mode,
+        "device": "cuda",
+    }
+    one, other = (
+        DeviceVectorEnv.make(FUSION, 5, **told),
+        DeviceVectorEnv.make(FUSION, 5, graph=True, **told),
+    )
+    for env in (one, other):
+        env.reset(seed=0)
+    for step in range(20):
+        actions = torch.full((5, 1), 0.05 * step, device="cuda")
+        for a, b in zip(one.step(actions)[:4], other.step(actions)[:4], strict=True):
+            assert torch.equal(a, b)
 
 
 def test_nothing_of_the_vector_env_is_changed_by_one_on_a_device() -> None:

@@ -27,6 +27,7 @@ ARGUMENTS: list[tuple[dict[str, Any], type[Exception], str]] = [
     ({"device": "meta"}, ValueError, "unknown device 'meta'; known: 'cpu', 'cuda'"),
     ({"device": None}, ValueError, "unknown device None"),
     ({"device": "cuda:99"}, ValueError, "device 'cuda:99' is not there: torch .* finds cpu"),
+    ({"graph": True}, ValueError, "graph=True needs a CUDA device, got cpu"),
     ({"dtype": "float16"}, ValueError, "dtype is 'float64' or 'float32', got 'float16'"),
     ({"dtype": torch.int64}, ValueError, "dtype is 'float64' or 'float32', got torch.int64"),
     ({"autoreset_mode": "Later"}, ValueError, "'Later'; known: 'NextStep'"),
@@ -45,6 +46,16 @@ def test_arguments(arguments: dict[str, Any], error: type[Exception], message: s
 def test_a_device_that_is_not_there_is_named_with_those_that_are() -> None:
     with pytest.raises(ValueError, match=r"device 'cuda' is not there: torch .* finds cpu"):
         DeviceVectorEnv(device="cuda")
+
+
+def test_without_a_compiler_nothing_is_compiled_and_a_warning_says_so(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("CXX", "no-such-compiler")
+    with pytest.warns(RuntimeWarning, match="there is no 'no-such-compiler': ticks are not compi"):
+        env = DeviceVectorEnv.make(FUSION, 2, compile=True, control_period=1)
+    env.reset(seed=0)
+    env.step(torch.zeros(2, 1))
 
 
 def test_an_id_that_has_no_such_environment() -> None:

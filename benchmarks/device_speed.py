@@ -1,0 +1,164 @@
+"""Question: how many env-steps a second does the device engine take, and what bounds it?
+
+`python -m sideslip.benchmarks.device_speed --device cuda --compile --out table.md`
+"""
+
+import shlex
+import statistics
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import torch
+import typer
+from rich.console import Console
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from ..envs.device import DeviceVectorEnv
+from ..envs.layout import P
+from .rows import check_writable, write_whole
+
+COUNTS = (1024, 16384, 65536, 262144, 1048576)
+ROUNDS = 5
+_COPIED = 1 << 28  # bytes, beyond every cache
+
+
+class Measured(NamedTuple):
+    """What a batch of `count` rows did."""
+
+    count: int
+    rate: float  # env-steps a second of wall time: median, least and largest of the rounds
+    least: float
+    largest: float
+    bytes_a_step: float  # of one row, each number moved once
+    bandwidth: float  # bytes a second of a copy on the same device, read and written
+
+
+def _seconds(work: Callable[[], object], device: torch.device) -> float:
+    start = time.perf_counter()
+    work()
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return time.perf_counter() - start
+
+
+def bandwidth(device: torch.device) -> float:
+    """Bytes a second, read and written, of a copy within the device."""
+    one = torch.ones(_COPIED, dtype=torch.uint8, device=device)
+    other = torch.empty_like(one)
+    taken = [_seconds(lambda: other.copy_(one), device) for _ in range(4)]
+    return 2.0 * _COPIED / min(taken[1:])
+
+
+def bytes_of(env: DeviceVectorEnv) -> float:
+    """The least that a step of one row moves: its parameters and its state are read, the state,
+    the observation and the record are written."""
+    held, brought = env.tensors()
+    read = sum(each.nbytes for each in held) + env.num_envs * P.end * env.dtype.itemsize
+    written = sum(each.nbytes for each in (*held, *brought))
+    return (read + written) / env.num_envs
+
+
+class _Counted(TorchDispatchMode):
+    """Counts the numbers that torch's operations give."""
+
+    numbers = 0
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        result = func(*args, **(kwargs or {}))
+        moves = func.is_view or func.__name__.partition(".")[0] in ("stack", "cat", "clone")
+        if isinstance(result, torch.Tensor) and not moves:
+            self.numbers += result.numel()
+        return result
+
+
+def operations(env_id: str, count: int = 64, **arguments: Any) -> float:
+    """Operations of an env-step of one row as the text is written: products, sums, choices."""
+    env = DeviceVectorEnv.make(env_id, count, **arguments)
+    env.reset(seed=0)
+    actions = torch.zeros(env.action_space.shape or ())
+    with _Counted() as counted:
+        env.step(actions)
+    return counted.numbers / count
+
+
+def measure(env: DeviceVectorEnv, copied: float, rounds: int, steps: int) -> Measured:
+    """Rounds of `steps` steps each, after one that does not count."""
+    env.reset(seed=0)
+    actions = torch.zeros(env.action_space.shape or (), device=env.device)
+
+    def several() -> None:
+        for _ in range(steps):
+            env.step(actions)
+
+    taken = [_seconds(several, env.device) for _ in range(rounds + 1)][1:]
+    rates = [env.num_envs * steps / each for each in taken]
+    return Measured(
+        env.num_envs, statistics.median(rates), min(rates), max(rates), bytes_of(env), copied
+    )
+
+
+def table(found: Sequence[Measured], needed: float) -> str:
+    """The measurements as Markdown; needed: operations of an env-step."""
+    lines = [
+        "| N | env-steps/s | range | us a step of all | bytes a row, at least | of a copy's "
+        "bandwidth | operations/s |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for each in found:
+        share = each.rate * each.bytes_a_step / each.bandwidth
+        lines.append(
+            f"| {each.count} | {each.rate:.3g} | {each.least:.3g} .. {each.largest:.3g} "
+            f"| {1e6 * each.count / each.rate:.4g} | {each.bytes_a_step:.0f} "
+            f"| {100.0 * share:.2g} % | {each.rate * needed:.3g} |"
+        )
+    return "\n".join(lines)
+
+
+def name_of(device: torch.device) -> str:
+    """The device in words."""
+    if device.type == "cuda":
+        return torch.cuda.get_device_name(device)
+    return f"CPU, {torch.get_num_threads()} threads of torch"
+
+
+def main(
+    device: Annotated[str, typer.Option(help="cpu, cuda, cuda:1, ...")] = "cpu",
+    dtype: Annotated[str, typer.Option(help="float32 or float64.")] = "float32",
+    env: Annotated[str, typer.Option(help="An environment's id.")] = "sideslip/YawFusion-v0",
+    count: Annotated[list[int] | None, typer.Option(help="Rows of a batch; repeatable.")] = None,
+    compiled: Annotated[bool, typer.Option("--compile", help="By torch.compile.")] = False,
+    steps: Annotated[int, typer.Option(min=1, help="Steps of a round.")] = 20,
+    rounds: Annotated[int, typer.Option(min=1, help="Rounds that count.")] = ROUNDS,
+    out: Annotated[Path | None, typer.Option(help="Write the table as Markdown.")] = None,
+) -> None:
+    """Measure env-steps per second against the size of the batch.
+
+    Episodes end and start anew where the steps are many enough; the resets are then part of it.
+    """
+    check_writable(out)
+    console, found = Console(), []
+    needed = operations(env)
+    copied = 0.0
+    for each in count or COUNTS:
+        batch = DeviceVectorEnv.make(env, each, device=device, dtype=dtype, compile=compiled)
+        copied = copied or bandwidth(batch.device)
+        found.append(measure(batch, copied, rounds, steps))
+        console.print(f"{each}: {found[-1].rate:.3g} env-steps/s", highlight=False)
+        del batch
+    text = (
+        f"`{shlex.join(['python', '-m', 'sideslip.benchmarks.device_speed', *sys.argv[1:]])}`\n\n"
+        f"{name_of(torch.device(device))}, torch {torch.__version__}; {env}, {dtype}, "
+        f"{'compiled' if compiled else 'not compiled'}. Median and range of {rounds} rounds of "
+        f"{steps} steps, wall time. An env-step is {needed:.0f} operations. A copy on the device "
+        f"moves {copied / 1e9:.3g} GB/s.\n\n{table(found, needed)}\n"
+    )
+    console.print(text, highlight=False, markup=False, soft_wrap=True)
+    if out is not None:
+        write_whole(out, text)
+
+
+if __name__ == "__main__":
+    typer.run(main)

@@ -1,0 +1,47 @@
+"""The device engine's table in a small form."""
+
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("torch")
+
+from sideslip.benchmarks import device_speed
+
+ENV_ID = "sideslip/YawVision-v0"
+
+
+def test_the_table_has_a_line_for_each_size_and_says_how_it_was_made(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(device_speed, "_COPIED", 1 << 20)
+    out = tmp_path / "table.md"
+    device_speed.main("cpu", "float64", ENV_ID, [4, 8], compiled=False, steps=1, rounds=2, out=out)
+    command, _, text, _, *lines = out.read_text().splitlines()
+    assert "sideslip.benchmarks.device_speed" in command
+    assert f"{ENV_ID}, float64, not compiled. Median and range of 2 rounds of 1 steps" in text
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+    assert [row[0] for row in rows] == ["N", "---", "4", "8"]
+    for count, rate, spread, *_ in rows[2:]:
+        low, high = map(float, spread.split(" .. "))
+        assert 0.0 < low <= float(rate) <= high, count
+
+
+def test_operations_grow_with_the_ticks_of_a_step() -> None:
+    one = device_speed.operations(ENV_ID, 2, control_period=1)
+    four = device_speed.operations(ENV_ID, 2, control_period=4)
+    assert 3.0 * 1000.0 < four - one < 3.0 * 5000.0
+
+
+@pytest.mark.parametrize(
+    ("told", "message"),
+    [({"device": "gpu"}, "unknown device 'gpu'"), ({"dtype": "half"}, "dtype is 'float64' or")],
+)
+def test_a_wrong_word_is_refused(told: dict[str, str], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        device_speed.main(**told, count=[2], rounds=1, steps=1, out=None)
+
+
+def test_a_table_that_cannot_be_written_is_refused_before_the_work(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="there is no such folder"):
+        device_speed.main(device="gpu", out=tmp_path / "no" / "table.md")
