@@ -174,7 +174,6 @@ def _rebuild(function: Any, table: dict[str, Any], done: dict[Any, Any]) -> Any:
         return done[source]
     names: dict[str, Any] = dict(source.__globals__)
     rebuilt = types.FunctionType(source.__code__, names, source.__name__, source.__defaults__)
-    del names["__name__"]  # by which torch.compile would look the names up in the module itself
     done[source] = rebuilt
     for name in source.__code__.co_names:
         callee = names.get(name)
@@ -183,4 +182,5 @@ def _rebuild(function: Any, table: dict[str, Any], done: dict[Any, Any]) -> Any:
         )
         if isinstance(callee, Dispatcher) or ours:
             names[name] = _rebuild(callee, table, done)
+    del names["__name__"]  # by which torch.compile would look the names up in the module itself
     return rebuilt
