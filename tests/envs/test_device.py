@@ -38,6 +38,7 @@ def agrees(env_id: str, moments: Moments, **arguments: Any) -> DeviceVectorEnv:
     return env
 
 
+@pytest.mark.plain
 @pytest.mark.parametrize("device", DEVICES)
 def test_the_noise_has_the_same_words_and_the_same_numbers_to_rounding(device: str) -> None:
     rng = np.random.default_rng(3)
@@ -124,6 +125,7 @@ def test_a_row_that_fails_stops_at_that_tick(
     assert (env.ticks_done < 50).any()
 
 
+@pytest.mark.plain
 def test_a_batch_has_the_episodes_of_its_seeds() -> None:
     """Row i of reset(seed=s) is the single environment of s + i."""
     env = DeviceVectorEnv.make(UNEVEN, 4, camera={"phase": None})
@@ -136,6 +138,7 @@ def test_a_batch_has_the_episodes_of_its_seeds() -> None:
         np.testing.assert_array_equal(env.motion[i], alone.motion)
 
 
+@pytest.mark.plain
 @pytest.mark.parametrize("mode", MODES)
 def test_episodes_follow_each_other_as_in_the_vector_env(mode: str) -> None:
     """Resets of their own and by a mask, drives and ends: to 1e-9 over a few episodes."""
@@ -221,6 +224,7 @@ def test_float32_costs_little_in_a_second() -> None:
         assert 0.0 < error[Motion._fields.index(name)] < limit, name
 
 
+@pytest.mark.plain
 def test_a_snapshot_goes_on_in_the_compiled_engine() -> None:
     """There and back: what a device leaves out of a state nobody needs."""
     env = DeviceVectorEnv.make(FUSION, 3, camera={"duplicate": 0.5})

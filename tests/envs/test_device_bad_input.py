@@ -18,6 +18,8 @@ torch = pytest.importorskip("torch")
 
 from sideslip.envs.device import DeviceVectorEnv  # noqa: E402
 
+pytestmark = pytest.mark.plain
+
 FUSION, AFS = "sideslip/YawFusion-v0", "sideslip/AfsYawFusion-v0"
 FEW = {"num_envs": 2}
 ARGUMENTS: list[tuple[dict[str, Any], type[Exception], str]] = [
