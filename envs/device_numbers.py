@@ -56,3 +56,12 @@ def on_tensors(dtype: torch.dtype, *functions: Callable[..., Any]) -> list[Any]:
     """The functions' text on tensors whose floats are of `dtype`."""
     table = numbers(dtype)
     return [plain(function, table) for function in functions]
+
+
+def compiled(function: Callable[..., Any]) -> Any:
+    """The function by `torch.compile`, whole.
+
+    torch inlines what is short wherever it is used, and so again in that; where each of a chain's
+    results is used several times, as in the logarithm's shifts, it would compile for an hour.
+    """
+    return torch.compile(function, fullgraph=True, options={"realize_opcount_threshold": 16})

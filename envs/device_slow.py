@@ -210,16 +210,13 @@ def taken_off(queue: Tensor, count: Tensor) -> Tensor:
 def unpacked(states: Tensor, room: int) -> Under:
     """The slow sensors' part of packed states (Z.end, N); ValueError where more packets are under
     way than there is room for."""
-    slow = states[Z.camera : Z.queue].reshape(2, len(Slow._fields), -1)
-    queue = states[Z.queue : Z.sky].reshape(-1, PACKET_WIDTH, states.shape[1]).clone()
-    place = torch.arange(len(queue), device=queue.device)[:, None]
-    queue[:, PACKET.arrived] = torch.where(
-        place < states[Z.under_way], queue[:, PACKET.arrived], NEVER
-    )
-    queue = in_order(queue)
-    if bool((queue[room:, PACKET.arrived] != NEVER).any()):
+    if bool((states[Z.under_way] > room).any()):
         raise ValueError(f"a state has more than {room} packets under way")
-    return Under(slow.clone(), states[Z.sky].clone(), queue[:room].clone())
+    slow = states[Z.camera : Z.queue].reshape(2, len(Slow._fields), -1)
+    queue = states[Z.queue : Z.sky].reshape(-1, PACKET_WIDTH, states.shape[1])[:room].clone()
+    place = torch.arange(room, device=queue.device)[:, None]
+    queue[:, PACKET.arrived].masked_fill_(place >= states[Z.under_way], NEVER)
+    return Under(slow.clone(), states[Z.sky].clone(), in_order(queue))
 
 
 def packed(under: Under, states: Tensor) -> None:

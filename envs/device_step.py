@@ -1,10 +1,10 @@
 """One env-step of all rows on tensors, from their state to the next and what they tell: a pure
 function that never waits for the device."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from .backend import select
-from .device_numbers import on_tensors, torch
+from .device_numbers import compiled, on_tensors, torch
 from .device_slow import Most, SlowSensors, Under, Window
 from .device_tell import Telling
 from .device_ticks import Now, Ticks, start_of
@@ -53,7 +53,7 @@ class Brought(NamedTuple):
 class Step:
     """The env-steps of rows of one kind.
 
-    kind: what chooses the plant's text. most: the slow sensors present and their room. compiled:
+    kind: what chooses the plant's text. most: the slow sensors present and their room. compile:
     through `torch.compile`.
     """
 
@@ -66,17 +66,15 @@ class Step:
         bounds: Array,
         dtype: torch.dtype,
         device: torch.device,
-        compiled: bool,
+        compile: bool,
     ) -> None:
         self._n = n
-        self._ticks = Ticks(kind, dtype, compiled)
+        self._ticks = Ticks(kind, dtype, compile)
         self._slow = SlowSensors(most, kind.small_angle, dtype)
         told = torch.as_tensor(bounds, dtype=dtype, device=device)
         self._telling = Telling(tuple(most), all_samples, told, dtype)
         self._clip, self._select = on_tensors(dtype, clip, select)
-        self._conclude = (
-            torch.compile(self._concluded, fullgraph=True) if compiled else self._concluded
-        )
+        self._conclude: Any = compiled(self._concluded) if compile else self._concluded
 
     def __call__(
         self, p: Tensor, keys: Tensor, held: Held, actions: Tensor

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from .backend import select
 from .delivery import Chance
-from .device_numbers import on_tensors, torch
+from .device_numbers import compiled, on_tensors, torch
 from .dynamics import Motion
 from .kernel import fixed_of
 from .layout import Drive, P
@@ -51,18 +51,16 @@ class Now(NamedTuple):
 class Ticks:
     """The ticks of rows of one kind."""
 
-    def __init__(self, kind: Kind, dtype: torch.dtype, compiled: bool) -> None:
-        """compiled: a tick, and the chances of all ticks, are one call of `torch.compile` each."""
+    def __init__(self, kind: Kind, dtype: torch.dtype, compile: bool) -> None:
+        """compile: a tick, and the chances of all ticks, are one call of `torch.compile` each."""
         self.kind = kind
         self._normals, self._steering_at = on_tensors(dtype, normals, steering_at)
         self._fixed, self._advance, self._changed, self._select = on_tensors(
             dtype, fixed_of, advance, changed, select
         )
         self._dtype = dtype
-        self.tick: Any = torch.compile(self._tick, fullgraph=True) if compiled else self._tick
-        self.foresee: Any = (
-            torch.compile(self._foresee, fullgraph=True) if compiled else self._foresee
-        )
+        self.tick: Any = compiled(self._tick) if compile else self._tick
+        self.foresee: Any = compiled(self._foresee) if compile else self._foresee
 
     def _foresee(self, p: Tensor, keys: Tensor, first: Tensor, n: int) -> tuple[Numbers, Any]:
         """(eight normal numbers, the programme's steering) of n ticks from `first` on, (n, N)."""
@@ -139,17 +137,19 @@ class Ticks:
 
 def start_of(motion: Tensor, drive: Tensor, driver: Tensor, tick: Tensor, alive: Tensor) -> Now:
     """Where rows are at the start of an env-step."""
-    zero = torch.zeros_like(tick)
-    motions = motion.unbind(0)
+    zeros = tick.new_zeros((2 + len(Told._fields) + FAST_WIDTH, len(tick)))
+    failure, cost, *others = zeros.unbind(0)
+    told, row = others[: len(Told._fields)], others[len(Told._fields) :]
+    # no tensor stands twice: torch.compile would compile the first tick and the others apart
     return Now(
         alive,
-        motions,
+        motion.unbind(0),
         drive.unbind(0),
         driver,
         tick,
-        zero,
-        zero,
-        (zero,) * len(Told._fields),
-        (zero,) * FAST_WIDTH,
-        motions,
+        failure,
+        cost,
+        tuple(told),
+        tuple(row),
+        motion.unbind(0),
     )
