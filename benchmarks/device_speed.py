@@ -26,9 +26,9 @@ _COPIED = 1 << 28  # bytes, beyond every cache
 
 
 class Measured(NamedTuple):
-    """What a batch of `count` rows did."""
+    """What a batch of `size` rows did."""
 
-    count: int
+    size: int
     rate: float  # env-steps a second of wall time: median, least and largest of the rounds
     least: float
     largest: float
@@ -61,10 +61,10 @@ def bytes_of(env: DeviceVectorEnv) -> float:
     return (read + written) / env.num_envs
 
 
-class _Counted(TorchDispatchMode):
+class _Counted(TorchDispatchMode):  # type: ignore[no-untyped-call]
     """Counts the numbers that torch's operations give."""
 
-    numbers = 0
+    numbers: int = 0
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         result = func(*args, **(kwargs or {}))
@@ -79,9 +79,10 @@ def operations(env_id: str, count: int = 64, **arguments: Any) -> float:
     env = DeviceVectorEnv.make(env_id, count, **arguments)
     env.reset(seed=0)
     actions = torch.zeros(env.action_space.shape or ())
-    with _Counted() as counted:
+    counted: Any = _Counted()  # type: ignore[no-untyped-call]
+    with counted:
         env.step(actions)
-    return counted.numbers / count
+    return float(counted.numbers) / count
 
 
 def measure(env: DeviceVectorEnv, copied: float, rounds: int, steps: int) -> Measured:
@@ -110,8 +111,8 @@ def table(found: Sequence[Measured], needed: float) -> str:
     for each in found:
         share = each.rate * each.bytes_a_step / each.bandwidth
         lines.append(
-            f"| {each.count} | {each.rate:.3g} | {each.least:.3g} .. {each.largest:.3g} "
-            f"| {1e6 * each.count / each.rate:.4g} | {each.bytes_a_step:.0f} "
+            f"| {each.size} | {each.rate:.3g} | {each.least:.3g} .. {each.largest:.3g} "
+            f"| {1e6 * each.size / each.rate:.4g} | {each.bytes_a_step:.0f} "
             f"| {100.0 * share:.2g} % | {each.rate * needed:.3g} |"
         )
     return "\n".join(lines)

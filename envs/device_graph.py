@@ -1,5 +1,7 @@
 """The env-step as one launch: a CUDA graph of it, which spares the launches of its many kernels."""
 
+from typing import Any
+
 from .device_numbers import torch
 from .device_step import Brought, Held, Step
 
@@ -37,7 +39,7 @@ class Graphed:
         self._fixed = (p, keys)
         self._held = Held(*(each.clone() for each in held))
         self._actions = actions.clone()
-        stream = torch.cuda.Stream(p.device)
+        stream: Any = torch.cuda.Stream(p.device)  # type: ignore[no-untyped-call]
         stream.wait_stream(torch.cuda.current_stream(p.device))
         with torch.cuda.stream(stream):
             for _ in range(_WARM):

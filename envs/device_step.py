@@ -91,7 +91,9 @@ class Step:
         start = start_of(held.motion, held.drive, held.driver, held.tick, running)
         now, rows, track = self._ticks.drive_on(p, keys, start, shares[:, 0], turn, self._n)
         refused = ~finite & ~held.over
-        return self._conclude(p, keys, held, now, rows, track, running, refused)
+        after: Held
+        after, brought = self._conclude(p, keys, held, now, rows, track, running, refused)
+        return after, brought
 
     def _concluded(
         self,

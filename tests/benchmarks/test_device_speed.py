@@ -1,6 +1,7 @@
 """The device engine's table in a small form."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -37,7 +38,7 @@ def test_operations_grow_with_the_ticks_of_a_step() -> None:
     ("told", "message"),
     [({"device": "gpu"}, "unknown device 'gpu'"), ({"dtype": "half"}, "dtype is 'float64' or")],
 )
-def test_a_wrong_word_is_refused(told: dict[str, str], message: str) -> None:
+def test_a_wrong_word_is_refused(told: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         device_speed.main(**told, count=[2], rounds=1, steps=1, out=None)
 
