@@ -35,8 +35,9 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
 
     In float64 an env-step agrees with the other engines' from the same state to 1e-9, and so does a
     second of stable driving. In float32 a step of 10 ms is within 1e-5 m/s, 1e-6 rad/s and 1e-4 m
-    (30 m from the start), a second within 1e-4 m/s, 2e-5 rad/s and 5e-4 m. `DeviceVectorEnv.make(id, num_envs=N, device="cuda")` builds
-    the one of an id. Needs torch, of the extra `train`.
+    (30 m from the start), a second within 1e-4 m/s, 2e-5 rad/s and 5e-4 m.
+    `DeviceVectorEnv.make(id, num_envs=N, device="cuda")` builds that of an id. Needs torch, of the
+    extra `train`.
 
     ## Arguments
     arguments: those of `StabilityEnv`. device: "cpu", "cuda", "cuda:1", ... dtype: "float64" or
