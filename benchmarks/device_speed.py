@@ -11,12 +11,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
-import torch
 import typer
 from rich.console import Console
-from torch.utils._python_dispatch import TorchDispatchMode
 
 from ..envs.device import DeviceVectorEnv
+from ..envs.device_numbers import torch
 from ..envs.layout import P
 from .rows import check_writable, write_whole
 
@@ -61,7 +60,7 @@ def bytes_of(env: DeviceVectorEnv) -> float:
     return (read + written) / env.num_envs
 
 
-class _Counted(TorchDispatchMode):  # type: ignore[no-untyped-call]
+class _Counted(torch.utils._python_dispatch.TorchDispatchMode):  # type: ignore[no-untyped-call]
     """Counts the numbers that torch's operations give."""
 
     numbers: int = 0
