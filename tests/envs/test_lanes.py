@@ -1,4 +1,4 @@
-"""Lanes: cars that are computed abreast have the bits of the car alone, whoever their neighbours."""
+"""Lanes: cars computed abreast have the bits of the car alone, whoever their neighbours are."""
 
 from collections.abc import Callable
 from typing import Any
@@ -61,7 +61,8 @@ def _uniform(x: Any, y: Any) -> Any:
 
 @jit
 def _turned(x: Any, y: Any) -> Any:
-    return sincos(x) + (atan(x), atan2(y, x), exp(minimum(absolute(x), 7.0)), wrap(x))
+    s, c = sincos(x)
+    return s, c, atan(x), atan2(y, x), exp(minimum(absolute(x), 7.0)), wrap(x)
 
 
 @jit
