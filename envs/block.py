@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from .backend import abreast, at, jit
+from .backend import abreast, apart, at
 from .kernel import conclude, drive_on, kind_of, shares_of
 from .lanes import LANES
 from .layout import Array, P, Z
@@ -44,7 +44,7 @@ def block_of(count: int, n: int) -> Block:
     )
 
 
-@jit
+@apart
 def step_block(count: int, every: Any, n: int, bounds: Any, block: Any) -> bool:
     """One env-step of the first `count` of the block's members, of one kind, whose actions are
     finite; False, and nothing is changed, where not all of them come to the step's end."""

@@ -110,10 +110,10 @@ class Fleet:
             self.final_ticks_done,
             self.final_delivered,
         )
-        self._sort()
+        self.sort()
 
-    def _sort(self) -> None:
-        """Rows whose ticks have the same text stand next to each other in the block's order."""
+    def sort(self) -> None:
+        """Put rows whose ticks have the same text next to each other in the block's order."""
         lags = self.params[:, [P.motor, P.steer]] > 0.0
         kinds = np.hstack([self.switches, lags])
         mixed = (kinds != kinds[0]).any()

@@ -13,6 +13,7 @@ from typing import Any
 from .actuators import Lag
 from .backend import (
     anywhere,
+    apart,
     at,
     copied,
     fixed_tuple,
@@ -140,7 +141,7 @@ def drive_on(
     return 0
 
 
-@jit
+@apart
 def conclude(
     p: Any,
     z: Any,
@@ -199,7 +200,7 @@ def refuse(p: Any, z: Any, switches: Any, report: Any) -> int:
     return 0
 
 
-@jit
+@apart
 def step_vehicle(
     p: Any,
     z: Any,

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from .backend import copied, fixed_tuple, jit, select
+from .backend import apart, copied, fixed_tuple, jit, select
 from .delivery import FAR, Chance, fast_row, sense_slow, store
 from .driver import Driver, wanted_angle
 from .dynamics import Car, Motion, Road, gravity_at, sideslip_angle
@@ -52,7 +52,7 @@ def _write_surroundings(p: Any, d: Any, s: Any, v_x: Any) -> None:
     store(p, P.path, laid(path, s + d.onset * v_x, scale, select(mirrored, -1.0, 1.0)))
 
 
-@jit
+@apart
 def reset_vehicle(
     template: Any,
     low: Any,

@@ -230,3 +230,4 @@ class StabilityVectorEnv(Fleet, VectorEnv[Observations, Any, npt.NDArray[Any]]):
         self.templates, self.seeds = list(snapshot["templates"]), list(snapshot["seeds"])
         self.generators = copy.deepcopy(snapshot["rng"])
         self._started, self._waiting = snapshot["started"], int(self.over.sum())
+        self.sort()

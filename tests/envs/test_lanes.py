@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.envs import SCENARIOS, noise
+from sideslip.envs import noise
 from sideslip.envs.backend import (
     absolute,
     anywhere,
@@ -165,8 +165,11 @@ def test_scenarios_of_one_kind_stand_next_to_each_other() -> None:
     follows = env.switches[env.block.order][:, 3]
     assert (np.diff(follows) != 0).sum() == 1  # all drivers together, all programmes together
     assert sorted(env.block.order) == list(range(count))
+    snapshot, sorted_order = env.get_state(), env.block.order.copy()
     env.reset(seed=0)
     assert env.block.order.tolist() == list(range(count))
+    env.set_state(snapshot)
+    assert env.block.order.tolist() == sorted_order.tolist()
 
 
 def test_a_block_with_a_car_that_fails_is_stepped_car_by_car() -> None:
@@ -189,6 +192,3 @@ def test_a_block_with_a_car_that_fails_is_stepped_car_by_car() -> None:
             if i == 4:
                 failed = bool(over)
     assert failed
-
-
-assert SCENARIOS  # every one of them goes through test_vector's rows
