@@ -77,8 +77,8 @@ def source_stamp(layer: str = _LAYERS[-1]) -> str:
     """
     digest = hashlib.sha256()
     for folder in _LAYERS[: _LAYERS.index(layer) + 1]:
-        for path in sorted((_PACKAGE / folder).glob("*.py")):
-            digest.update(path.name.encode())
+        for path in sorted((_PACKAGE / folder).rglob("*.py")):
+            digest.update(str(path.relative_to(_PACKAGE)).encode())
             digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
 

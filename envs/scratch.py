@@ -23,18 +23,18 @@ from .backend import (
 )
 from .delivery import Chance
 from .dynamics import Motion
+from .lanes import LANES
 from .layout import Array, P, Z
 from .noise import CHANNELS, normals
 from .programme import STEERING_WIDTH, steering_at
 
 CHANCE, AHEAD, TRACK = 0, 8, 9  # its rows: two times four normal numbers, rad, a Motion
 _ROWS = TRACK + len(Motion._fields)
-_WIDEST = 16
 
 
 def scratch_of(n: int, *lanes: int) -> Array:
     """The array for n ticks a step, whose columns are whole lanes."""
-    return np.zeros((_ROWS, -(-n // _WIDEST) * _WIDEST, *lanes))
+    return np.zeros((_ROWS, -(-n // LANES) * LANES, *lanes))
 
 
 @jit

@@ -38,21 +38,17 @@ print(json.dumps(marks))
 """
 
 _WATCH = """
-import json, time
-from numba.core import event
+import json, logging
 
-class Watch(event.Listener):
-    def __init__(self):
-        self.open, self.taken = [], []
-    def on_start(self, ev):
-        self.open.append((ev.data["dispatcher"].py_func.__name__, time.process_time()))
-    def on_end(self, ev):
-        name, start = self.open.pop()
-        if not self.open:
-            self.taken.append((name, time.process_time() - start))
+taken = []
 
-watch = Watch()
-event.register("numba:compile", watch)
+class Watch(logging.Handler):
+    def emit(self, record):
+        if len(record.args) == 2:  # a kernel's name and its own CPU seconds
+            taken.append(record.args)
+
+logging.getLogger("sideslip.compiler").addHandler(Watch())
+logging.getLogger("sideslip.compiler").setLevel(logging.INFO)
 """
 
 _COLD = """
@@ -85,11 +81,11 @@ def warm() -> dict[str, float]:
 
 
 def cold(code: str = _COLD) -> list[tuple[str, float]]:
-    """(name, CPU seconds) of each kernel that some code has compiled with nothing on disk, its
-    callees' included where they are first compiled for it."""
+    """(name, CPU seconds) of each kernel that some code has compiled with nothing on disk, without
+    those of kernels that it calls as they stand."""
     with TemporaryDirectory() as folder:
         here = {"XDG_CACHE_HOME": folder, "NUMBA_CACHE_DIR": ""}
-        said = _python(f"{_WATCH}\n{code}\nprint(json.dumps(watch.taken))", here)
+        said = _python(f"{_WATCH}\n{code}\nprint(json.dumps(taken))", here)
     return [(str(name), float(seconds)) for name, seconds in json.loads(said)]
 
 

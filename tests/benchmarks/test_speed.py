@@ -167,17 +167,17 @@ def test_memory_is_asked_before_it_is_taken(monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_compilation_is_counted_at_the_top_alone() -> None:
     code = """
-import numba
-@numba.njit
+from sideslip.envs.backend import jit
+@jit
 def inner(x):
     return x + 1
-@numba.njit
+@jit
 def outer(x):
     return inner(x) * 2
-outer(1); outer(1.0); inner(1)
+outer(1); outer(1.0); outer(2); inner(1)
 """
     found = first_use.cold(code)
-    assert [name for name, _ in found] == ["outer", "outer"]
+    assert [name for name, _ in found] == ["outer", "outer", "inner"]
     assert all(seconds > 0.0 for _, seconds in found)
     with pytest.raises(RuntimeError, match="no such thing"):
         first_use.cold("raise ValueError('no such thing')")
