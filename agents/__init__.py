@@ -1,4 +1,4 @@
-"""Everything that acts: classical controllers with stable-baselines3's `predict`."""
+"""Everything that acts, with stable-baselines3's `predict`: controllers and learned policies."""
 
 from collections.abc import Callable
 from typing import Any

@@ -1,4 +1,4 @@
-"""The deterministic actor of a stable-baselines3 model as a `Network`; the only place for torch."""
+"""The deterministic actor of a stable-baselines3 model as a `Network`, which needs no torch."""
 
 from typing import Any
 

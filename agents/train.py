@@ -38,7 +38,7 @@ EPISODES = 256  # of an evaluation
 EVERY = 250_000  # steps from one evaluation to the next
 _MEASURED = 64  # environments whose observations make the scaling
 
-# Test seeds are below 2^32, calibration seeds below 2^62 but above 2^30 by a hash; no others are.
+# No other seeds are as large: those of tests and of the calibration are below 2^63.
 _EVALUATION, _SCALING, _TRAINING = 2**64, 2**65, 2**66
 _ROOM = 2**40  # seeds of a training: it takes those from its steps on when it starts or goes on
 
@@ -51,7 +51,7 @@ class Task:
     `EstimateObservation`, "" for none. env_options: of `gym.make`, JSON types. seed: of the
     weights, the episodes and the exploration. num_envs: side by side.
 
-    Raises ValueError for an unknown algorithm or a negative seed.
+    Raises ValueError for an unknown algorithm, a negative seed or no environment.
     """
 
     env_id: str = "sideslip/YawVision-v0"
@@ -65,6 +65,8 @@ class Task:
         algorithm_of(self.algo)
         if self.seed < 0:
             raise ValueError(f"seed is at least 0, got {self.seed}")
+        if self.num_envs < 1:
+            raise ValueError(f"num_envs is at least 1, got {self.num_envs}")
 
     def vector_env(self, num_envs: int) -> VectorEnv[Any, Any, Any]:
         """Another vector env of the task, not the one that is trained on."""

@@ -22,7 +22,7 @@ from ..envs import SCENARIOS
 from ..envs.backend import source_stamp
 from ..estimators import EstimateObservation
 from .cases import run_cases
-from .rows import write_whole
+from .rows import write_text
 
 FILE = Path(__file__).with_name("calibration.json")
 SALT, SEEDS = "calibration", 64
@@ -121,7 +121,7 @@ def measure(case: Case) -> Episode:
     episode = Episode(
         case.seed, found.cost, found.winner, found.costs, found.statuses, round(found.seconds, 1)
     )
-    write_whole(case.path, json.dumps(asdict(episode)))
+    write_text(case.path, json.dumps(asdict(episode)))
     return episode
 
 
@@ -221,4 +221,4 @@ def update(path: str | Path, made: Sequence[Entry]) -> None:
     kept = read_calibration(path) if Path(path).exists() else {}
     kept |= {(entry.env_id, entry.scenario): entry for entry in made}
     ordered = [asdict(kept[key]) for key in sorted(kept)]
-    write_whole(path, json.dumps(ordered, indent=1) + "\n")
+    write_text(path, json.dumps(ordered, indent=1) + "\n")

@@ -17,7 +17,7 @@ from rich.console import Console
 from ..envs.device import DeviceVectorEnv
 from ..envs.device_numbers import torch
 from ..envs.layout import P
-from .rows import check_writable, write_whole
+from .rows import check_writable, write_text
 
 COUNTS = (1024, 16384, 65536, 262144, 1048576)
 ROUNDS = 5
@@ -157,7 +157,7 @@ def main(
     )
     console.print(text, highlight=False, markup=False, soft_wrap=True)
     if out is not None:
-        write_whole(out, text)
+        write_text(out, text)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ import numpy as np
 from rich.console import Console
 
 from .. import __version__
-from .rows import Row, Suite, write_json, write_parquet, write_whole
+from .rows import Row, Suite, write_json, write_parquet, write_text
 from .screen import print_suite
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ def show_episode(
     if parquet is not None:
         drive.to_parquet(parquet)
     if kml is not None:
-        write_whole(kml, track_kml(drive.log.name, {who: (drive["X"], drive["Y"])}))
+        write_text(kml, track_kml(drive.log.name, {who: (drive["X"], drive["Y"])}))
 
 
 def give(

@@ -17,7 +17,7 @@ from string import Template
 from typing import Any
 
 from .colours import INK, base, colour
-from .rows import Suite, Table, write_whole
+from .rows import Suite, Table, write_text
 
 _PAGE = Template("""\
 <!DOCTYPE html>
@@ -102,7 +102,7 @@ def write_report(
             _section(link, suite) for (link, _), suite in zip(_links(suites), suites, strict=True)
         ),
     )
-    write_whole(path, page)
+    write_text(path, page)
 
 
 def number(cell: str) -> float | None:

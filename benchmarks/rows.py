@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
+from ..agents.whole_file import write_whole
 from .explorer import Explorer
 
 METRICS = {
@@ -140,15 +141,9 @@ def check_writable(*paths: Path | None) -> None:
             raise PermissionError(f"cannot write {path}: its folder is read-only")
 
 
-def write_whole(path: str | Path, text: str) -> None:
-    """Write a file or nothing: the text goes to a neighbour first and is then renamed."""
-    target = Path(path)
-    part = target.with_name(f".{target.name}.part")
-    try:
-        part.write_text(text, encoding="utf-8")
-        part.replace(target)
-    finally:
-        part.unlink(missing_ok=True)
+def write_text(path: str | Path, text: str) -> None:
+    """Write a text file or nothing."""
+    write_whole(Path(path), text.encode())
 
 
 def write_json(path: str | Path, rows: Sequence[Row]) -> None:
@@ -160,7 +155,7 @@ def write_json(path: str | Path, rows: Sequence[Row]) -> None:
         }
         for row in rows
     ]
-    write_whole(path, json.dumps(plain, indent=1) + "\n")
+    write_text(path, json.dumps(plain, indent=1) + "\n")
 
 
 def read_json(path: str | Path) -> list[Row]:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from ..estimators.tunings import read_tunings
-from .rows import write_whole
+from .rows import write_text
 
 _HEAD = """\
 # Tunings: process noise per second, (unit of the state)^2 / s, and measurement noise where it was
@@ -28,7 +28,7 @@ def update(path: str | Path, entry: dict[str, Any]) -> None:
     entries[_key(entry)] = kept | entry
     text = target.read_text(encoding="utf-8") if target.exists() else ""
     head = text.partition("[[tuning]]")[0] or _HEAD + "\n"
-    write_whole(target, head + "\n".join(map(_text, entries.values())))
+    write_text(target, head + "\n".join(map(_text, entries.values())))
 
 
 def _key(entry: dict[str, Any]) -> tuple[str, str]:

@@ -47,7 +47,10 @@ def block_of(count: int, n: int) -> Block:
 @apart
 def step_block(count: int, every: Any, n: int, bounds: Any, block: Any) -> bool:
     """One env-step of the first `count` of the block's members, of one kind, whose actions are
-    finite; False, and nothing is changed, where not all of them come to the step's end."""
+    finite; False, and nothing is changed, where not all of them come to the step's end.
+
+    every: params, states, switches, actions, obs, rows, packets, reports, with a row for each car.
+    """
     params, states, switches, actions, obs, rows, packets, reports = every
     for lane in range(abreast()):
         i = block.members[lane if lane < count else 0]  # spare lanes repeat the first

@@ -269,7 +269,7 @@ def tell(folder: Path | None) -> None:
     A line on standard error; a record of the logger `sideslip.compiler` instead where the program
     has set up logging; nothing in worker processes or with SIDESLIP_QUIET set.
     """
-    where = f"kept in {folder}" if folder else "not kept: the cache's folder cannot be written"
+    where = f"kept in {folder}" if folder else "not kept"
     text = f"sideslip: compiling kernels for this machine ({where}) ..."
     if _told or os.environ.get(QUIET):
         return

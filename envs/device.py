@@ -106,13 +106,15 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
     def _most_of(self, templates: Iterable[Template]) -> dict[int, Most]:
         """What the slow sensors need room for with these templates and those before; ValueError
         for a template of another kind of plant."""
-        for template in templates:
+        told = list(templates)
+        for template in told:
             kind = _kind_of(template)
             if kind != self._kind:
                 raise ValueError(
                     f"on a device all rows have one kind of plant, {self._kind}; "
                     f"scenario {template.scenario.name!r} has {kind}"
                 )
+        for template in told:
             for sensor, links in self._links.items():
                 at = P.camera if sensor == CAMERA else P.gps
                 links.add(Link(*template.params[at : at + len(Link._fields)].tolist()))

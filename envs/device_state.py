@@ -69,9 +69,9 @@ def told_actions(
     is NaN. Anything else is brought to the device as the vector env takes it.
     """
     if not isinstance(actions, torch.Tensor):
-        force: Tensor = torch.as_tensor(actions_of(actions, count, width, fail))
-        return force.to(device, dtype)
-    if actions.device.type != device.type:
+        rounded: Tensor = torch.as_tensor(actions_of(actions, count, width, fail))
+        return rounded.to(device, dtype)
+    if actions.device != device:
         raise ValueError(
             f"actions are on {actions.device}, the env on {device}; nothing was stepped"
         )
@@ -82,8 +82,8 @@ def told_actions(
                 "nothing was stepped"
             )
         actions = torch.full((count, width), torch.nan, device=device)
-    force = actions.detach().to(torch.float32)
-    return force.to(dtype)
+    rounded = actions.detach().to(torch.float32)
+    return rounded.to(dtype)
 
 
 def held_of(

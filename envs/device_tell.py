@@ -8,7 +8,7 @@ from .device_slow import Delivered
 from .device_ticks import Now, Told
 from .layout import AGE_CAP, SAMPLED, Slow
 from .record import CAMERA, FAST, PACKET, TICK, VALUES
-from .reference import COST_CAP
+from .reference import rest_of_cost
 from .sensors import NEVER
 from .summary import clip
 from .switches import BAD_ACTION, RUNNING, Report
@@ -27,7 +27,7 @@ class Telling:
         """bounds: (2, k), of the observation's entries."""
         self._sensors, self._all_samples = sensors, all_samples
         self._bounds = bounds[:, :, None]
-        self._clip, self._select = on_tensors(dtype, clip, select)
+        self._clip, self._select, self._rest_of_cost = on_tensors(dtype, clip, select, rest_of_cost)
 
     def observe(
         self, rows: Tensor, done: Tensor, now: Now, slow: Tensor, delivered: Delivered
@@ -70,8 +70,7 @@ class Telling:
 
     def report(self, now: Now, duration: Tensor, count: Tensor) -> Tensor:
         """The reports (len(Report), N) of rows that were stepped."""
-        # the rest of the episode is charged: failing never pays
-        rest = COST_CAP * (duration - now.tick) * TICK
+        rest = self._rest_of_cost(duration, now.tick)
         cost = now.cost + self._select(now.failure != RUNNING, rest, 0.0)
         told = Told(*now.told)
         named = {
@@ -93,7 +92,7 @@ class Telling:
 
     def refusal(self, now: Now, duration: Tensor, before: Tensor) -> Tensor:
         """The reports of rows that an action which is not finite fails; the rest stays."""
-        cost = COST_CAP * (duration - now.tick) * TICK
+        cost = self._rest_of_cost(duration, now.tick)
         named = dict(zip(Report._fields, before.unbind(0), strict=True))
         named |= {
             "cost": cost,

@@ -16,8 +16,8 @@ from .layout import Drive, P
 from .noise import CHANNELS, normals
 from .programme import STEERING_WIDTH, steering_at
 from .record import FAST_WIDTH, TICK
-from .switches import NOT_FINITE, OFF_ROAD, RUNNING, SPIN
-from .tick import Kind, Moving, advance, changed
+from .switches import RUNNING
+from .tick import Kind, Moving, advance, changed, failure_of
 
 Tensor = torch.Tensor
 Numbers = tuple[Tensor, ...]
@@ -55,9 +55,8 @@ class Ticks:
         """compile: a tick, and the chances of all ticks, are one call of `torch.compile` each."""
         self.kind = kind
         self._normals, self._steering_at = on_tensors(dtype, normals, steering_at)
-        self._fixed, self._advance, self._changed, self._select = on_tensors(
-            dtype, fixed_of, advance, changed, select
-        )
+        self._fixed, self._advance, self._changed = on_tensors(dtype, fixed_of, advance, changed)
+        self._failure_of, self._select = on_tensors(dtype, failure_of, select)
         self._dtype = dtype
         self.tick: Any = compiled(self._tick) if compile else self._tick
         self.foresee: Any = compiled(self._foresee) if compile else self._foresee
@@ -98,8 +97,7 @@ class Ticks:
         )
         alive, fit = now.alive, now.alive & ~seen.lost
         tick = now.tick + alive
-        failure = pick(seen.spun, SPIN * 1.0, pick(seen.off, OFF_ROAD * 1.0, RUNNING * 1.0))
-        failure = pick(seen.lost, NOT_FINITE * 1.0, failure)
+        failure = self._failure_of(seen)
         refs = [pick(seen.lost, 0.0, each) for each in seen.refs]
         told = (pick(seen.lost, 0.0, seen.beta), *refs, seen.steer, seen.moment)
 

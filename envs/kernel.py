@@ -29,12 +29,12 @@ from .layout import Change, Disturbance, Drive, P, Task, Z
 from .pace import Pace
 from .programme import DRIVER, Wind
 from .record import TICK
-from .reference import COST_CAP, Target
+from .reference import Target, rest_of_cost
 from .scratch import AHEAD, TRACK, chance_at, foresee, motion_at
 from .sensors import Noise
 from .summary import clip, observe, write_report
-from .switches import BAD_ACTION, NOT_FINITE, OFF_ROAD, REFUSED, REPORT, RUNNING, SPIN, Switches
-from .tick import Fixed, Kind, Moving, advance, changed, standing_load
+from .switches import BAD_ACTION, REFUSED, REPORT, RUNNING, Switches
+from .tick import Fixed, Kind, Moving, advance, changed, failure_of, standing_load
 from .tracks import Path
 from .tyres import shifts
 
@@ -93,8 +93,8 @@ def drive_on(
 
     share, turn: of the yaw moment and the added steering, within +-1. rows: filled with the fast
     sensors. p, z, report: vectors, or matrices with a column for each vehicle of those abreast;
-    rows and scratch have one axis more then. Where one of these fails or ends before the others
-    nothing is changed and 0 returned.
+    rows and scratch have one axis more then. alone: whether it is one vehicle; where one of several
+    fails or ends before the others, 0 is returned and z and report are as they were.
     """
     fixed = fixed_of(p)
     motion = Motion(*fixed_tuple(z[Z.motion :], _MOTION))
@@ -125,11 +125,9 @@ def drive_on(
             put_all(z, now.drive, 0, Z.drive)
             put(z, now.driver, Z.driver)
             put(z, tick, Z.clock + 2)
-            failure = select(seen.spun, SPIN * 1.0, select(seen.off, OFF_ROAD * 1.0, 0.0))
-            failure = select(seen.lost, NOT_FINITE * 1.0, failure)
+            failure = failure_of(seen)
             put(z, failure, Z.clock + 3)
-            # the rest of the episode is charged: failing never pays
-            rest = COST_CAP * (task.duration - tick) * TICK
+            rest = rest_of_cost(task.duration, tick)
             put(report, cost + select(failure != RUNNING, rest, 0.0), REPORT.cost)
             put(report, beta, REPORT.beta)
             put(report, refs[0], REPORT.beta_ref)
@@ -194,7 +192,7 @@ def refuse(p: Any, z: Any, switches: Any, report: Any) -> int:
         return REFUSED
     z[Z.clock + 3] = BAD_ACTION
     report[REPORT.failure] = BAD_ACTION
-    report[REPORT.cost] = COST_CAP * (p[P.task] - z[Z.clock + 2]) * TICK
+    report[REPORT.cost] = rest_of_cost(p[P.task], z[Z.clock + 2])
     report[REPORT.reward] = -report[REPORT.cost]
     report[REPORT.packets] = 0.0
     return 0

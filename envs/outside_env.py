@@ -19,7 +19,7 @@ from .outside_checks import check_options, check_scenario
 from .pace import Pace, acceleration_command
 from .programme import DRIVER, STEERING_WIDTH, Wind, steering_at, wind_at
 from .record import FAST, TICK
-from .reference import COST_CAP, Target, cost_rate, reference
+from .reference import Target, cost_rate, reference, rest_of_cost
 from .scenario import Scenario
 from .sensors import Noise
 from .stability import StabilityEnv
@@ -127,8 +127,8 @@ class OutsideEnv(StabilityEnv):
             done += 1
             failure = self._failure(told, motion, beta)
         z[Z.clock + 3] = failure
-        if failure != RUNNING:  # the rest of the episode is charged: failing never pays
-            cost += COST_CAP * (told.task.duration - z[Z.clock + 2]) * TICK
+        if failure != RUNNING:
+            cost += rest_of_cost(told.task.duration, float(z[Z.clock + 2]))
         self._tell(done, count, refs, obs)
         write_report(self._report, z)
         self._report[REPORT.beta] = beta

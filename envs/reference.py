@@ -3,6 +3,7 @@
 from typing import Any, NamedTuple
 
 from .backend import absolute, jit, maximum, minimum
+from .record import TICK
 from .vehicle import GRAVITY, Vehicle
 
 ZERO_SLIP, MODEL, LIMITED = range(3)
@@ -69,3 +70,9 @@ def cost_rate(e_beta: Any, e_gamma: Any, moment_share: Any, steer_added: Any, ki
         g = e_gamma * (1.0 / GAMMA_SCALE)
         c = c + g * g
     return minimum(absolute(c), COST_CAP)
+
+
+@jit
+def rest_of_cost(duration: Any, tick: Any) -> Any:
+    """What an episode of `duration` ticks costs besides where it fails: failing never pays."""
+    return COST_CAP * (duration - tick) * TICK

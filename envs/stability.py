@@ -30,12 +30,11 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
 
     ## Action
     `Box(-1, 1, (1,), float32)`: the yaw moment as a share of its full scale (372.7 N m for the
-    COMS; positive turns left and drives the right wheel). With `steering` it is
-    `Box(-1, 1, (2,), float32)`: the second entry is the steering angle *added* to the driver's,
-    as a share of its full scale (0.1 rad, positive to the left; at most 0.8 rad/s, and within the
-    stop of the front wheels). Zero is the uncontrolled car. Values outside are clipped. What is
-    not finite, no numbers or of a wrong shape raises ValueError and steps nothing; with
-    `on_bad_action="fail"` it ends the episode as a failure.
+    COMS; positive turns left). With `steering` it is `Box(-1, 1, (2,), float32)`: the second
+    entry is the steering angle *added* to the driver's, as a share of its full scale (0.1 rad,
+    positive to the left; at most 0.8 rad/s, within the stop). Zero is the uncontrolled car; values
+    outside are clipped. What is not finite, no numbers or of a wrong shape raises ValueError and
+    steps nothing; with `on_bad_action="fail"` it ends the episode as a failure.
 
     ## Observation
     A float32 summary whose length does not depend on the control period. `layout` gives name,
@@ -56,20 +55,18 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
     Before the first sample a slow sensor's values are 0, its age 10 s, fresh 0.
 
     ## Record
-    `env.unwrapped.record` is what the car's wires carried in the step: a `Record` of fast rows
-    (one a millisecond) and time-stamped packets. Estimators read only this.
+    `env.unwrapped.record` is what the car's wires carried in the step, fast rows and time-stamped
+    packets. Estimators read only this.
 
     ## Reward
     Minus the integral over the step of
     c = (e_beta/0.02)^2 + (e_gamma/0.1)^2 + 0.01 (N_z/N_max)^2 + 0.01 (steering added/0.05)^2,
-    capped at 100 per second; N_z and the added steering are those delivered; with the reference
-    "zero-slip" the yaw rate is not judged. On failure the rest of the episode is charged at 100
-    per second.
+    capped at 100 per second, which a failure costs for the rest of the episode too; N_z and the
+    added steering are those delivered; with "zero-slip" the yaw rate is not judged.
 
     ## Episode end
     `terminated`: the car spun (sideslip above 0.5 rad) or left the ground, or the lane that a
-    driver keeps. `truncated`: the
-    scenario's duration is over (the env truncates itself; there is no TimeLimit).
+    driver keeps. `truncated`: the scenario's duration is over (there is no TimeLimit).
 
     ## Info
     `t, beta, gamma, psi, beta_ref, gamma_ref, steer, yaw_moment, cost, failure, is_success`

@@ -1,7 +1,7 @@
 """One tick of the car: what the driver asks, the actuators do, the plant and the fast sensors make
 of it, and what it costs.
 
-The text of a tick is the same for one car, eight abreast in lanes, and tensors of them.
+The text of a tick is the same for one car, abreast in lanes, and tensors of them.
 """
 
 from typing import Any, NamedTuple
@@ -16,11 +16,12 @@ from .pace import acceleration_command
 from .programme import wind_at
 from .record import FAST, TICK
 from .reference import cost_rate, reference
+from .switches import NOT_FINITE, OFF_ROAD, RUNNING, SPIN
 from .tracks import path_offset
 from .tyres import Inputs, load_of
 from .vehicle import GRAVITY
 
-NO_LAG, ONE_LAGS, BOTH_LAG = range(3)
+NO_LAG, ONE_LAGS = range(2)  # 2: both lag
 
 
 class Kind(NamedTuple):
@@ -215,3 +216,10 @@ def advance(
         absolute(aside) > task.half_width,
     )
     return Moving(motion, drive, end, driver, car), seen
+
+
+@jit
+def failure_of(seen: Seen) -> Any:
+    """The failure's code, as a float."""
+    failure = select(seen.spun, SPIN * 1.0, select(seen.off, OFF_ROAD * 1.0, RUNNING * 1.0))
+    return select(seen.lost, NOT_FINITE * 1.0, failure)

@@ -131,3 +131,12 @@ def test_one_version() -> None:
     assert importlib.metadata.version("sideslip") == sideslip.__version__, (
         "the installation is older than the version: touch pyproject.toml and make again"
     )
+
+
+@pytest.mark.smoke
+def test_what_is_no_code_is_installed_too() -> None:
+    from sideslip.agents.policy_file import load_policy, shipped
+    from sideslip.benchmarks.speed.yardstick import source
+
+    assert shipped() and all(load_policy(name).card.command for name in shipped())
+    assert "plant" in source()

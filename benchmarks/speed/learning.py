@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
+from ...envs.record import TICK
 from ..rows import Suite
 from .field import Field, add_costs
 from .timing import Contestant, Effort, Taken, interleaved
@@ -18,7 +19,6 @@ OURS = "PPO, YawFusion-v0"
 PENDULUM = "PPO, Pendulum-v1"
 
 COUNT = 256  # environments of the bridge
-LARGE: dict[str, Any] = {"n_steps": 32, "batch_size": 1024, "n_epochs": 4}  # as `sideslip train`
 DEFAULTS = 2048  # steps of a rollout with the defaults
 ROUNDS = 5  # at most: a round takes seconds
 
@@ -37,8 +37,16 @@ def _learner(env: Any, steps: int, **settings: Any) -> Contestant:
 def _ours() -> Contestant:
     from ...agents.vec_env import make_vec_env
 
+    told = _settings()
     env = make_vec_env("sideslip/YawFusion-v0", COUNT, seed=0)
-    return _learner(env, COUNT * LARGE["n_steps"], **LARGE)
+    return _learner(env, COUNT * told["n_steps"], **told)
+
+
+def _settings() -> dict[str, Any]:
+    """Those of `sideslip train`."""
+    from ...agents.algorithms import algorithm_of
+
+    return algorithm_of("ppo").options(10 * TICK, COUNT)
 
 
 @contextmanager
@@ -66,7 +74,7 @@ def add(suite: Suite, effort: Effort) -> tuple[dict[str, Taken], dict[str, str]]
     with _torch_on_one_thread():
         fewer = replace(effort, rounds=max(1, min(effort.rounds // 2, ROUNDS)))
         taken = interleaved(field.contestants, fewer)
-    settings = ", ".join(f"{name} = {value}" for name, value in LARGE.items())
+    settings = ", ".join(f"{name} = {value}" for name, value in _settings().items())
     add_costs(
         suite,
         "Cost of a learned env-step",

@@ -7,7 +7,7 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
-from sideslip.benchmarks.rows import Row, read_json, write_json, write_parquet, write_whole
+from sideslip.benchmarks.rows import Row, read_json, write_json, write_parquet, write_text
 
 ROWS = [
     Row("estimation", "tie-vision-fig7", "rmse", 0.005, "dakf", low=0.004, high=0.006, n=100),
@@ -43,7 +43,7 @@ def test_a_failed_write_leaves_the_old_file(
 
     monkeypatch.setattr(Path, "write_text", full_disk)
     with pytest.raises(OSError, match="No space left"):
-        write_whole(path, "new")
+        write_text(path, "new")
     monkeypatch.undo()
     assert path.read_text() == "old" and os.listdir(tmp_path) == ["rows.json"]
 
