@@ -55,8 +55,7 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
     Before the first sample a slow sensor's values are 0, its age 10 s, fresh 0.
 
     ## Record
-    `env.unwrapped.record` is what the car's wires carried in the step, fast rows and time-stamped
-    packets. Estimators read only this.
+    `env.unwrapped.record`: the step's fast rows and time-stamped packets, all that estimators read.
 
     ## Reward
     Minus the integral over the step of
