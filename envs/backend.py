@@ -4,6 +4,7 @@ The equations of sideslip are plain scalar functions over tuples. `jit` compiles
 rebuilds the very same functions for Python floats, NumPy arrays or any other table of primitives.
 """
 
+import contextlib
 import functools
 import hashlib
 import os
@@ -84,21 +85,23 @@ def source_stamp(layer: str = _LAYERS[-1]) -> str:
 
 
 def _cache_folder(layer: str = _LAYERS[-1]) -> str | None:
-    """A writable folder for a layer's kernels, or None; older versions' are pruned."""
+    """The folder of a layer's kernels, or None where there can be none; older ones are pruned.
+
+    One that is there but cannot be written is read.
+    """
     home = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
     base = Path(os.environ.get("NUMBA_CACHE_DIR") or Path(home) / "sideslip" / "kernels")
     folder = base / source_stamp(layer)
-    try:
+    with contextlib.suppress(OSError):
         folder.mkdir(parents=True, exist_ok=True)
         os.utime(folder)
-        newest = sorted(base.iterdir(), key=lambda path: path.stat().st_mtime, reverse=True)
-    except OSError:
-        return None
-    if not os.access(folder, os.W_OK):
+    if not folder.is_dir():
         return None
     if "NUMBA_CACHE_DIR" not in os.environ:  # a folder of the user's own is not ours to prune
-        for old in newest[_KEPT_CACHES:]:
-            shutil.rmtree(old, ignore_errors=True)
+        with contextlib.suppress(OSError):  # another process may prune as well
+            newest = sorted(base.iterdir(), key=lambda path: path.stat().st_mtime, reverse=True)
+            for old in newest[_KEPT_CACHES:]:
+                shutil.rmtree(old, ignore_errors=True)
     return str(folder)
 
 

@@ -102,7 +102,7 @@ def action_of(action: Any, width: int, fail: bool) -> Actions:
     """One action (width,) as float32; what has another shape or is no numbers raises ValueError,
     with `fail` it is NaN."""
     if type(action) is np.ndarray and action.dtype is _FLOAT32 and action.shape == (width,):
-        return action if action.flags.c_contiguous else action.copy()  # it is only read
+        return action if action.flags.carray else action.copy()  # others are other types
     try:
         return _action_of(action, width)
     except ValueError as error:

@@ -6,6 +6,7 @@ place. Both sides of a condition are computed, so nothing ever waits for the dev
 
 import math
 from collections.abc import Callable
+from types import FunctionType, MethodType
 from typing import Any
 
 from .backend import plain
@@ -58,10 +59,20 @@ def on_tensors(dtype: torch.dtype, *functions: Callable[..., Any]) -> list[Any]:
     return [plain(function, table) for function in functions]
 
 
-def compiled(function: Callable[..., Any]) -> Any:
-    """The function by `torch.compile`, whole.
+def compiled(function: Any) -> Any:
+    """The bound method by `torch.compile`, whole.
 
     torch inlines what is short wherever it is used, and so again in that; where each of a chain's
     results is used several times, as in the logarithm's shifts, it would compile for an hour.
+    What torch has compiled it counts by code object, and refuses a ninth: each env has its own.
     """
-    return torch.compile(function, fullgraph=True, options={"realize_opcount_threshold": 16})
+    owner, text = function.__self__, function.__func__
+    own = FunctionType(
+        text.__code__.replace(),
+        text.__globals__,
+        text.__name__,
+        text.__defaults__,
+        text.__closure__,
+    )
+    whole = MethodType(own, owner)
+    return torch.compile(whole, fullgraph=True, options={"realize_opcount_threshold": 16})

@@ -159,7 +159,10 @@ class Estimator:
             rows, wide, arrived, long = 0, 0, 0, 0
         if wide != FAST_WIDTH or long != PACKET_WIDTH:
             raise ValueError(_misshapen(fast, packets))
-        arrived = arrived if count is None else count
+        if count is not None:
+            if not 0 <= count <= arrived:
+                raise ValueError(f"count is 0 to {arrived}, the packets given, got {count}")
+            arrived = count
         done = step_entry()(self.filters, self.gains, fast, packets, arrived)
         if done < rows:  # gains are missing
             nothing = _NOTHING, _NOTHING, _NO_NIS

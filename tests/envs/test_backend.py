@@ -133,3 +133,30 @@ def test_plain_replaces_every_callee_and_leaves_the_original_alone() -> None:
                 todo.append(callee)
     assert {"rk4", "derivative", "slips", "sincos", "minimum", "floor"} <= seen
     assert backend.plain(rk4) is not function
+
+
+def test_a_folder_that_can_only_be_read_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    folder = tmp_path / backend.source_stamp("envs")
+    assert backend._cache_folder("envs") == str(folder)  # made
+
+    def refuse(*_: object, **__: object) -> None:
+        raise PermissionError("read-only")
+
+    monkeypatch.setattr(Path, "mkdir", refuse)
+    monkeypatch.setattr(os, "utime", refuse)
+    assert backend._cache_folder("envs") == str(folder)
+    folder.rmdir()
+    assert backend._cache_folder("envs") is None
+
+
+def test_a_folder_that_another_process_prunes_meanwhile_is_no_trouble(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    gone = [tmp_path / "gone"]
+    monkeypatch.setattr(Path, "iterdir", lambda path: iter(gone))
+    assert backend._cache_folder("envs") is not None

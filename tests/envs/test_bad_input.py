@@ -7,7 +7,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-from sideslip.envs import FAILURES, StabilityEnv
+from sideslip.envs import FAILURES, StabilityEnv, kernel
 
 from .helpers import LINEAR, bits, play
 
@@ -189,3 +189,16 @@ def test_a_snapshot_of_another_kind_of_env_is_refused_and_changes_nothing() -> N
         with pytest.raises(ValueError, match=message):
             env.set_state(other.get_state())
         assert bits(env.get_state()["state"]) == before
+
+
+def test_an_array_that_cannot_be_written_compiles_nothing() -> None:
+    """It is another type to the compiler: agents of other libraries give such."""
+    env = StabilityEnv()
+    env.reset(seed=0)
+    action = np.array([0.1], np.float32)
+    env.step(action)
+    known = len(getattr(kernel.step_vehicle, "overloads", ()))
+    action.setflags(write=False)
+    env.step(action)
+    env.step(np.broadcast_to(np.float32(0.1), (1,)))
+    assert len(getattr(kernel.step_vehicle, "overloads", ())) == known

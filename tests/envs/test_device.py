@@ -280,3 +280,20 @@ def test_nothing_of_the_vector_env_is_changed_by_one_on_a_device() -> None:
     assert env.observation_space == host.observation_space
     assert env.action_space == host.action_space
     assert env.layout == host.layout
+
+
+@pytest.mark.long
+def test_more_environments_are_compiled_than_torch_allows_for_one_text(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """By dynamo alone: what refuses a ninth comes before any machine code."""
+    whole = torch.compile
+    monkeypatch.setattr(
+        torch,
+        "compile",
+        lambda f, fullgraph, options: whole(f, fullgraph=fullgraph, backend="eager"),
+    )
+    for period in range(1, 11):
+        env = DeviceVectorEnv.make(UNEVEN, 2, control_period=period, compile=True)
+        env.reset(seed=0)
+        assert env.step(torch.zeros(2, 1))[0].shape == (2, len(env.layout))
