@@ -1,6 +1,6 @@
 """Question: how many env-steps a second does the device engine take, and what bounds it?
 
-`python -m sideslip.benchmarks.device_speed --device cuda --compile --out table.md`
+`python -m sideslip.benchmarks.speed.device --device cuda --compile --out table.md`
 """
 
 import shlex
@@ -14,10 +14,10 @@ from typing import Annotated, Any, NamedTuple
 import typer
 from rich.console import Console
 
-from ..envs.device import DeviceVectorEnv
-from ..envs.device_numbers import torch
-from ..envs.layout import P
-from .rows import check_writable, write_text
+from ...envs.device import DeviceVectorEnv
+from ...envs.device_numbers import torch
+from ...envs.layout import P
+from ..rows import check_writable, write_text
 
 COUNTS = (1024, 16384, 65536, 262144, 1048576)
 ROUNDS = 5
@@ -130,6 +130,7 @@ def main(
     env: Annotated[str, typer.Option(help="An environment's id.")] = "sideslip/YawFusion-v0",
     count: Annotated[list[int] | None, typer.Option(help="Rows of a batch; repeatable.")] = None,
     compiled: Annotated[bool, typer.Option("--compile", help="By torch.compile.")] = False,
+    graph: Annotated[bool, typer.Option("--graph", help="A step is one CUDA graph.")] = False,
     steps: Annotated[int, typer.Option(min=1, help="Steps of a round.")] = 20,
     rounds: Annotated[int, typer.Option(min=1, help="Rounds that count.")] = ROUNDS,
     out: Annotated[Path | None, typer.Option(help="Write the table as Markdown.")] = None,
@@ -143,13 +144,15 @@ def main(
     needed = operations(env)
     copied = 0.0
     for each in count or COUNTS:
-        batch = DeviceVectorEnv.make(env, each, device=device, dtype=dtype, compile=compiled)
+        batch = DeviceVectorEnv.make(
+            env, each, device=device, dtype=dtype, compile=compiled, graph=graph
+        )
         copied = copied or bandwidth(batch.device)
         found.append(measure(batch, copied, rounds, steps))
         console.print(f"{each}: {found[-1].rate:.3g} env-steps/s", highlight=False)
         del batch
     text = (
-        f"`{shlex.join(['python', '-m', 'sideslip.benchmarks.device_speed', *sys.argv[1:]])}`\n\n"
+        f"`{shlex.join(['python', '-m', 'sideslip.benchmarks.speed.device', *sys.argv[1:]])}`\n\n"
         f"{name_of(torch.device(device))}, torch {torch.__version__}; {env}, {dtype}, "
         f"{'compiled' if compiled else 'not compiled'}. Median and range of {rounds} rounds of "
         f"{steps} steps, wall time. An env-step is {needed:.0f} operations. A copy on the device "

@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip("torch")
 
-from sideslip.benchmarks import device_speed
+from sideslip.benchmarks.speed import device as device_speed
 
 ENV_ID = "sideslip/YawVision-v0"
 
@@ -19,7 +19,7 @@ def test_the_table_has_a_line_for_each_size_and_says_how_it_was_made(
     out = tmp_path / "table.md"
     device_speed.main("cpu", "float64", ENV_ID, [4, 8], compiled=False, steps=1, rounds=2, out=out)
     command, _, text, _, *lines = out.read_text().splitlines()
-    assert "sideslip.benchmarks.device_speed" in command
+    assert "sideslip.benchmarks.speed.device" in command
     assert f"{ENV_ID}, float64, not compiled. Median and range of 2 rounds of 1 steps" in text
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
     assert [row[0] for row in rows] == ["N", "---", "4", "8"]
