@@ -15,7 +15,7 @@ import typer
 from rich.console import Console
 
 from ...envs.device import DeviceVectorEnv
-from ...envs.device_numbers import torch
+from ...envs.device.numbers import torch
 from ...envs.layout import P
 from ..rows import check_writable, write_text
 

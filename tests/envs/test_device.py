@@ -13,7 +13,7 @@ torch = pytest.importorskip("torch")
 
 from sideslip.envs import noise  # noqa: E402
 from sideslip.envs.device import DeviceVectorEnv  # noqa: E402
-from sideslip.envs.device_numbers import on_tensors  # noqa: E402
+from sideslip.envs.device.numbers import on_tensors  # noqa: E402
 from sideslip.envs.dynamics import Motion  # noqa: E402
 from sideslip.envs.layout import Z  # noqa: E402
 from sideslip.envs.record import FAST  # noqa: E402

@@ -4,12 +4,12 @@ from typing import Any
 
 import numpy as np
 
-from .device_numbers import torch
-from .device_slow import Most
-from .device_state import held_of, write_states
-from .device_step import Brought, Held
-from .fleet import Fleet, Whole
-from .record import PACKET_WIDTH
+from ..fleet import Fleet, Whole
+from ..record import PACKET_WIDTH
+from .numbers import torch
+from .slow import Most
+from .state import held_of, write_states
+from .step import Brought, Held
 
 Tensor = torch.Tensor
 _RECORD = Brought._fields.index("rows")  # from here on the rows are the last axis

@@ -3,15 +3,15 @@ function that never waits for the device."""
 
 from typing import Any, NamedTuple
 
-from .backend import select
-from .device_numbers import compiled, on_tensors, torch
-from .device_slow import Most, SlowSensors, Under, Window
-from .device_tell import Telling
-from .device_ticks import Now, Ticks, start_of
-from .layout import Array, P
-from .summary import clip
-from .switches import BAD_ACTION, REPORT, RUNNING
-from .tick import Kind
+from ..backend import select
+from ..layout import Array, P
+from ..summary import clip
+from ..switches import BAD_ACTION, REPORT, RUNNING
+from ..tick import Kind
+from .numbers import compiled, on_tensors, torch
+from .slow import Most, SlowSensors, Under, Window
+from .tell import Telling
+from .ticks import Now, Ticks, start_of
 
 Tensor = torch.Tensor
 

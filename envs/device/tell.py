@@ -2,16 +2,16 @@
 
 from typing import Any
 
-from .backend import select
-from .device_numbers import on_tensors, torch
-from .device_slow import Delivered
-from .device_ticks import Now, Told
-from .layout import AGE_CAP, SAMPLED, Slow
-from .record import CAMERA, FAST, PACKET, TICK, VALUES
-from .reference import rest_of_cost
-from .sensors import NEVER
-from .summary import clip
-from .switches import BAD_ACTION, RUNNING, Report
+from ..backend import select
+from ..layout import AGE_CAP, SAMPLED, Slow
+from ..record import CAMERA, FAST, PACKET, TICK, VALUES
+from ..reference import rest_of_cost
+from ..sensors import NEVER
+from ..summary import clip
+from ..switches import BAD_ACTION, RUNNING, Report
+from .numbers import on_tensors, torch
+from .slow import Delivered
+from .ticks import Now, Told
 
 Tensor = torch.Tensor
 _CAPTURED, _ARRIVED = Slow._fields.index("captured"), Slow._fields.index("arrived")

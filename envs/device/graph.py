@@ -2,8 +2,8 @@
 
 from typing import Any
 
-from .device_numbers import torch
-from .device_step import Brought, Held, Step
+from .numbers import torch
+from .step import Brought, Held, Step
 
 Tensor = torch.Tensor
 _WARM = 3  # calls before the recording, as torch asks for

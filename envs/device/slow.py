@@ -8,15 +8,14 @@ off the front what has arrived.
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from .backend import select
-from .delivery import FAR
-from .device_numbers import on_tensors, torch
-from .dynamics import Motion, Road
-from .elementary import exp
-from .layout import P, Slow, Z
-from .noise import CHANNELS, normals
-from .record import CAMERA, PACKET, PACKET_WIDTH, VALUES
-from .sensors import (
+from ..backend import select
+from ..delivery import FAR
+from ..dynamics import Motion, Road
+from ..elementary import exp
+from ..layout import P, Slow, Z
+from ..noise import CHANNELS, normals
+from ..record import CAMERA, PACKET, PACKET_WIDTH, VALUES
+from ..sensors import (
     NEVER,
     Link,
     Noise,
@@ -27,6 +26,7 @@ from .sensors import (
     most_under_way,
     sky_deviation,
 )
+from .numbers import on_tensors, torch
 
 Tensor = torch.Tensor
 _NEWEST = Slow._fields.index("captured")
@@ -207,7 +207,7 @@ def taken_off(queue: Tensor, count: Tensor) -> Tensor:
     return torch.cat((before, arrived[:, None], after), 1)
 
 
-def unpacked(states: Tensor, room: int) -> Under:
+def read_packed(states: Tensor, room: int) -> Under:
     """The slow sensors' part of packed states (Z.end, N); ValueError where more packets are under
     way than there is room for."""
     if bool((states[Z.under_way] > room).any()):
@@ -219,7 +219,7 @@ def unpacked(states: Tensor, room: int) -> Under:
     return Under(slow.clone(), states[Z.sky].clone(), in_order(queue))
 
 
-def packed(under: Under, states: Tensor) -> None:
+def write_packed(under: Under, states: Tensor) -> None:
     """Write the slow sensors' part into packed states (Z.end, N)."""
     count = states.shape[1]
     states[Z.camera : Z.queue] = under.slow.reshape(-1, count)

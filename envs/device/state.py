@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from .border import actions_of
-from .device_numbers import DTYPES, torch
-from .device_slow import packed, unpacked
-from .device_step import Held
-from .dynamics import Motion
-from .layout import Array, Drive, Z
+from ..border import actions_of
+from ..dynamics import Motion
+from ..layout import Array, Drive, Z
+from .numbers import DTYPES, torch
+from .slow import read_packed, write_packed
+from .step import Held
 
 Tensor = torch.Tensor
 _MOTION, _DRIVE = len(Motion._fields), len(Drive._fields)
@@ -96,7 +96,7 @@ def held_of(
 ) -> tuple[Held, Tensor]:
     """The state on the device, and the keys (2, N), of packed states (N, Z.end)."""
     whole = torch.as_tensor(states.T.copy())
-    under = unpacked(whole, room)
+    under = read_packed(whole, room)
     held = Held(
         whole[Z.motion : Z.motion + _MOTION],
         whole[Z.drive : Z.drive + _DRIVE],
@@ -122,5 +122,5 @@ def write_states(held: Held, states: Array) -> None:
     whole[Z.driver] = here.driver
     whole[Z.clock + 2] = here.tick
     whole[Z.clock + 3] = here.failure
-    packed(here.under, whole)
+    write_packed(here.under, whole)
     states[:] = whole.numpy().T

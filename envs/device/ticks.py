@@ -7,17 +7,17 @@ branches on values, so the device never waits for the host.
 
 from typing import Any, NamedTuple
 
-from .backend import select
-from .delivery import Chance
-from .device_numbers import compiled, on_tensors, torch
-from .dynamics import Motion
-from .kernel import fixed_of
-from .layout import Drive, P
-from .noise import CHANNELS, normals
-from .programme import STEERING_WIDTH, steering_at
-from .record import FAST_WIDTH, TICK
-from .switches import RUNNING
-from .tick import Kind, Moving, advance, changed, failure_of
+from ..backend import select
+from ..delivery import Chance
+from ..dynamics import Motion
+from ..kernel import fixed_of
+from ..layout import Drive, P
+from ..noise import CHANNELS, normals
+from ..programme import STEERING_WIDTH, steering_at
+from ..record import FAST_WIDTH, TICK
+from ..switches import RUNNING
+from ..tick import Kind, Moving, advance, changed, failure_of
+from .numbers import compiled, on_tensors, torch
 
 Tensor = torch.Tensor
 Numbers = tuple[Tensor, ...]

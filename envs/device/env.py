@@ -8,21 +8,21 @@ import numpy as np
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, VectorEnv
 
-from .border import count_of, mask_of, mode_of, named
-from .device_graph import Graphed
-from .device_numbers import torch
-from .device_rows import Rows
-from .device_slow import Most, most_of
-from .device_state import compiles, device_of, dtype_of, told_actions
-from .device_step import Brought, Held, Step
-from .kernel import kind_of
-from .layout import P
-from .record import CAMERA, SLOW_NAMES
-from .sensors import Link
-from .switches import REPORT, RUNNING, Report, Switches
-from .template import Template
-from .tick import Kind
-from .vector import StabilityVectorEnv
+from ..border import count_of, mask_of, mode_of, named
+from ..kernel import kind_of
+from ..layout import P
+from ..record import CAMERA, SLOW_NAMES
+from ..sensors import Link
+from ..switches import REPORT, RUNNING, Report, Switches
+from ..template import Template
+from ..tick import Kind
+from ..vector import StabilityVectorEnv
+from .graph import Graphed
+from .numbers import torch
+from .rows import Rows
+from .slow import Most, most_of
+from .state import compiles, device_of, dtype_of, told_actions
+from .step import Brought, Held, Step
 
 Tensor = torch.Tensor
 Infos = dict[str, Any]
