@@ -53,7 +53,7 @@ clean: ## remove the virtual environment and everything made here
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # One stamp for each set of extras: the benchmark does without torch.
-.venv/ready-bench: EXTRAS := design,mpc,report,bench,outside
+.venv/ready-bench: EXTRAS := design,mpc,report,highway,bench,outside
 .venv/ready-all: EXTRAS := all,dev
 .venv/ready-bench .venv/ready-all: pyproject.toml constraints.txt | $(BIN)/python
 	@echo "Installing sideslip[$(EXTRAS)] into .venv (the first time takes a minute or more)"
