@@ -11,17 +11,7 @@ scratch array, `drive_on` moves the car tick by tick, `conclude` handles the slo
 from typing import Any
 
 from .actuators import Lag
-from .backend import (
-    anywhere,
-    apart,
-    at,
-    copied,
-    fixed_tuple,
-    jit,
-    put,
-    put_all,
-    select,
-)
+from .backend import anywhere, apart, at, copied, fixed_tuple, jit, put, put_all, select
 from .delivery import due, sense_slow
 from .driver import Driver
 from .dynamics import Car, Motion, Road
