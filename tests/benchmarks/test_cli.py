@@ -1,30 +1,12 @@
 """The command line: what a newcomer types, and each way to type it wrong."""
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from sideslip.benchmarks import cli
 from sideslip.benchmarks.suites import SUITES
-
-Run = Callable[..., tuple[int, str, str]]
-
-
-@pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Run:
-    """Call `sideslip` with arguments; gives (exit status, stdout, stderr)."""
-
-    def call(*arguments: object) -> tuple[int, str, str]:
-        monkeypatch.setattr("sys.argv", ["sideslip", *map(str, arguments)])
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-            raise SystemExit(0)
-        out, err = capfd.readouterr()
-        return int(ended.value.code or 0), out, err
-
-    return call
+from tests.benchmarks.conftest import Run
 
 
 @pytest.mark.smoke

@@ -23,9 +23,7 @@ from sideslip.benchmarks.matrix.contestants import LEARNED, MANOEUVRES, STEERING
 from sideslip.benchmarks.matrix.drive import Chunk
 from sideslip.benchmarks.matrix.kept import Kept
 from sideslip.benchmarks.matrix.seeds import salt_of, salted_seeds
-from tests.benchmarks.test_cli import Run, run
-
-__all__ = ["run"]  # a fixture
+from tests.benchmarks.conftest import Run
 
 SHORT = {"base": "random-steering", "duration": 1.5}
 HERE = "sideslip/YawVision-v0"

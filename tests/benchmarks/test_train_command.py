@@ -2,39 +2,29 @@
 
 import shlex
 import sys
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
 
 from sideslip.agents.policy_file import load_policy
-from sideslip.benchmarks import cli
 
 pytest.importorskip("stable_baselines3")
 from sideslip.agents import train
 from sideslip.benchmarks import enjoy, train_command
+from tests.benchmarks.conftest import Run
 
-Run = Callable[..., tuple[int, str, str]]
 TINY = ("--num-envs", 8, "--option", "scenario=sine-with-dwell")
 
 
 @pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], tmp_path: Path) -> Run:
+def run(run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
     """Call `sideslip train` in an empty folder; gives (exit status, stdout, stderr)."""
     for name, value in {"EPISODES": 4, "EVERY": 256, "_MEASURED": 8}.items():
         monkeypatch.setattr(train, name, value)
     monkeypatch.setattr(train_command, "EPISODES", 4)
     monkeypatch.chdir(tmp_path)
-
-    def call(*arguments: object) -> tuple[int, str, str]:
-        monkeypatch.setattr("sys.argv", ["sideslip", "train", *map(str, arguments)])
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-            raise SystemExit(0)
-        out, err = capfd.readouterr()
-        return int(ended.value.code or 0), out, err
-
-    return call
+    return partial(run, "train")
 
 
 @pytest.mark.long

@@ -5,18 +5,18 @@ import errno
 import os
 import sys
 import tomllib
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from sideslip.benchmarks import cli, tune, tune_file, tune_study, tune_task
+from sideslip.benchmarks import tune, tune_file, tune_study, tune_task
 from sideslip.benchmarks.tune_task import Drive, Task
 from sideslip.estimators import make_estimator, tunings
+from tests.benchmarks.conftest import Run
 
-Run = Callable[..., tuple[int, str, str]]
 SCENARIO = "tie-vision-fig8"
 optuna = pytest.importorskip("optuna")
 
@@ -245,20 +245,10 @@ def test_a_shipped_tuning_says_how_it_was_found(entry: dict[str, Any]) -> None:
 
 
 @pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], tmp_path: Path) -> Run:
+def run(run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
     """Call `sideslip tune estimator` in an empty folder; gives (exit status, stdout, stderr)."""
     monkeypatch.chdir(tmp_path)
-
-    def call(*arguments: object) -> tuple[int, str, str]:
-        words = ["sideslip", "tune", "estimator", *map(str, arguments)]
-        monkeypatch.setattr("sys.argv", words)
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-            raise SystemExit(0)
-        out, err = capfd.readouterr()
-        return int(ended.value.code or 0), out, err
-
-    return call
+    return partial(run, "tune", "estimator")
 
 
 FEW = ("--trials", 8, "--seeds", 1, "--test-seeds", 2, "--jobs", 1)

@@ -15,6 +15,9 @@ from sideslip.envs.record import PACKET, PACKET_WIDTH
 
 from .batches import batch
 
+FUSION, UNEVEN = "sideslip/YawFusion-v0", "sideslip/YawVisionUneven-v0"
+EXACT = 1e-9
+
 _ARRAYS = (
     "params", "states", "switches", "over", "obs", "rows", "packets", "reports", "ticks_done",
     "delivered",
@@ -106,3 +109,16 @@ def largest_error(one: dict[str, Any], other: dict[str, Any]) -> float:
         same = (a == b) | (np.isnan(a) & np.isnan(b))
         worst = max(worst, float(np.where(same, 0.0, np.abs(a - b)).max(initial=0.0)))
     return worst
+
+
+def agrees(env_id: str, moments: Moments, **arguments: Any) -> DeviceVectorEnv:
+    """The device's step from these moments is the compiled engine's; returns the env after it."""
+    returned, env = device_step(env_id, moments, **arguments)
+    obs, rewards, terminated, truncated, infos = returned
+    np.testing.assert_array_equal(terminated.cpu(), moments.terminated)
+    np.testing.assert_array_equal(truncated.cpu(), moments.truncated)
+    assert largest_error(moments.after, env.get_state()) < EXACT
+    np.testing.assert_allclose(rewards.cpu(), moments.rewards, rtol=0.0, atol=EXACT)
+    np.testing.assert_allclose(obs.cpu(), moments.after["obs"], rtol=0.0, atol=1e-6)
+    assert (infos["failure"] != 0).tolist() == moments.terminated.tolist()
+    return env

@@ -19,24 +19,18 @@ from sideslip.envs.layout import Z  # noqa: E402
 from sideslip.envs.record import FAST  # noqa: E402
 
 from .batches import MODES, batch  # noqa: E402
-from .moments import Moments, device_step, drive, episodes, largest_error  # noqa: E402
+from .moments import (  # noqa: E402
+    EXACT,
+    FUSION,
+    UNEVEN,
+    agrees,
+    device_step,
+    drive,
+    episodes,
+    largest_error,
+)
 
-FUSION, UNEVEN = "sideslip/YawFusion-v0", "sideslip/YawVisionUneven-v0"
-EXACT = 1e-9
 DEVICES = ["cpu"] + ["cuda"] * torch.cuda.is_available()
-
-
-def agrees(env_id: str, moments: Moments, **arguments: Any) -> DeviceVectorEnv:
-    """The device's step from these moments is the compiled engine's; returns the env after it."""
-    returned, env = device_step(env_id, moments, **arguments)
-    obs, rewards, terminated, truncated, infos = returned
-    np.testing.assert_array_equal(terminated.cpu(), moments.terminated)
-    np.testing.assert_array_equal(truncated.cpu(), moments.truncated)
-    assert largest_error(moments.after, env.get_state()) < EXACT
-    np.testing.assert_allclose(rewards.cpu(), moments.rewards, rtol=0.0, atol=EXACT)
-    np.testing.assert_allclose(obs.cpu(), moments.after["obs"], rtol=0.0, atol=1e-6)
-    assert (infos["failure"] != 0).tolist() == moments.terminated.tolist()
-    return env
 
 
 @pytest.mark.plain
@@ -250,57 +244,10 @@ def test_a_snapshot_goes_on_in_the_compiled_engine() -> None:
     assert largest_error(host.get_state(), env.get_state()) < EXACT
 
 
-@pytest.mark.long
-def test_compiled_ticks_are_the_same_and_compiled_once() -> None:
-    scenario = {"base": "random-steering", "duration": 0.3}
-    moments = episodes(FUSION, 40, scenario=scenario)
-    env = agrees(FUSION, moments, scenario=scenario, compile=True)
-    with torch.compiler.set_stance("fail_on_recompile"):
-        for _ in range(3):
-            env.step(torch.zeros(env.num_envs, 1))
-
-
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-@pytest.mark.parametrize("mode", MODES)
-def test_a_graph_gives_the_same_steps(mode: str) -> None:
-    told: dict[str, Any] = {
-        "scenario": {"base": "random-steering", "duration": 0.07},
-        "autoreset_mode": mode,
-        "device": "cuda",
-    }
-    one, other = (
-        DeviceVectorEnv.make(FUSION, 5, **told),
-        DeviceVectorEnv.make(FUSION, 5, graph=True, **told),
-    )
-    for env in (one, other):
-        env.reset(seed=0)
-    for step in range(20):
-        actions = torch.full((5, 1), 0.05 * step, device="cuda")
-        for a, b in zip(one.step(actions)[:4], other.step(actions)[:4], strict=True):
-            assert torch.equal(a, b)
-
-
-def test_nothing_of_the_vector_env_is_changed_by_one_on_a_device() -> None:
+def test_spaces_and_layout_are_those_of_the_vector_env() -> None:
     env = DeviceVectorEnv.make(FUSION, 2)
     host = batch(FUSION, 2)
     assert isinstance(host, StabilityVectorEnv)
     assert env.observation_space == host.observation_space
     assert env.action_space == host.action_space
     assert env.layout == host.layout
-
-
-@pytest.mark.long
-def test_more_environments_are_compiled_than_torch_allows_for_one_text(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """By dynamo alone: what refuses a ninth comes before any machine code."""
-    whole = torch.compile
-    monkeypatch.setattr(
-        torch,
-        "compile",
-        lambda f, fullgraph, options: whole(f, fullgraph=fullgraph, backend="eager"),
-    )
-    for period in range(1, 11):
-        env = DeviceVectorEnv.make(UNEVEN, 2, control_period=period, compile=True)
-        env.reset(seed=0)
-        assert env.step(torch.zeros(2, 1))[0].shape == (2, len(env.layout))

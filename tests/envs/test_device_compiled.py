@@ -1,0 +1,59 @@
+"""The device engine by `torch.compile` and as CUDA graphs: the same steps, compiled once."""
+
+from typing import Any
+
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from sideslip.envs.device import DeviceVectorEnv  # noqa: E402
+
+from .batches import MODES  # noqa: E402
+from .moments import FUSION, UNEVEN, agrees, episodes  # noqa: E402
+
+
+@pytest.mark.long
+def test_compiled_ticks_are_the_same_and_compiled_once() -> None:
+    scenario = {"base": "random-steering", "duration": 0.3}
+    moments = episodes(FUSION, 40, scenario=scenario)
+    env = agrees(FUSION, moments, scenario=scenario, compile=True)
+    with torch.compiler.set_stance("fail_on_recompile"):
+        for _ in range(3):
+            env.step(torch.zeros(env.num_envs, 1))
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@pytest.mark.parametrize("mode", MODES)
+def test_a_graph_gives_the_same_steps(mode: str) -> None:
+    told: dict[str, Any] = {
+        "scenario": {"base": "random-steering", "duration": 0.07},
+        "autoreset_mode": mode,
+        "device": "cuda",
+    }
+    one, other = (
+        DeviceVectorEnv.make(FUSION, 5, **told),
+        DeviceVectorEnv.make(FUSION, 5, graph=True, **told),
+    )
+    for env in (one, other):
+        env.reset(seed=0)
+    for step in range(20):
+        actions = torch.full((5, 1), 0.05 * step, device="cuda")
+        for a, b in zip(one.step(actions)[:4], other.step(actions)[:4], strict=True):
+            assert torch.equal(a, b)
+
+
+@pytest.mark.long
+def test_more_environments_are_compiled_than_torch_allows_for_one_text(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """By dynamo alone: what refuses a ninth comes before any machine code."""
+    whole = torch.compile
+    monkeypatch.setattr(
+        torch,
+        "compile",
+        lambda f, fullgraph, options: whole(f, fullgraph=fullgraph, backend="eager"),
+    )
+    for period in range(1, 11):
+        env = DeviceVectorEnv.make(UNEVEN, 2, control_period=period, compile=True)
+        env.reset(seed=0)
+        assert env.step(torch.zeros(2, 1))[0].shape == (2, len(env.layout))
