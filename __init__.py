@@ -54,7 +54,7 @@ for _id, _kwargs in _ENVIRONMENTS.items():
             kwargs=_kwargs,
         )
 if "sideslip/Outside-v0" not in registry:
-    register("sideslip/Outside-v0", entry_point="sideslip.envs.outside_env:OutsideEnv")
+    register("sideslip/Outside-v0", entry_point="sideslip.envs.outside.env:OutsideEnv")
 
 
 def __getattr__(name: str) -> Any:

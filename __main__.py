@@ -1,6 +1,6 @@
 """The command line: `sideslip` and `python -m sideslip`."""
 
-from .benchmarks.cli import main
+from .benchmarks.cli.main import main
 
 __all__ = ["main"]
 

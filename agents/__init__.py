@@ -3,18 +3,18 @@
 from collections.abc import Callable
 from typing import Any
 
-from .controller import Controller, NoControl
-from .esc import Esc
-from .given import AnyEnv
-from .informed import Informed
-from .lane_keeping import LaneKeeping
-from .learned import Learned
-from .lqr import Lqr
-from .model_following import ModelFollowing
-from .mpc import Mpc
-from .policy_file import is_policy
-from .sliding_mode import SlidingMode
-from .two_dof import Feedforward, TwoDof
+from .controllers.base import Controller, NoControl
+from .controllers.esc import Esc
+from .controllers.informed import Informed
+from .controllers.lane_keeping import LaneKeeping
+from .controllers.lqr import Lqr
+from .controllers.model_following import ModelFollowing
+from .controllers.mpc import Mpc
+from .controllers.sliding_mode import SlidingMode
+from .controllers.two_dof import Feedforward, TwoDof
+from .env_facts import AnyEnv
+from .learned.files import is_policy
+from .learned.policy import Learned
 
 AGENTS: dict[str, Callable[..., Controller]] = {
     "none": NoControl,

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 from gymnasium.vector import VectorEnv, VectorWrapper
 
-from ..envs.layout import Entry
-from ..envs.vehicle import Vehicle
+from ..envs.task.observation import Entry
+from ..envs.vehicle.vehicle import Vehicle
 
 if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv

@@ -1,5 +1,6 @@
-"""One episode as a table of every signal with its unit."""
+"""One episode as a table of every signal with its unit; the cost of many episodes at once."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -7,8 +8,27 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
+from gymnasium.vector import VectorEnv
 
 from ..envs.record import Log, Record, concatenate
+
+
+def costs_of(
+    env: VectorEnv[Any, Any, Any], agent: Any, seeds: Sequence[int]
+) -> npt.NDArray[np.float64]:
+    """The cost J of each seed's first episode, (N,); agent: with stable-baselines3's `predict`."""
+    told: Any = list(seeds)
+    obs, _ = env.reset(seed=told)
+    costs, alive = np.zeros(env.num_envs), np.ones(env.num_envs, np.bool_)
+    state, start = None, np.ones(env.num_envs, np.bool_)
+    while alive.any():
+        actions, state = agent.predict(obs, state, start, deterministic=True)
+        obs, rewards, terminated, truncated, _ = env.step(actions)
+        costs -= np.where(alive, rewards, 0.0)
+        start = np.logical_or(terminated, truncated)
+        alive &= ~start
+    return costs
+
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -13,11 +13,12 @@ from rich.console import Console
 
 from .. import __version__
 from ..agents.rollout import Rollout, rollout
-from ..estimators import UnobservableWarning, make_estimator
-from ..estimators.bound import bound
-from .cases import run_cases
-from .rows import Row, Suite, Table
-from .stats import interval, ratio_of_roots, root_mean
+from ..estimators.analysis.bound import bound
+from ..estimators.estimates import UnobservableWarning
+from ..estimators.make import make_estimator
+from .harness.parallel import run_cases
+from .harness.results import Row, Suite, Table
+from .harness.stats import interval, ratio_of_roots, root_mean
 
 Array = npt.NDArray[np.float64]
 
@@ -226,7 +227,7 @@ def _draw(
 ) -> None:
     """Figures of one experiment; nothing where plotly is not installed."""
     try:
-        from .figures import bars_with_interval, time_series
+        from .report.figures import bars_with_interval, time_series
     except ModuleNotFoundError:
         return
     labels = [label for label, _, _ in experiment.estimators]

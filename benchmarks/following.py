@@ -12,17 +12,17 @@ from rich.console import Console
 
 from .. import __version__
 from ..agents import make_agent
-from ..agents.model_following import feedback_gains
-from ..envs import scenario_from
-from ..envs.dynamics import Motion
-from ..envs.linear import LinearModel, bicycle
-from ..envs.record import TICK
-from ..estimators import UnobservableWarning
-from ..estimators.vector import EstimateObservation
-from .cases import run_cases
-from .rows import Row, Suite, Table
-from .stats import interval
-from .tracking import drive, tracking
+from ..agents.controllers.model_following import feedback_gains
+from ..envs.scenarios.manoeuvres import scenario_from
+from ..envs.ticks import TICK
+from ..envs.vehicle.dynamics import Motion
+from ..envs.vehicle.linear import LinearModel, bicycle
+from ..estimators.estimates import UnobservableWarning
+from ..estimators.vector.estimate import EstimateObservation
+from .harness.parallel import run_cases
+from .harness.results import Row, Suite, Table
+from .harness.stats import interval
+from .papers.ledger.tracking import drive, tracking
 
 Array = npt.NDArray[np.float64]
 
@@ -167,7 +167,7 @@ def _bandwidths(suite: Suite, found: Array) -> None:
     note = "Errors over those without control; shares of time and of runs."
     suite.tables.append(Table("The bandwidth K", header, cells, note, keyed=False))
     try:
-        from .matrix.pictures import curves
+        from .report.heat_maps import curves
     except ModuleNotFoundError:
         return
     shown = {name: _columns(each) for name, each in lines.items()}

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from .colours import INK, colour
-from .matrix.contestants import REFERENCE_FILTER, YAW
-from .rows import METRICS, Row, Suite
+from .control.cells import REFERENCE_FILTER, YAW
+from .harness.results import METRICS, Row, Suite
+from .report.colours import INK, colour
 
 
 def write_picture(path: str | Path, suites: Sequence[Suite]) -> None:

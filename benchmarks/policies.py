@@ -12,15 +12,15 @@ import gymnasium as gym
 import numpy as np
 
 from .. import __version__
-from ..agents.policy_card import JsonMap
-from ..agents.policy_file import Policy, load_policy, save_policy
-from .matrix.contestants import REFERENCE_FILTER, Cell
-from .matrix.drive import NUMBERS, Array, Chunk, Driven, drive
-from .matrix.scores import improvement
-from .matrix.seeds import salted_seeds
-from .matrix.tables import spec_of
-from .rows import Row, Suite, Table
-from .stats import interval
+from ..agents.learned.card import JsonMap
+from ..agents.learned.files import Policy, load_policy, save_policy
+from .control.cells import REFERENCE_FILTER, Cell
+from .control.episodes import NUMBERS, Array, Chunk, Driven, drive
+from .control.scores import improvement
+from .control.seeds import salted_seeds
+from .control.tables import spec_of
+from .harness.results import Row, Suite, Table
+from .harness.stats import interval
 
 CLASSICAL = "lqr"
 
@@ -131,7 +131,7 @@ def suite_of(found: Enjoyed) -> Suite:
     if judged != card.reference:
         text += f" Here it is judged by another reference, {judged}: by another cost."
     suite = Suite("enjoy", f"{name} on {cell.env_id}", text, _rows(found), [_table(found)])
-    from .matrix.illustrate import in_motion, over_time, run_of
+    from .control.figures import in_motion, over_time, run_of
 
     runs = {who: run_of(found.cells[who], found.seeds[0]) for who in found.driven}
     try:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from .rows import Suite
+from .harness.results import Suite
 
 
 @dataclass(frozen=True)
@@ -32,15 +32,15 @@ def _estimation(wish: Wish) -> Suite:
 
 
 def _control(wish: Wish) -> Suite:
-    from . import control
-    from .matrix.contestants import EPISODES, QUICK_EPISODES
+    from .control import suite as control
+    from .control.cells import EPISODES, QUICK_EPISODES
 
     usual = QUICK_EPISODES if wish.quick else EPISODES
     return control.run(wish.episodes or usual, wish.jobs, wish.console, wish.keep)
 
 
 def _papers(wish: Wish) -> Suite:
-    from . import papers
+    from .papers import suite as papers
 
     seeds = papers.QUICK_SEEDS if wish.quick else papers.SEEDS
     return papers.run(seeds, wish.jobs, console=wish.console)

@@ -4,14 +4,14 @@
 if __name__ != "sideslip.envs":
     raise ImportError(f"this folder is the package sideslip.envs; it was imported as {__name__}")
 
-from .layout import Entry
-from .manoeuvres import SCENARIOS, scenario_from
 from .record import Log, Record, SlowSensor
-from .scenario import Scenario
+from .scenarios.manoeuvres import SCENARIOS, scenario_from
+from .scenarios.scenario import Scenario
 from .stability import StabilityEnv
-from .switches import FAILURES
+from .task.failures import FAILURES
+from .task.observation import Entry
 from .vector import StabilityVectorEnv
-from .vehicle import COMS, PASSENGER_CAR, VEHICLES, Vehicle, critical_speed, vehicle_from
+from .vehicle.vehicle import COMS, PASSENGER_CAR, VEHICLES, Vehicle, critical_speed, vehicle_from
 
 __all__ = [
     "COMS",

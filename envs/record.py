@@ -9,10 +9,9 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
+from .ticks import TICK
 
-TICK = 0.001
-"""The base tick of the simulated car in seconds."""
+Array = npt.NDArray[np.float64]
 
 
 class Fast(NamedTuple):

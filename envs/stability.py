@@ -9,20 +9,23 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.error import ResetNeeded
 
-from .border import action_of
-from .dynamics import Motion
-from .episode import info_of, motion_in, record_in, slow_in, vehicle_in
-from .kernel import step_vehicle
-from .layout import Entry, P, Z
-from .manoeuvres import scenario_from
-from .programme import DRAWS_WIDTH
-from .record import FAST_WIDTH, PACKET_WIDTH, TICK, Record, SlowSensor
-from .restart import reset_vehicle
-from .scenario import Scenario
-from .scratch import scratch_of
-from .setting import Setting
-from .switches import REFUSED, REPORT, RUNNING
-from .vehicle import Vehicle, vehicle_from
+from .arguments import action_of
+from .engine.config import Setting
+from .engine.layout import P, Z
+from .engine.reset import reset_vehicle
+from .engine.step import step_vehicle
+from .engine.views import motion_in, record_in, slow_in, vehicle_in
+from .engine.window import scratch_of
+from .record import FAST_WIDTH, PACKET_WIDTH, Record, SlowSensor
+from .scenarios.draws import DRAWS_WIDTH
+from .scenarios.manoeuvres import scenario_from
+from .scenarios.scenario import Scenario
+from .task.failures import REFUSED, RUNNING
+from .task.info import REPORT, info_of
+from .task.observation import Entry
+from .ticks import TICK
+from .vehicle.dynamics import Motion
+from .vehicle.vehicle import Vehicle, vehicle_from
 
 
 class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):

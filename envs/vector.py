@@ -12,13 +12,13 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from .batch import step_rows
-from .border import actions_of, count_of, mask_of, mode_of, named, seeds_of
-from .episode import infos_of
-from .fleet import Fleet
-from .layout import Array
+from .arguments import actions_of, count_of, mask_of, mode_of, named, seeds_of
+from .engine.batch import step_rows
+from .engine.episodes import Fleet
+from .record import Array
 from .stability import StabilityEnv
-from .switches import REFUSED
+from .task.failures import REFUSED
+from .task.info import infos_of
 
 Observations = npt.NDArray[np.float32]
 Flags = npt.NDArray[np.bool_]

@@ -13,13 +13,13 @@ equations of `kalman`; `stability` refuses what diverges. `estimator` and `wrapp
 ceiling.
 """
 
-from .dual_rate import DualRate
+from .analysis.linear_system import DualRate
+from .analysis.smoother import smooth
 from .estimates import Estimates, UnobservableWarning
 from .estimator import Estimator
+from .filters import FILTERS
 from .make import make_estimator
-from .papers import FILTERS
-from .smoother import smooth
-from .wrappers import EstimateObservation
+from .wrappers.estimate import EstimateObservation
 
 __all__ = [
     "FILTERS",

@@ -11,17 +11,18 @@ import numpy.typing as npt
 from scipy.linalg import block_diag
 
 from ..envs.record import FAST, FAST_WIDTH, PACKET_WIDTH, SLOW_NAMES, Log, Record, SlowSensor
-from .compiled import advance_entry, receive_entry, step_entry
-from .core import begin_all
+from .core.entry import advance_entry, receive_entry, step_entry
+from .core.memory import Counters
+from .core.run import begin_all
+from .core.transition import KINEMATIC, LATERAL, VELOCITY_ROLL
+from .design.error_map import MARGINAL, error_map, spectral_radius, unobservable
+from .design.models import UNITS
+from .design.periodic import design, table_shape
+from .design.schedule import Schedule, whole_ticks
 from .estimates import Estimates, UnobservableWarning
-from .memory import Counters
-from .models import UNITS
-from .periodic import design, table_shape
-from .schedule import Schedule, whole_ticks
-from .stability import MARGINAL, error_map, spectral_radius, unobservable
-from .transition import KINEMATIC, LATERAL, VELOCITY_ROLL
 
 Array = npt.NDArray[np.float64]
+
 
 CHECKED_SPEEDS = (3.0, 7.0, 14.0)  # m/s, where a filter without a fixed speed is checked
 

@@ -7,18 +7,19 @@ from typing import Any
 
 import numpy as np
 
-from ..envs.record import TICK, SlowSensor
-from ..envs.vehicle import COMS, Vehicle, vehicle_from
-from .delay import check_window, place_clones
+from ..envs.record import SlowSensor
+from ..envs.ticks import TICK
+from ..envs.vehicle.vehicle import COMS, Vehicle, vehicle_from
+from .core.memory import FILTER
+from .design.configure import Common, plans, write_clocks, write_rules, write_speed
+from .design.late_samples import check_window, place_clones
+from .design.models import write_model
+from .design.options import Options, check_prior, noise_levels, prior_variances, process_noise
+from .design.request import models_of, slow_sensors, wish_of
+from .design.schedule import Schedule
+from .design.tunings import TUNINGS
 from .estimator import Estimator
-from .memory import FILTER
-from .models import write_model
-from .options import Options, check_prior, noise_levels, prior_variances, process_noise
-from .papers import FILTERS
-from .rules import Common, plans, write_clocks, write_rules, write_speed
-from .schedule import Schedule
-from .tunings import TUNINGS
-from .wish import models_of, slow_sensors, wish_of
+from .filters import FILTERS
 
 
 def make_estimator(

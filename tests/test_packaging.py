@@ -135,8 +135,8 @@ def test_one_version() -> None:
 
 @pytest.mark.smoke
 def test_what_is_no_code_is_installed_too() -> None:
-    from sideslip.agents.policy_file import load_policy, shipped
-    from sideslip.benchmarks.speed.yardstick import source
+    from sideslip.agents.learned.files import load_policy, shipped
+    from sideslip.benchmarks.speed.c_plant import source
 
     assert shipped() and all(load_policy(name).card.command for name in shipped())
     assert "plant" in source()

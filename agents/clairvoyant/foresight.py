@@ -6,17 +6,18 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ..envs.actuators import Lag, lag_of, lagged
-from ..envs.backend import plain
-from ..envs.dynamics import Car, Motion, Road
-from ..envs.kernel import step_vehicle
-from ..envs.layout import Change, Drive, P, Task, Z
-from ..envs.pace import Pace, acceleration_command
-from ..envs.programme import DRIVER, FOREVER, STEERING_WIDTH, Wind, steering_at, wind_at
-from ..envs.record import TICK
-from ..envs.reference import Target
-from ..envs.scratch import scratch_of
-from ..envs.switches import REPORT, Switches
+from ...envs.backend.rebuild import plain
+from ...envs.engine.layout import Change, Drive, P, Switches, Task, Z
+from ...envs.engine.step import step_vehicle
+from ...envs.engine.window import scratch_of
+from ...envs.scenarios.speed import Pace, acceleration_command
+from ...envs.scenarios.steering import DRIVER, STEERING_WIDTH, steering_at
+from ...envs.scenarios.wind import Wind, wind_at
+from ...envs.task.info import REPORT
+from ...envs.task.reference import Target
+from ...envs.ticks import FOREVER, TICK
+from ...envs.vehicle.actuators import Lag, lag_of, lagged
+from ...envs.vehicle.dynamics import Car, Motion, Road
 
 Array = npt.NDArray[np.float64]
 

@@ -13,14 +13,14 @@ import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 
-from ..envs.layout import P
-from ..envs.programme import DRIVER
-from ..envs.reference import reference
-from ..envs.vehicle import GRAVITY
-from .clairvoyant_linear import is_linear, solve_linear
-from .clairvoyant_nonlinear import Solution, Trajectory, solve, tracking_gains
-from .controller import Controller
-from .foreseen import Foreseen, Known, State, foresee, state_of
+from ...envs.engine.layout import P
+from ...envs.scenarios.steering import DRIVER
+from ...envs.task.reference import reference
+from ...envs.vehicle.vehicle import GRAVITY
+from ..controllers.base import Controller
+from .foresight import Foreseen, Known, State, foresee, state_of
+from .qp import is_linear, solve_linear
+from .shooting import Solution, Trajectory, solve, tracking_gains
 
 Array = npt.NDArray[np.float64]
 Actions = npt.NDArray[np.float32]

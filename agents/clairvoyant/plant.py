@@ -4,15 +4,16 @@ from typing import Any, NamedTuple
 
 import casadi as ca
 
-from ..envs.actuators import distribute, lagged, yaw_moment
-from ..envs.backend import plain
-from ..envs.dynamics import Motion, Push, rk4, sideslip_angle
-from ..envs.pace import acceleration_command
-from ..envs.record import TICK
-from ..envs.reference import cost_rate, reference
-from ..envs.tyres import Inputs, load_of
-from .foreseen import Fixed, Known, State
-from .symbolic import SYMBOLS, symbolic
+from ...envs.backend.on_casadi import SYMBOLS, symbolic
+from ...envs.backend.rebuild import plain
+from ...envs.scenarios.speed import acceleration_command
+from ...envs.task.cost import cost_rate
+from ...envs.task.reference import reference
+from ...envs.ticks import TICK
+from ...envs.vehicle.actuators import distribute, lagged, yaw_moment
+from ...envs.vehicle.dynamics import Motion, Push, rk4, sideslip_angle
+from ...envs.vehicle.tyres import Inputs, load_of
+from .foresight import Fixed, Known, State
 
 _rk4, _load_of, _distribute = symbolic(rk4), symbolic(load_of), symbolic(distribute)
 _acceleration, _reference = symbolic(acceleration_command), symbolic(reference)

@@ -14,9 +14,9 @@ import numpy.typing as npt
 import osqp
 from scipy import sparse
 
-from ..envs.tyres import LINEAR
-from .foreseen import Fixed, Foreseen, Known, State
-from .foreseen_plant import advance, carried, node_cost, scales
+from ...envs.vehicle.tyres import LINEAR
+from .foresight import Fixed, Foreseen, Known, State
+from .plant import advance, carried, node_cost, scales
 
 Array = npt.NDArray[np.float64]
 

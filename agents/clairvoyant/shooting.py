@@ -8,12 +8,13 @@ import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
-from ..envs.actuators import within_stop
-from ..envs.backend import ARRAYS, plain
-from ..envs.reference import BETA_SCALE, GAMMA_SCALE
-from ..envs.tyres import SLOW
-from .foreseen import Fixed, Foreseen, Known, State
-from .foreseen_plant import advance, carried, node_cost, scales
+from ...envs.backend.primitives import ARRAYS
+from ...envs.backend.rebuild import plain
+from ...envs.task.cost import BETA_SCALE, GAMMA_SCALE
+from ...envs.vehicle.actuators import within_stop
+from ...envs.vehicle.tyres import SLOW
+from .foresight import Fixed, Foreseen, Known, State
+from .plant import advance, carried, node_cost, scales
 
 Array = npt.NDArray[np.float64]
 

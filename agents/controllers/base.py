@@ -5,7 +5,7 @@ from abc import ABC, abstractmethod
 import numpy as np
 import numpy.typing as npt
 
-from .given import AnyEnv, given
+from ..env_facts import AnyEnv, given
 
 Array = npt.NDArray[np.float64]
 

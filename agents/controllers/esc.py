@@ -5,14 +5,15 @@ from typing import Any
 
 import numpy as np
 
-from ..envs.backend import absolute, jit, maximum
-from ..envs.linear import bicycle_coefficients
-from ..envs.record import TICK
-from ..envs.reference import LIMITED, reference, target_of
-from ..envs.vehicle import Vehicle
-from .controller import Array, Controller
-from .given import AnyEnv, given
-from .schedule import SPEEDS, cell
+from ...envs.backend.decorators import jit
+from ...envs.backend.primitives import absolute, maximum
+from ...envs.task.reference import LIMITED, reference, target_of
+from ...envs.ticks import TICK
+from ...envs.vehicle.linear import bicycle_coefficients
+from ...envs.vehicle.vehicle import Vehicle
+from ..design.gain_schedule import SPEEDS, cell
+from ..env_facts import AnyEnv, given
+from .base import Array, Controller
 
 BANDWIDTH = 16.0  # rad/s
 RELEASE = 0.5  # s, in which the integral is let go within the dead band

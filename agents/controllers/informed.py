@@ -6,16 +6,16 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from ..envs.scenario import Scenario
-from ..envs.sensors import HDOP_LAWS
-from ..envs.tyres import SLOW
-from ..envs.vehicle import GRAVITY, Vehicle
-from ..estimators import EstimateObservation, vector
-from ..estimators.truth import STIFFNESSES, TruthObservation
-from ..estimators.truth_vector import TruthObservation as VectorTruthObservation
-from ..estimators.wrappers import TRUTH
-from .controller import Array
-from .given import AnyEnv, given
+from ...envs.scenarios.scenario import Scenario
+from ...envs.sensors.gps import HDOP_LAWS
+from ...envs.vehicle.tyres import SLOW
+from ...envs.vehicle.vehicle import GRAVITY, Vehicle
+from ...estimators.vector import estimate as vector
+from ...estimators.vector.truth import TruthObservation as VectorTruthObservation
+from ...estimators.wrappers.estimate import TRUTH, EstimateObservation
+from ...estimators.wrappers.truth import STIFFNESSES, TruthObservation
+from ..env_facts import AnyEnv, given
+from .base import Array
 from .lqr import Lqr
 
 OUTPUTS = ["beta", "gamma", "F_d", "N_d"]

@@ -9,15 +9,16 @@ from typing import Any
 
 import numpy as np
 
-from ..envs.backend import jit, maximum
-from ..envs.linear import LinearModel, vision
-from ..envs.record import TICK
-from ..envs.reference import BETA_SCALE, EFFORT_WEIGHT, GAMMA_SCALE, STEER_SCALE
-from ..envs.vehicle import Vehicle
-from .controller import Array, Controller
-from .design_model import optimal
-from .given import AnyEnv
-from .schedule import SPEEDS, interpolated
+from ...envs.backend.decorators import jit
+from ...envs.backend.primitives import maximum
+from ...envs.task.cost import BETA_SCALE, EFFORT_WEIGHT, GAMMA_SCALE, STEER_SCALE
+from ...envs.ticks import TICK
+from ...envs.vehicle.linear import LinearModel, vision
+from ...envs.vehicle.vehicle import Vehicle
+from ..design.gain_schedule import SPEEDS, interpolated
+from ..design.sampled_model import optimal
+from ..env_facts import AnyEnv
+from .base import Array, Controller
 
 MOVED = ("beta", "gamma", "psi", "y", "N_z", "delta_f", "integral")
 """States that the inputs move; y is the offset of the centre of gravity from the road, in m, and

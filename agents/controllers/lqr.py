@@ -6,15 +6,15 @@ from typing import Any
 
 import numpy as np
 
-from ..envs.backend import jit
-from ..envs.record import TICK
-from ..envs.reference import REFERENCES
-from ..envs.vehicle import Vehicle
-from .controller import Array, Controller
-from .design_model import Purpose
-from .given import AnyEnv, given
-from .schedule import SPEEDS, gain_table, interpolated
-from .within import best_within
+from ...envs.backend.decorators import jit
+from ...envs.backend.primitives import absolute
+from ...envs.task.reference import REFERENCES
+from ...envs.ticks import TICK
+from ...envs.vehicle.vehicle import Vehicle
+from ..design.gain_schedule import SPEEDS, gain_table, interpolated
+from ..design.sampled_model import Purpose
+from ..env_facts import AnyEnv, given
+from .base import Array, Controller
 
 STATES = ("steer", "steer_command", "beta_ref", "gamma_ref")
 
@@ -155,3 +155,34 @@ class Lqr(Controller):
             self.vehicle.steering_rate * self.control_period * TICK,
             action,
         )
+
+
+@jit
+def _held(value: Any, low: Any, high: Any) -> Any:
+    return min(max(value, low), high)
+
+
+@jit
+def best_within(
+    s_uu: Any, s_uw: Any, s_ww: Any, u: Any, w: Any, most: Any, low: Any, high: Any
+) -> Any:
+    """(u, w) with |u| <= most and low <= w <= high nearest to the given ones.
+
+    Nearest in du^2 s_uu + 2 du dw s_uw + dw^2 s_ww, positive definite. The given ones where they
+    are within; else the least of the four edges' own minima.
+    """
+    if absolute(u) <= most and low <= w <= high:
+        return u, w
+    best_u, best_w, least = 0.0, 0.0, -1.0
+    for edge in range(4):
+        if edge < 2:
+            a = most if edge == 0 else -most
+            b = _held(w - s_uw / s_ww * (a - u), low, high)
+        else:
+            b = low if edge == 2 else high
+            a = _held(u - s_uw / s_uu * (b - w), -most, most)
+        du, dw = a - u, b - w
+        cost = du * du * s_uu + 2.0 * du * dw * s_uw + dw * dw * s_ww
+        if least < 0.0 or cost < least:
+            best_u, best_w, least = a, b, cost
+    return best_u, best_w

@@ -11,13 +11,14 @@ from typing import Any
 
 import numpy as np
 
-from ..envs.backend import jit, maximum
-from ..envs.linear import bicycle_coefficients
-from ..envs.record import TICK
-from ..envs.reference import REFERENCES, reference, target_of
-from ..envs.vehicle import Vehicle
-from .controller import Array, Controller
-from .given import AnyEnv, given
+from ...envs.backend.decorators import jit
+from ...envs.backend.primitives import maximum
+from ...envs.task.reference import REFERENCES, reference, target_of
+from ...envs.ticks import TICK
+from ...envs.vehicle.linear import bicycle_coefficients
+from ...envs.vehicle.vehicle import Vehicle
+from ..env_facts import AnyEnv, given
+from .base import Array, Controller
 
 SLOWEST = 2.0  # m/s: below it the vehicle is taken as at this speed
 BANDWIDTH = (5.0, 5.0)  # rad/s, K_beta and K_gamma of dakf-stability V.D

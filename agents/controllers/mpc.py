@@ -8,14 +8,14 @@ import numpy as np
 import numpy.typing as npt
 from scipy.sparse import csc_matrix
 
-from ..envs.record import TICK
-from ..envs.vehicle import Vehicle
-from .controller import Array
-from .design_model import Purpose, design_model
-from .given import AnyEnv
+from ...envs.ticks import TICK
+from ...envs.vehicle.vehicle import Vehicle
+from ..design.condensed_qp import Quadratic, quadratic
+from ..design.gain_schedule import SPEEDS
+from ..design.sampled_model import Purpose, design_model
+from ..env_facts import AnyEnv
+from .base import Array
 from .lqr import Lqr, predicted_state
-from .quadratic import Quadratic, quadratic
-from .schedule import SPEEDS
 
 STEP = 10  # ticks, the shortest of the prediction
 NOT_FINITE = "the observation is not finite"

@@ -5,11 +5,12 @@ from typing import Any
 
 import numpy as np
 
-from ..envs.backend import jit, maximum
-from ..envs.record import TICK
-from ..envs.reference import REFERENCES, ZERO_SLIP, reference, target_of
-from .controller import Array, Controller
-from .given import AnyEnv, given
+from ...envs.backend.decorators import jit
+from ...envs.backend.primitives import maximum
+from ...envs.task.reference import REFERENCES, ZERO_SLIP, reference, target_of
+from ...envs.ticks import TICK
+from ..env_facts import AnyEnv, given
+from .base import Array, Controller
 from .model_following import SLOWEST, _car, _drift, _plant
 
 

@@ -9,12 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from ..envs.backend import absolute, jit, maximum, select
-from ..envs.record import TICK
-from ..envs.vehicle import COMS, Vehicle
-from .controller import Array, Controller
-from .given import AnyEnv
-from .pi import COMS_PI, PLACEMENTS, POLE, design_pi, sample_pi
+from ...envs.backend.decorators import jit
+from ...envs.backend.primitives import absolute, maximum, select
+from ...envs.ticks import TICK
+from ...envs.vehicle.vehicle import COMS, Vehicle
+from ..design.pi import COMS_PI, PLACEMENTS, POLE, design_pi, sample_pi
+from ..env_facts import AnyEnv
+from .base import Array, Controller
 
 SLOWEST = 2.0  # m/s: gains below it are those of this speed
 SPEEDS = np.arange(SLOWEST, 61.0, 0.5)  # m/s

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.linalg import block_diag
 
-from .design_model import DesignModel, cost_to_go
+from .sampled_model import DesignModel, cost_to_go
 
 Array = npt.NDArray[np.float64]
 

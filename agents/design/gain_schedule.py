@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..envs.backend import jit
-from ..envs.vehicle import Vehicle
-from .design_model import Purpose, design_model, regulator
+from ...envs.backend.decorators import jit
+from ...envs.vehicle.vehicle import Vehicle
+from .sampled_model import Purpose, design_model, regulator
 
 Array = npt.NDArray[np.float64]
 

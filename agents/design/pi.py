@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import brentq
 
-from ..envs.linear import bicycle
-from ..envs.vehicle import Vehicle
+from ...envs.vehicle.linear import bicycle
+from ...envs.vehicle.vehicle import Vehicle
 
 POLE = 2.0 * math.pi * 2.0  # rad/s: Table II of tie-vision places poles at 2 Hz
 PLACEMENTS = ("radius", "real")

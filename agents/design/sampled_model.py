@@ -13,11 +13,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..envs.actuators import lag_of
-from ..envs.linear import LinearModel, bicycle
-from ..envs.record import TICK
-from ..envs.reference import BETA_SCALE, EFFORT_WEIGHT, GAMMA_SCALE, STEER_SCALE, ZERO_SLIP
-from ..envs.vehicle import Vehicle
+from ...envs.task.cost import BETA_SCALE, EFFORT_WEIGHT, GAMMA_SCALE, STEER_SCALE
+from ...envs.task.reference import ZERO_SLIP
+from ...envs.ticks import TICK
+from ...envs.vehicle.actuators import lag_of
+from ...envs.vehicle.linear import LinearModel, bicycle
+from ...envs.vehicle.vehicle import Vehicle
 
 Array = npt.NDArray[np.float64]
 

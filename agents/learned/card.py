@@ -7,9 +7,9 @@ from typing import Any
 
 import gymnasium as gym
 
-from .. import __version__
-from ..estimators import EstimateObservation
-from .given import given
+from ... import __version__
+from ...estimators.wrappers.estimate import EstimateObservation
+from ..env_facts import given
 
 JsonMap = dict[str, Any]
 

@@ -14,9 +14,9 @@ import numpy.typing as npt
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
+from ...envs.backend.files import write_whole
+from .card import Card
 from .network import Network
-from .policy_card import Card
-from .whole_file import write_whole
 
 FORMAT = 1
 """Counts up when an older sideslip could not read, or would misread, a newer file."""

@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-from .controller import Array, Controller
-from .given import AnyEnv, given
-from .policy_file import Policy, load_policy
+from ..controllers.base import Array, Controller
+from ..env_facts import AnyEnv, given
+from .files import Policy, load_policy
 
 DEFAULT = "ppo-yaw-vision"
 

@@ -12,13 +12,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-from .scaling import Standardised  # first: it says which extra is missing
-
 from stable_baselines3 import PPO  # isort: skip
 from stable_baselines3.common.base_class import BaseAlgorithm  # isort: skip
 from stable_baselines3.common.utils import LinearSchedule  # isort: skip
 from stable_baselines3.common.vec_env import VecEnv  # isort: skip
 from torch import nn  # isort: skip
+
+from .normalise import Standardised  # first: it says which extra is missing
 
 HORIZON = 0.2
 """s, in which a reward's weight falls to 1/e: the car answers a yaw moment within a tenth."""

@@ -11,7 +11,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
-from .whole_file import write_whole
+from ...envs.backend.files import write_whole
 
 FORMAT = 1
 

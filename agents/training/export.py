@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from .network import Network
+from ..learned.network import Network
 
 _PRIOR = 1e-4  # samples that a VecNormalize starts with, of mean 0 and variance 1
 
@@ -22,7 +22,7 @@ def network_from_sb3(model: Any, normaliser: Any = None) -> Network:
     try:
         from stable_baselines3.common.torch_layers import FlattenExtractor
 
-        from .scaling import Standardised
+        from .normalise import Standardised
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError(
             "networks come from stable-baselines3: pip install 'sideslip[train]'", name=error.name

@@ -11,11 +11,11 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.vector import VectorEnv
 
-from .vec_env import Observations  # first: it says which extra is missing
-
 import torch  # isort: skip
 from stable_baselines3.common.torch_layers import FlattenExtractor  # isort: skip
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper  # isort: skip
+
+from ..vec_env.env import Observations  # first: it says which extra is missing
 
 Array = npt.NDArray[np.float64]
 

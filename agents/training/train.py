@@ -15,17 +15,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from gymnasium.vector import VectorEnv
 
-from .. import __version__
+from ... import __version__
+from ...envs.backend.files import write_whole
+from ..controllers.base import NoControl
+from ..learned.card import Card
+from ..learned.files import save_policy
+from ..rollout import costs_of
+from ..vec_env.env import make_native_env, make_vec_env
 from .algorithms import algorithm_of
 from .checkpoint import load_parameters, read_told, save_checkpoint
-from .controller import NoControl
-from .costs import costs_of
-from .from_sb3 import network_from_sb3
-from .policy_card import Card
-from .policy_file import save_policy
-from .scaling import PerSecond, measured
-from .vec_env import make_native_env, make_vec_env
-from .whole_file import write_whole
+from .export import network_from_sb3
+from .normalise import PerSecond, measured
 
 import torch  # isort: skip  # after ours, which say which extra is missing
 from stable_baselines3.common.base_class import BaseAlgorithm  # isort: skip

@@ -9,10 +9,10 @@ import numpy.typing as npt
 from gymnasium.envs.registration import load_env_creator
 from gymnasium.vector import AutoresetMode, VectorEnv
 
-from ..envs import StabilityVectorEnv
-from ..envs.episode import info_of
-from ..estimators.vector import EstimateObservation
-from .vec_row import Row
+from ...envs.task.info import info_of
+from ...envs.vector import StabilityVectorEnv
+from ...estimators.vector.estimate import EstimateObservation
+from .row import Row
 
 try:
     from stable_baselines3.common.vec_env import VecEnv, VecMonitor

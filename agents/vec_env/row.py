@@ -6,9 +6,12 @@ from typing import Any
 import numpy as np
 from gymnasium.vector import VectorEnv, VectorWrapper
 
-from ..envs.dynamics import Motion
-from ..envs.episode import info_of
-from ..estimators import truth, truth_vector, vector, wrappers
+from ...envs.task.info import info_of
+from ...envs.vehicle.dynamics import Motion
+from ...estimators.vector import estimate as vector
+from ...estimators.vector import truth as truth_vector
+from ...estimators.wrappers import estimate as wrappers
+from ...estimators.wrappers import truth
 
 _OWN = (  # a sequence in the vector env, with an item for each row
     "vehicle", "nominal", "scenario", "record", "held_speed", "slow_sensors", "motion",

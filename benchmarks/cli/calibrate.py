@@ -8,7 +8,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from .rows import check_writable
+from ..harness.results import check_writable
 
 
 def calibrate_command(
@@ -28,7 +28,7 @@ def calibrate_command(
 
     A stopped run goes on where it was when the same command is given again in the same folder.
     """
-    from .calibrate import FILE, calibrate, cases_of, forget, scored_scenarios, update
+    from ..control.calibration import FILE, calibrate, cases_of, forget, scored_scenarios, update
 
     path = FILE if out is None else out
     check_writable(path)

@@ -11,11 +11,11 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from .giving import give, show_episode
-from .rows import check_writable
+from ..harness.results import check_writable
+from .output import give, show_episode
 
 if TYPE_CHECKING:
-    from ..agents.policy_file import Policy
+    from ...agents.learned.files import Policy
 
 
 def enjoy_command(
@@ -34,9 +34,9 @@ def enjoy_command(
     card: Annotated[bool, typer.Option("--card", help="Show the policy's card, no more.")] = False,
 ) -> None:
     """Drive a learned policy: its cost against no control and the best classical line."""
-    from ..agents.policy_file import load_policy
-    from .enjoy import enjoy, suite_of
-    from .matrix.illustrate import run_of
+    from ...agents.learned.files import load_policy
+    from ..control.figures import run_of
+    from ..policies import enjoy, suite_of
 
     console = Console()
     if card:

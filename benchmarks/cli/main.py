@@ -9,14 +9,14 @@ from gymnasium.error import Error as GymnasiumError
 from rich.console import Console
 from rich.markup import escape
 
-from .. import __version__
-from .calibrate_command import calibrate_command
-from .enjoy_command import enjoy_command
-from .giving import give, show_episode
-from .rows import check_writable
-from .suites import SUITES, Wish
-from .train_command import train_command
-from .tune_command import tune_app
+from ... import __version__
+from ..harness.results import check_writable
+from ..suites import SUITES, Wish
+from .calibrate import calibrate_command
+from .enjoy import enjoy_command
+from .output import give, show_episode
+from .train import train_command
+from .tune import tune_app
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -71,10 +71,11 @@ def list_names() -> None:
     """What there is: environments, scenarios, vehicles, estimators, agents, policies, suites."""
     import gymnasium as gym
 
-    from ..agents import AGENTS
-    from ..agents.policy_file import shipped
-    from ..envs import SCENARIOS, VEHICLES
-    from ..estimators import FILTERS
+    from ...agents import AGENTS
+    from ...agents.learned.files import shipped
+    from ...envs.scenarios.manoeuvres import SCENARIOS
+    from ...envs.vehicle.vehicle import VEHICLES
+    from ...estimators.filters import FILTERS
 
     for title, names in {
         "environments": [name for name in gym.registry if name.startswith("sideslip/")],
@@ -103,9 +104,9 @@ def run(
     """Drive one episode, print its score, draw it."""
     import gymnasium as gym
 
-    from ..agents import make_agent
-    from ..agents.rollout import rollout
-    from ..estimators import EstimateObservation
+    from ...agents import make_agent
+    from ...agents.rollout import rollout
+    from ...estimators.wrappers.estimate import EstimateObservation
 
     check_writable(plot, parquet, kml)
     options: dict[str, Any] = {} if scenario is None else {"scenario": scenario}
@@ -143,7 +144,7 @@ def bench(
     check_writable(html, json, parquet, picture)
     done = []
     if log is not None:  # first: a log that cannot be read should not cost minutes
-        from .replay import replay_file
+        from ..recorded.suite import replay_file
 
         done.append(replay_file(log, vehicle, mapping=mapping))
     wish = Wish(quick, jobs, console, episodes, keep)
@@ -152,7 +153,7 @@ def bench(
     done.sort(key=lambda suite: order.index(suite.name))
     give(console, done, html, json, parquet)
     if picture is not None:
-        from .picture import write_picture
+        from ..picture import write_picture
 
         write_picture(picture, done)
         console.print(f"picture: {picture}", highlight=False)
@@ -173,7 +174,7 @@ def replay(
     parquet: Parquet = None,
 ) -> None:
     """Run the estimators over a recorded drive and score them."""
-    from .replay import replay_file
+    from ..recorded.suite import replay_file
 
     check_writable(html, json, parquet)
     suite = replay_file(

@@ -9,14 +9,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from rich import box
 from rich.console import Console
+from rich.markup import escape
+from rich.table import Table as RichTable
 
-from .. import __version__
-from .rows import Row, Suite, write_json, write_parquet, write_text
-from .screen import print_suite
+from ... import __version__
+from ..harness.results import Row, Suite, Table, write_json, write_parquet, write_text
 
 if TYPE_CHECKING:
-    from ..agents.rollout import Rollout
+    from ...agents.rollout import Rollout
 
 _SHOWN = ("numpy", "scipy", "numba", "gymnasium", "control", "plotly")
 
@@ -30,7 +32,7 @@ def show_episode(
     kml: Path | None = None,
 ) -> None:
     """Say an episode's score in a line and draw it; who: drove it."""
-    from .kml import track_kml
+    from ..report.kml import track_kml
 
     slip = drive["beta"]
     console.print(
@@ -65,7 +67,7 @@ def give(
         write_parquet(parquet, rows)
         console.print(f"rows: {parquet}", highlight=False)
     if html is not None:
-        from .report import write_report
+        from ..report.html import write_report
 
         write_report(html, list(suites), command_line(), environment())
         console.print(f"report: {html}", highlight=False)
@@ -85,3 +87,39 @@ def environment() -> dict[str, str]:
         except PackageNotFoundError:
             continue
     return found
+
+
+_NAME = 32  # letters: a longer text in a table's first column is no name and may wrap
+_LEAST = 22  # letters that the first column keeps on a narrow screen
+
+
+def print_suite(console: Console, suite: Suite) -> None:
+    """The title, the text, and each table with its note."""
+    console.rule(f"[bold]{suite.title}")
+    console.print(escape(suite.text) + "\n", highlight=False)
+    for table in suite.tables:
+        console.print(_rich(table))
+        if table.note:
+            console.print(f"[dim]{escape(table.note)}[/]\n", highlight=False)
+
+
+def _rich(table: Table) -> RichTable:
+    """Columns of numbers to the right and whole, those of text to the left, wrapped if long."""
+    from ..report.html import numeric
+
+    shown = RichTable(
+        title=table.title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0)
+    )
+    columns = zip(*table.cells, strict=True) if table.cells else [()] * len(table.header)
+    for i, (name, column) in enumerate(zip(table.header, columns, strict=True)):
+        right = i > 0 and numeric(column)
+        longest = max(map(len, column), default=0)
+        shown.add_column(
+            name,
+            justify="right" if right else "left",
+            no_wrap=right or (i == 0 and longest <= _NAME),
+            min_width=min(longest, _LEAST) if i == 0 else None,
+        )
+    for row in table.cells:
+        shown.add_row(*map(escape, row))
+    return shown

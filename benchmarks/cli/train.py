@@ -10,11 +10,11 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from .tune_command import option_of
+from .tune import option_of
 
 if TYPE_CHECKING:
-    from ..agents.train import Progress as Now
-    from ..agents.train import Task, Trained
+    from ...agents.training.train import Progress as Now
+    from ...agents.training.train import Task, Trained
 
 STEPS = 2_000_000
 EPISODES = 256  # of the policy's test
@@ -43,8 +43,8 @@ def train_command(
 
     With --resume whatever is not given is that of the training in the folder.
     """
-    from ..agents.train import CURVE, POLICY, task_in, train, with_defaults
-    from .enjoy import evaluate, evaluation
+    from ...agents.training.train import CURVE, POLICY, task_in, train, with_defaults
+    from ..policies import evaluate, evaluation
 
     wish: dict[str, Any] = {
         "env_id": env,

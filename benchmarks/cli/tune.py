@@ -9,8 +9,8 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
-from .rows import check_writable
-from .screen import print_suite
+from ..harness.results import check_writable
+from .output import print_suite
 
 tune_app = typer.Typer(no_args_is_help=True)
 Texts = list[str] | None
@@ -77,10 +77,10 @@ def tune_estimator(
 
     A stopped search goes on where it was when the same command is given again.
     """
-    from ..estimators import tunings
-    from .tune import entry, run
-    from .tune_file import update
-    from .tune_task import STORAGE, make_task
+    from ...estimators.design import tunings
+    from ..tuning.file import update
+    from ..tuning.suite import entry, run
+    from ..tuning.task import STORAGE, make_task
 
     files = [*([out] if out else []), *([tunings.FILE] if write else [])]
     check_writable(*files)

@@ -1,1 +1,1 @@
-"""The matrix: estimators with controllers on manoeuvres, everyone on the same seeds."""
+"""The matrix of estimators and controllers: cells, seeds, episodes, scores, tables, calibration."""

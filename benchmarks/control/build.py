@@ -11,11 +11,12 @@ from gymnasium.vector import VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
 from ...agents import make_agent
-from ...agents.policy_file import is_policy, load_policy
-from ...envs import Entry
-from ...estimators import FILTERS, UnobservableWarning
-from ...estimators.vector import EstimateObservation
-from .contestants import INFORMED, TRUTH, Cell
+from ...agents.learned.files import is_policy, load_policy
+from ...envs.task.observation import Entry
+from ...estimators.estimates import UnobservableWarning
+from ...estimators.filters import FILTERS
+from ...estimators.vector.estimate import EstimateObservation
+from .cells import INFORMED, TRUTH, Cell
 
 _DISTURBANCES = {"forces": ("F_d", "N_d"), "walk": ("d1", "d2"), "walk-all": ("d1", "d2")}
 
@@ -68,7 +69,7 @@ def make_contest(cell: Cell, cars: int) -> tuple[VectorEnv[Any, Any, Any], Any]:
     """(vector env of `cars` rows with the cell's estimator, its agent)."""
     options = {"scenario": cell.scenario, "on_bad_action": "fail"} | cell.options
     if cell.controller == INFORMED:
-        from ...agents.informed import make_informed
+        from ...agents.controllers.informed import make_informed
 
         return make_informed(cell.env_id, num_envs=cars, **options)
     env: Any = gym.make_vec(cell.env_id, num_envs=cars, **options)

@@ -10,9 +10,9 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from ...agents.policy_file import stamp
-from ...envs.backend import source_stamp
-from .drive import Chunk, Driven, drive
+from ...agents.learned.files import stamp
+from ...envs.backend.cache import source_stamp
+from .episodes import Chunk, Driven, drive
 
 _LENGTH = 24
 
@@ -52,7 +52,7 @@ class Kept:
 def sources() -> str:
     """A hash of all files that an episode's numbers depend on."""
     digest = hashlib.sha256(source_stamp("agents").encode())
-    for name in ("contest.py", "contestants.py", "drive.py"):
+    for name in ("build.py", "cells.py", "episodes.py"):
         digest.update(Path(__file__).with_name(name).read_bytes())
     return digest.hexdigest()
 

@@ -16,13 +16,13 @@ import gymnasium as gym
 import numpy as np
 from rich.console import Console
 
-from .. import __version__
-from ..agents import make_agent
-from ..envs import SCENARIOS
-from ..envs.backend import source_stamp
-from ..estimators import EstimateObservation
-from .cases import run_cases
-from .rows import write_text
+from ... import __version__
+from ...agents import make_agent
+from ...envs.backend.cache import source_stamp
+from ...envs.scenarios.manoeuvres import SCENARIOS
+from ...estimators.wrappers.estimate import EstimateObservation
+from ..harness.parallel import run_cases
+from ..harness.results import write_text
 
 FILE = Path(__file__).with_name("calibration.json")
 SALT, SEEDS = "calibration", 64
@@ -106,7 +106,7 @@ def scored_scenarios() -> list[str]:
 
 def measure(case: Case) -> Episode:
     """The ceiling of one episode, from the folder of finished cases where it is there."""
-    from ..agents.clairvoyant import actions_of, ceiling
+    from ...agents.clairvoyant.plan import actions_of, ceiling
 
     if case.path.exists():
         return Episode(**json.loads(case.path.read_text(encoding="utf-8")))

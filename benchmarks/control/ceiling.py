@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from ...envs import FAILURES
-from ..calibrate import FILE, Entry, read_calibration
-from .results import FAILURE, Results
+from ...envs.task.failures import FAILURES
+from .calibration import FILE, Entry, read_calibration
+from .run import FAILURE, Results
 from .scores import Array, Ceiling
 
 _OF_THE_CAR = ("none", "spin", "off-road")

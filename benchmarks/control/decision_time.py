@@ -6,8 +6,8 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from .contest import make_contest
-from .contestants import Cell
+from .build import make_contest
+from .cells import Cell
 
 STEPS = 200
 

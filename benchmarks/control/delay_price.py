@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 from rich.console import Console
 
-from .contestants import INFORMED, YAW, Cell
-from .results import Results, measure
+from .cells import INFORMED, YAW, Cell
+from .run import Results, measure
 from .scores import Ceiling, Estimate, Resampled
 
 Array = npt.NDArray[np.float64]

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...envs import FAILURES
-from ...envs.border import actions_of
-from ...envs.record import TICK
-from .contest import make_contest
-from .contestants import Cell
+from ...envs.arguments import actions_of
+from ...envs.task.failures import FAILURES
+from ...envs.ticks import TICK
+from .build import make_contest
+from .cells import Cell
 
 Array = npt.NDArray[np.float64]
 

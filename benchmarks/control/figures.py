@@ -10,17 +10,17 @@ import numpy.typing as npt
 
 from ...agents import make_agent
 from ...agents.rollout import Rollout, rollout
-from ...envs import VEHICLES
-from ...estimators import EstimateObservation
-from ..colours import INK, colour
-from ..explorer import Explorer, Panel
-from ..kml import track_kml
-from ..rows import Suite
-from .contest import estimate_options
-from .contestants import STEERING, YAW, Cell
-from .drive import SIGNALS
-from .price import DELAYS, Price, lines
-from .results import Results
+from ...envs.vehicle.vehicle import VEHICLES
+from ...estimators.wrappers.estimate import EstimateObservation
+from ..harness.explorer import Explorer, Panel
+from ..harness.results import Suite
+from ..report.colours import INK, colour
+from ..report.kml import track_kml
+from .build import estimate_options
+from .cells import STEERING, YAW, Cell
+from .delay_price import DELAYS, Price, lines
+from .episodes import SIGNALS
+from .run import Results
 from .tables import Standing
 
 Array = npt.NDArray[np.float64]
@@ -59,7 +59,7 @@ def illustrate(
         text = track_kml(manoeuvre, tracks, {name: colour(name) for name in tracks})
         suite.files.append((f"{manoeuvre}.kml", "application/vnd.google-earth.kml+xml", text))
     try:
-        from .pictures import curves
+        from ..report.heat_maps import curves
     except ModuleNotFoundError:
         return
     suite.explorers.append(_time_series(results))
@@ -83,7 +83,7 @@ def illustrate(
 
 def in_motion(title: str, runs: Mapping[str, Rollout]) -> tuple[str, Any, str]:
     """A figure of a suite: cars from above; runs: by name. Needs plotly."""
-    from .pictures import animation
+    from ..report.heat_maps import animation
 
     size = (VEHICLES["coms"].wheelbase, VEHICLES["coms"].front_track)
     t = max((run["t"] for run in runs.values()), key=len)
@@ -96,7 +96,7 @@ def in_motion(title: str, runs: Mapping[str, Rollout]) -> tuple[str, Any, str]:
 
 
 def _maps(env_id: str, standings: Sequence[Standing]) -> list[tuple[str, Any, str]]:
-    from .pictures import heat_map
+    from ..report.heat_maps import heat_map
 
     names = [each.label for each in standings]
     scenarios = list(standings[0].by_scenario)

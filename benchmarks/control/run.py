@@ -8,10 +8,10 @@ import numpy as np
 import numpy.typing as npt
 from rich.console import Console
 
-from ..cases import run_cases
-from .contestants import EPISODES, INFORMED, SLOW_EPISODES, Cell
-from .drive import NUMBERS, Chunk, Driven
-from .kept import Kept
+from ..harness.parallel import run_cases
+from .cache import Kept
+from .cells import EPISODES, INFORMED, SLOW_EPISODES, Cell
+from .episodes import NUMBERS, Chunk, Driven
 from .seeds import salted_seeds
 
 Array = npt.NDArray[np.float64]

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 
 from ... import __version__
-from ...agents.policy_file import ENDING
+from ...agents.learned.files import ENDING
 
 _PACKAGE = Path(__file__).resolve().parents[2]
-_CONTESTANTS = {"estimators": (".py", ".toml"), "agents": (".py",), "agents/policies": (ENDING,)}
+_CONTESTANTS = {"estimators": (".py", ".toml"), "agents": (".py", ENDING)}
 _LENGTH = 16
 
 
@@ -18,9 +18,9 @@ def salt_of(*more: str) -> str:
     texts."""
     digest = hashlib.sha256(__version__.encode())
     for folder, endings in _CONTESTANTS.items():
-        for path in sorted((_PACKAGE / folder).iterdir()):
+        for path in sorted((_PACKAGE / folder).rglob("*")):
             if path.suffix in endings:
-                digest.update(path.name.encode() + path.read_bytes())
+                digest.update(str(path.relative_to(_PACKAGE)).encode() + path.read_bytes())
     for text in more:
         digest.update(text.encode())
     return digest.hexdigest()[:_LENGTH]

@@ -5,24 +5,17 @@ from pathlib import Path
 
 from rich.console import Console
 
-from .. import __version__
-from ..agents.policy_file import is_policy, load_policy
-from .matrix.ceiling import calibrated_by, judged, refusals_of, tops_of
-from .matrix.contestants import EPISODES, LEARNED, STEERING, YAW, cells
-from .matrix.illustrate import illustrate
-from .matrix.price import DELAYS, SCENARIO, Price, price_of_delay
-from .matrix.results import Results, measure
-from .matrix.seeds import salt_of, salted_seeds
-from .matrix.tables import (
-    Standing,
-    main_table,
-    motion_table,
-    rows_of,
-    standings,
-    yardsticks,
-)
-from .matrix.timing import decision_time
-from .rows import Row, Suite, Table
+from ... import __version__
+from ...agents.learned.files import is_policy, load_policy
+from ..harness.results import Row, Suite, Table
+from .ceiling import calibrated_by, judged, refusals_of, tops_of
+from .cells import EPISODES, LEARNED, STEERING, YAW, cells
+from .decision_time import decision_time
+from .delay_price import DELAYS, SCENARIO, Price, price_of_delay
+from .figures import illustrate
+from .run import Results, measure
+from .seeds import salt_of, salted_seeds
+from .tables import Standing, main_table, motion_table, rows_of, standings, yardsticks
 
 PRICE_SHARE = 0.2  # of the matrix's episodes
 TITLES = {YAW: "Yaw moment by two motors", STEERING: "Yaw moment and added steering"}

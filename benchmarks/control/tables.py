@@ -7,11 +7,11 @@ import gymnasium as gym
 import numpy as np
 
 from ... import __version__
-from ..rows import Row, Table
+from ..harness.results import Row, Table
 from .ceiling import judged
-from .contestants import INFORMED, REFERENCE_CONTROLLER, REFERENCE_FILTER, Cell
-from .drive import NUMBERS, control_period, failed_by, rate_of
-from .results import Result, Results
+from .cells import INFORMED, REFERENCE_CONTROLLER, REFERENCE_FILTER, Cell
+from .episodes import NUMBERS, control_period, failed_by, rate_of
+from .run import Result, Results
 from .scores import Ceiling, Estimate, Resampled, improvement
 
 RATES = {"spin": "spin_rate", "off-road": "departure_rate"}

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from ..agents.whole_file import write_whole
+from ...envs.backend.files import write_whole
 from .explorer import Explorer
 
 METRICS = {

@@ -1,11 +1,11 @@
 """dakf-stability: slip from a GPS course and a gyro by disturbance accommodation, and control."""
 
-from .claim import Bound, Claim, Part, number, smaller
-from .controlled import Following
-from .draw import PaperFigure, course, curves
-from .estimation import Estimation, Filter
-from .observability import coms_ranks
-from .simulations import Analysis
+from .ledger.claim import Bound, Claim, Part, number, smaller
+from .ledger.controllers import Following
+from .ledger.filters import Estimation, Filter
+from .ledger.plots import PaperFigure, course, curves
+from .ledger.simulations import Analysis
+from .theory.observability import coms_ranks
 
 PAPER = "dakf-stability"
 FIG6, FASTER, FIG8 = "dakf-fig6", "dakf-fig6-faster", "dakf-fig8"

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from ...estimators import FILTERS
-from .claim import Bound, Claim, Part, over_others, smaller
-from .draw import PaperFigure, curves
-from .estimation import Estimation, Filter
+from ...estimators.filters import FILTERS
+from .ledger.claim import Bound, Claim, Part, over_others, smaller
+from .ledger.filters import Estimation, Filter
+from .ledger.plots import PaperFigure, curves
 
 PAPER = "double-layer-gps"
 FIG9, FASTER, PERIODS = "double-layer-fig9", "double-layer-fig9-fast", "double-layer-fig9-periods"

@@ -1,9 +1,9 @@
 """dual-rate: slip from the GPS's course alone; `dual_rate_gains` has the theory behind it."""
 
-from .claim import Claim, Part, smaller
-from .draw import PaperFigure, course, curves
-from .dual_rate_gains import PAPER
-from .estimation import Estimation, Filter
+from .ledger.claim import Claim, Part, smaller
+from .ledger.filters import Estimation, Filter
+from .ledger.plots import PaperFigure, course, curves
+from .theory.dual_rate_gains import PAPER
 
 FIG4, FIG5 = "dual-rate-fig4", "dual-rate-fig5"
 CONVENTIONAL, HOLDING, PSEUDO = "conventional", "innovation holding", "pseudo measurement"

@@ -5,12 +5,12 @@ from collections import Counter
 
 from rich.console import Console
 
-from .. import __version__
-from .cases import run_cases
+from ... import __version__
+from ..harness.parallel import run_cases
+from ..harness.results import VERDICTS, Row, Suite, Table
 from .claims import CLAIMS, FIGURES, SIMULATIONS
-from .claims.claim import Claim, Found, Measured, Results, find, verdict
-from .claims.simulations import joined
-from .rows import VERDICTS, Row, Suite, Table
+from .ledger.claim import Claim, Found, Measured, Results, find, verdict
+from .ledger.simulations import joined
 
 SEEDS = 20
 QUICK_SEEDS = 4
@@ -154,7 +154,7 @@ def _row(claim: Claim, found: Found, judged: str) -> Row:
 def _draw(suite: Suite, results: Results) -> None:
     """The papers' figures; nothing where plotly is not installed."""
     try:
-        from . import figures  # noqa: F401
+        from ..report import figures  # noqa: F401
     except ModuleNotFoundError:
         return
     for figure in FIGURES:

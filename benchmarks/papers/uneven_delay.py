@@ -1,10 +1,10 @@
 """uneven-delay: the lateral offset from a camera whose delay varies and is time-stamped."""
 
-from .claim import Bound, Claim, Part, number, ratio, smaller
-from .draw import PaperFigure, curves, delays, measured_offset
-from .estimation import Estimation, Filter
-from .observability import coms_ranks
-from .simulations import Analysis
+from .ledger.claim import Bound, Claim, Part, number, ratio, smaller
+from .ledger.filters import Estimation, Filter
+from .ledger.plots import PaperFigure, curves, delays, measured_offset
+from .ledger.simulations import Analysis
+from .theory.observability import coms_ranks
 
 PAPER = "uneven-delay"
 FIG5, NOISY, FIG7 = "uneven-delay-fig5", "uneven-delay-fig5-noisy", "uneven-delay-fig7"

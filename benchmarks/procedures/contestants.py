@@ -4,8 +4,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from ...agents import AGENTS
-from ...envs.outside import outside_vehicle
-from ...envs.vehicle import COMS, PASSENGER_CAR
+from ...envs.outside.plants import outside_vehicle
+from ...envs.vehicle.vehicle import COMS, PASSENGER_CAR
 from .drive import Drive, TestCar, of_env
 
 ENV_ID, OUTSIDE_ID = "sideslip/YawFusion-v0", "sideslip/Outside-v0"

@@ -9,13 +9,14 @@ import numpy as np
 import numpy.typing as npt
 
 from ...agents import make_agent
-from ...envs.dynamics import Motion
-from ...envs.outside import OUTSIDE_PLANTS, Acting, OutsidePlant
-from ...envs.programme import STEERING_KINDS, STEERING_WIDTH, Draws, steering_at, write_steering
-from ...envs.record import TICK
-from ...envs.scenario import Scenario
-from ...envs.vehicle import Vehicle
-from ...estimators import EstimateObservation
+from ...envs.outside.plants import OUTSIDE_PLANTS, Acting, OutsidePlant
+from ...envs.scenarios.draws import Draws
+from ...envs.scenarios.scenario import Scenario
+from ...envs.scenarios.steering import STEERING_KINDS, STEERING_WIDTH, steering_at, write_steering
+from ...envs.ticks import TICK
+from ...envs.vehicle.dynamics import Motion
+from ...envs.vehicle.vehicle import Vehicle
+from ...estimators.wrappers.estimate import EstimateObservation
 
 Array = npt.NDArray[np.float64]
 Fields = Mapping[str, Any]

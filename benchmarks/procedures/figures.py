@@ -6,14 +6,14 @@ import numpy as np
 from plotly import graph_objects as go
 from plotly.subplots import make_subplots
 
-from ...envs.tracks import Section
-from ..colours import GREY, INK
-from ..figures import colour, time_series, track
-from ..rows import Suite
+from ...envs.scenarios.tracks import Section
+from ..harness.results import Suite
+from ..report.colours import GREY, INK, colour
+from ..report.figures import time_series, track
 from . import fmvss126, iso3888, iso7401
-from .cars import CARS, CONTESTANTS
+from .cases import Case, Done, Sine, Transient, of
+from .contestants import CARS, CONTESTANTS
 from .drive import Array
-from .found import Case, Done, Sine, Transient, of
 
 
 def add(suite: Suite, done: Done) -> None:

@@ -24,7 +24,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...envs.vehicle import GRAVITY
+from ...envs.vehicle.vehicle import GRAVITY
 from .drive import Array, Drive, Fields, Series, TestCar
 
 FREQUENCY, DWELL = 0.7, 0.5  # Hz, s

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...envs.tracks import Section, sections
+from ...envs.scenarios.tracks import Section, sections
 from .drive import Array, Drive, Fields, Series, TestCar
 
 TRACKS = ("iso-3888-1", "iso-3888-2")

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...envs.reference import target_of
-from ...envs.vehicle import GRAVITY, Vehicle
+from ...envs.task.reference import target_of
+from ...envs.vehicle.vehicle import GRAVITY, Vehicle
 from .drive import Array, Drive, Fields, Series, TestCar
 
 SETTLE = 3.0  # s, at the first speed

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from ...envs.linear import bicycle
-from ...envs.vehicle import Vehicle
+from ...envs.vehicle.linear import bicycle
+from ...envs.vehicle.vehicle import Vehicle
 from .drive import Array, Drive, Fields, Series, TestCar
 
 Complex = npt.NDArray[np.complex128]

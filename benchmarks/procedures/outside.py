@@ -13,12 +13,12 @@ import gymnasium as gym
 
 from ...agents import make_agent
 from ...agents.rollout import rollout
-from ...envs.dynamics import Motion
-from ...envs.outside import outside_vehicle
-from ...envs.vehicle import GRAVITY
-from ...estimators import EstimateObservation
+from ...envs.outside.plants import outside_vehicle
+from ...envs.vehicle.dynamics import Motion
+from ...envs.vehicle.vehicle import GRAVITY
+from ...estimators.wrappers.estimate import EstimateObservation
 from . import fmvss126
-from .cars import OUTSIDE_ID, Contestant, outside_car
+from .contestants import OUTSIDE_ID, Contestant, outside_car
 from .drive import Law, of_plant
 
 MODEL = "drift"

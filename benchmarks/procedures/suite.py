@@ -6,13 +6,13 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from ...envs.outside import OUTSIDE_PLANTS
-from ...envs.vehicle import GRAVITY
-from ..cases import run_cases
-from ..rows import Suite
+from ...envs.outside.plants import OUTSIDE_PLANTS
+from ...envs.vehicle.vehicle import GRAVITY
+from ..harness.parallel import run_cases
+from ..harness.results import Suite
 from . import fmvss126, iso3888, iso4138, iso7401, outside, tables
-from .cars import CARS, CONTESTANTS
-from .found import NAME, Case, Sine, Transient
+from .cases import NAME, Case, Sine, Transient
+from .contestants import CARS, CONTESTANTS
 
 SHOWN = 5.0  # of A: the sine with dwell in the figures
 QUICK_MULTIPLES = (1.5, 3.0, 5.0, 6.5)  # of A
@@ -91,7 +91,7 @@ def run(quick: bool = False, jobs: int | None = None, console: Console | None = 
     suite = Suite(NAME, "Standard test procedures", _TEXT + (_OUTSIDE if there else _NONE_OUTSIDE))
     tables.add(suite, done)
     try:
-        from . import draw
+        from . import figures as draw
     except ModuleNotFoundError:
         return suite
     draw.add(suite, done)

@@ -5,12 +5,12 @@ from typing import Any
 import numpy as np
 
 from ... import __version__
-from ...envs.vehicle import GRAVITY
-from ..rows import Row, Suite, Table
-from ..stats import interval, mean
+from ...envs.vehicle.vehicle import GRAVITY
+from ..harness.results import Row, Suite, Table
+from ..harness.stats import interval, mean
 from . import fmvss126, iso3888, iso4138, iso7401, outside
-from .cars import CONTESTANTS
-from .found import NAME, Case, Done, Sine, Transient, of
+from .cases import NAME, Case, Done, Sine, Transient, of
+from .contestants import CONTESTANTS
 
 
 def add(suite: Suite, done: Done) -> None:

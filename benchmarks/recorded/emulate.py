@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..envs.logs import packet_rows
-from ..envs.record import FAST, Array, Log, SlowSensor
-from ..envs.sensors import COURSE_SPEED
+from ...envs.record import FAST, Array, Log, SlowSensor
+from ...envs.recordings.log_file import packet_rows
+from ...envs.sensors.gps import COURSE_SPEED
 
 _NOT_NEGATIVE = ("course_noise_deg", "delay")
 

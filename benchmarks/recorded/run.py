@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from ..envs.record import Array, Log, SlowSensor
-from ..envs.vehicle import Vehicle
-from ..estimators import UnobservableWarning, make_estimator
+from ...envs.record import Array, Log, SlowSensor
+from ...envs.vehicle.vehicle import Vehicle
+from ...estimators.estimates import UnobservableWarning
+from ...estimators.make import make_estimator
 from .emulate import Emulation
 
 GYRO_ONLY = "bicycle-kf"

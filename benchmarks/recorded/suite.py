@@ -8,13 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from .. import __version__
-from ..envs.logs import parse_mapping, read_log
-from ..envs.record import Log
-from ..envs.vehicle import Vehicle
+from ... import __version__
+from ...envs.record import Log
+from ...envs.recordings.columns import parse_mapping
+from ...envs.recordings.log_file import read_log
+from ...envs.vehicle.vehicle import Vehicle
+from ..harness.results import Row, Suite, Table
 from .emulate import path
-from .recorded import ESTIMATORS, GYRO_ONLY, SETTLED, Result, Settings, drives_of, run_estimators
-from .rows import Row, Suite, Table
+from .run import ESTIMATORS, GYRO_ONLY, SETTLED, Result, Settings, drives_of, run_estimators
 from .vehicles import read_vehicle
 
 __all__ = ["Settings", "corners", "read_vehicle", "replay", "replay_file"]
@@ -195,7 +196,7 @@ def _table(result: Result, name: str, told: Vehicle, noises: int) -> Table:
 def _figures(result: Result, log: Log) -> list[tuple[str, Any, str]]:
     """Bars, sideslip, errors and tracks of the first noise; nothing without plotly."""
     try:
-        from .figures import bars_with_interval, error_series, time_series, track
+        from ..report.figures import bars_with_interval, error_series, time_series, track
     except ModuleNotFoundError:
         return []
     truth = log.truth.get("beta")

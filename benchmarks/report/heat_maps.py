@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..colours import INK, line_styles
+from .colours import INK, line_styles
 
 try:
     from plotly import graph_objects as go

@@ -16,8 +16,8 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
+from ..harness.results import Suite, Table, write_text
 from .colours import INK, base, colour
-from .rows import Suite, Table, write_text
 
 _PAGE = Template("""\
 <!DOCTYPE html>

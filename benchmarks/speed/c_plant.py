@@ -9,7 +9,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from .field import AbsentError
+from .contestants import AbsentError
 
 FLAGS = ("-O3", "-march=native", "-ffp-contract=off")
 VECTORS = (

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
-from ..rows import Row, Suite, Table
+from ..harness.results import Row, Suite, Table
 from .timing import Contestant, Taken, spread
 
 

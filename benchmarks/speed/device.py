@@ -14,10 +14,10 @@ from typing import Annotated, Any, NamedTuple
 import typer
 from rich.console import Console
 
-from ...envs.device import DeviceVectorEnv
-from ...envs.device.numbers import torch
-from ...envs.layout import P
-from ..rows import check_writable, write_text
+from ...envs.backend.on_torch import torch
+from ...envs.device.env import DeviceVectorEnv
+from ...envs.engine.layout import P
+from ..harness.results import check_writable, write_text
 
 COUNTS = (1024, 16384, 65536, 262144, 1048576)
 ROUNDS = 5

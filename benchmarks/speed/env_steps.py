@@ -12,10 +12,10 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from ...estimators import EstimateObservation
-from ...estimators.vector import EstimateObservation as EstimateObservations
-from ..rows import Suite
-from .field import Field, add_costs
+from ...estimators.vector.estimate import EstimateObservation as EstimateObservations
+from ...estimators.wrappers.estimate import EstimateObservation
+from ..harness.results import Suite
+from .contestants import Field, add_costs
 from .timing import Contestant, Effort, Taken, interleaved
 
 COUNT = 1024  # environments at once

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...envs.linear import LinearModel, vision
 from ...envs.record import FAST, PACKET, Record
-from ...envs.vehicle import Vehicle
+from ...envs.vehicle.linear import LinearModel, vision
+from ...envs.vehicle.vehicle import Vehicle
 
 Array = npt.NDArray[np.float64]
 

@@ -8,11 +8,12 @@ import numpy as np
 
 from ...agents.rollout import rollout
 from ...envs.record import PACKET, Record
-from ...estimators import Estimator, make_estimator
-from ...estimators.batch import make_batch
-from ..rows import Row, Suite, Table
-from ..tune_task import Drive, told_by
-from .rivals import OURS, Rival, four_states, six_states
+from ...estimators.estimator import Estimator
+from ...estimators.make import make_estimator
+from ...estimators.vector.batch import make_batch
+from ..harness.results import Row, Suite, Table
+from ..tuning.task import Drive, told_by
+from .filterpy_rival import OURS, Rival, four_states, six_states
 from .timing import Contestant, Effort, interleaved, ratios, spread
 
 TICKS = 3000  # of the drive
@@ -224,7 +225,7 @@ def _against_frames(suite: Suite, effort: Effort) -> None:
 def _draw(suite: Suite, lines: dict[str, list[float]]) -> None:
     """The curve; nothing where plotly is not installed."""
     try:
-        from ..figures import time_series
+        from ..report.figures import time_series
     except ModuleNotFoundError:
         return
     figure = time_series(

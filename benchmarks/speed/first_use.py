@@ -9,8 +9,8 @@ import subprocess
 import sys
 from tempfile import TemporaryDirectory
 
-from ..rows import Row, Suite, Table
-from .field import AbsentError
+from ..harness.results import Row, Suite, Table
+from .contestants import AbsentError
 from .timing import spread
 
 FIRST = "gym.make to the first step, kernels on disk"

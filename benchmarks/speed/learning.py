@@ -10,9 +10,9 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
-from ...envs.record import TICK
-from ..rows import Suite
-from .field import Field, add_costs
+from ...envs.ticks import TICK
+from ..harness.results import Suite
+from .contestants import Field, add_costs
 from .timing import Contestant, Effort, Taken, interleaved
 
 OURS = "PPO, YawFusion-v0"
@@ -35,7 +35,7 @@ def _learner(env: Any, steps: int, **settings: Any) -> Contestant:
 
 
 def _ours() -> Contestant:
-    from ...agents.vec_env import make_vec_env
+    from ...agents.vec_env.env import make_vec_env
 
     told = _settings()
     env = make_vec_env("sideslip/YawFusion-v0", COUNT, seed=0)
@@ -44,7 +44,7 @@ def _ours() -> Contestant:
 
 def _settings() -> dict[str, Any]:
     """Those of `sideslip train`."""
-    from ...agents.algorithms import algorithm_of
+    from ...agents.training.algorithms import algorithm_of
 
     return algorithm_of("ppo").options(10 * TICK, COUNT)
 

@@ -11,18 +11,19 @@ import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 
-from ...envs.actuators import lagged
-from ...envs.backend import fixed_tuple, inlined, jit, put
-from ...envs.dynamics import Car, Motion, Push, Road, rk4
-from ...envs.lanes import LANES
-from ...envs.layout import P, Z
-from ...envs.outside import BMW_320I
-from ...envs.record import TICK
-from ...envs.tyres import FIALA, Inputs, load_of, shifts
-from ..rows import Suite
-from .field import Field, add_costs
+from ...envs.backend.arrays import fixed_tuple, put
+from ...envs.backend.decorators import inlined, jit
+from ...envs.backend.simd import LANES
+from ...envs.engine.layout import P, Z
+from ...envs.outside.plants import BMW_320I
+from ...envs.ticks import TICK
+from ...envs.vehicle.actuators import lagged
+from ...envs.vehicle.dynamics import Car, Motion, Push, Road, rk4
+from ...envs.vehicle.tyres import FIALA, Inputs, load_of, shifts
+from ..harness.results import Suite
+from .c_plant import c_plant
+from .contestants import Field, add_costs
 from .timing import Contestant, Effort, Taken, interleaved
-from .yardstick import c_plant
 
 Array = npt.NDArray[np.float64]
 

@@ -8,9 +8,9 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from ..rows import Row, Suite, Table
+from ..harness.results import Row, Suite, Table
+from .contestants import absences, add_rows, rate
 from .env_steps import COUNT, FUSION, FUSION_ID, batch, episode
-from .field import absences, add_rows, rate
 from .timing import Contestant, Effort, Taken, interleaved, spread
 
 COUNTS = (1, 2, 4, 8, 16, 64, 256, 1024, 4096, 16384, 65536)
@@ -122,7 +122,7 @@ def _cpu(taken: Taken) -> tuple[float, float, float]:
 def _draw(suite: Suite, x_label: str, x: Any, lines: Mapping[str, Any], text: str) -> None:
     """Nothing where plotly is not installed."""
     try:
-        from ..figures import curves
+        from ..report.figures import curves
     except ModuleNotFoundError:
         return
     figure = curves("", x, lines, "CPU time of an env-step / us", x_label)

@@ -2,7 +2,7 @@
 
 from rich.console import Console
 
-from ..rows import Suite
+from ..harness.results import Suite
 from . import env_steps, filters, first_use, learning, plant, scaling, targets
 from .timing import FULL, QUICK
 

@@ -3,9 +3,9 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from ..rows import Row, Suite, Table
+from ..harness.results import Row, Suite, Table
 from . import env_steps, first_use, learning, plant
-from .field import absences, three
+from .contestants import absences, three
 from .timing import Taken, ratios, spread
 
 

@@ -5,8 +5,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from ..estimators.tunings import read_tunings
-from .rows import write_text
+from ...estimators.design.tunings import read_tunings
+from ..harness.results import write_text
 
 _HEAD = """\
 # Tunings: process noise per second, (unit of the state)^2 / s, and measurement noise where it was

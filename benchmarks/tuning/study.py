@@ -17,9 +17,9 @@ import joblib
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from .cases import cores
-from .stats import root_mean
-from .tune_task import SAMPLERS, STORAGE, Drive, Task, squares
+from ..harness.parallel import cores
+from ..harness.stats import root_mean
+from .task import SAMPLERS, STORAGE, Drive, Task, squares
 
 try:
     import cmaes  # noqa: F401  Optuna imports it when it is too late

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from ..estimators.tunings import TUNINGS
-from .rows import Suite, Table
-from .stats import interval, ratio_of_roots, root_mean
-from .tune_task import SAMPLERS, STORAGE, Array, Drive, Task, simulate, squares
+from ...estimators.design.tunings import TUNINGS
+from ..harness.results import Suite, Table
+from ..harness.stats import interval, ratio_of_roots, root_mean
+from .task import SAMPLERS, STORAGE, Array, Drive, Task, simulate, squares
 
 _EDGE = 0.1  # decades: so close to an end of its range a number counts as being there
 
@@ -33,7 +33,7 @@ def run(
 
     Raises ValueError for no trials or test seeds, and as `open_study` and `search`.
     """
-    from .tune_study import open_study, search
+    from .study import open_study, search
 
     if trials < 1:
         raise ValueError(f"trials must be at least 1, got {trials}")

@@ -14,13 +14,16 @@ import numpy as np
 import numpy.typing as npt
 from rich.console import Console
 
-from .. import __version__
-from ..agents.rollout import rollout
-from ..envs.backend import source_stamp
-from ..envs.record import Log
-from ..estimators import FILTERS, Estimator, UnobservableWarning, make_estimator
-from .cases import run_cases
-from .estimation import EXPERIMENTS, SETTLED
+from ... import __version__
+from ...agents.rollout import rollout
+from ...envs.backend.cache import source_stamp
+from ...envs.record import Log
+from ...estimators.estimates import UnobservableWarning
+from ...estimators.estimator import Estimator
+from ...estimators.filters import FILTERS
+from ...estimators.make import make_estimator
+from ..estimation import EXPERIMENTS, SETTLED
+from ..harness.parallel import run_cases
 
 Array = npt.NDArray[np.float64]
 Range = tuple[float, float]

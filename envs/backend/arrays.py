@@ -15,7 +15,7 @@ from numba.core.imputils import lower_builtin
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numba.np.arrayobj import load_item, make_array, store_item
 
-from .lanes import FLOATS, INTS, LANES, splat
+from .simd import FLOATS, INTS, LANES, splat
 
 
 def fixed_tuple(vector: Any, length: int) -> tuple[Any, ...]:

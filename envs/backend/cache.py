@@ -7,10 +7,12 @@ where the disk is full or a file is cut short, and keeps every function below a 
 """
 
 import contextlib
+import functools
 import hashlib
 import importlib
 import os
 import pickle
+import shutil
 import sys
 import uuid
 from pathlib import Path
@@ -23,6 +25,49 @@ from numba.core.compiler import compile_result
 from numba.core.environment import _rebuild_env
 from numba.core.runtime import rtsys
 from numba.core.serialize import dumps
+
+_PACKAGE = Path(__file__).resolve().parents[2]
+_LAYERS = ("envs", "estimators", "agents", "benchmarks")  # each calls only those before it
+_KEPT_CACHES = 12
+
+
+def source_stamp(layer: str = _LAYERS[-1]) -> str:
+    """The hash of all source files a layer's kernels may call, which names their folder.
+
+    numba watches only the file of the function itself: an edit in a callee's module would
+    otherwise silently give the numbers of the old text. Calls point one way, so an edit in
+    `benchmarks` leaves the kernels of `envs` alone.
+    """
+    digest = hashlib.sha256()
+    for folder in _LAYERS[: _LAYERS.index(layer) + 1]:
+        for path in sorted((_PACKAGE / folder).rglob("*.py")):
+            digest.update(str(path.relative_to(_PACKAGE)).encode())
+            digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def _cache_folder(layer: str = _LAYERS[-1]) -> str | None:
+    """The folder of a layer's kernels, or None where there can be none; older ones are pruned.
+
+    One that is there but cannot be written is read.
+    """
+    home = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
+    base = Path(os.environ.get("NUMBA_CACHE_DIR") or Path(home) / "sideslip" / "kernels")
+    folder = base / source_stamp(layer)
+    with contextlib.suppress(OSError):
+        folder.mkdir(parents=True, exist_ok=True)
+        os.utime(folder)
+    if not folder.is_dir():
+        return None
+    if "NUMBA_CACHE_DIR" not in os.environ:  # a folder of the user's own is not ours to prune
+        with contextlib.suppress(OSError):  # another process may prune as well
+            newest = sorted(base.iterdir(), key=lambda path: path.stat().st_mtime, reverse=True)
+            for old in newest[_KEPT_CACHES:]:
+                shutil.rmtree(old, ignore_errors=True)
+    return str(folder)
+
+
+_kept_folder = functools.cache(_cache_folder)
 
 _ENVIRONMENT = "_ZN08NumbaEnv"  # begins the names of the globals that point to environments
 _DIGEST = hashlib.sha256().digest_size

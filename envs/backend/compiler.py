@@ -32,7 +32,7 @@ from numba.core.registry import CPUDispatcher
 from numba.core.sigutils import normalize_signature
 from numba.core.typing import make_concrete_template
 
-from .kept import Kept, environment_names, link_environments
+from .cache import Kept, environment_names, link_environments
 
 QUIET = "SIDESLIP_QUIET"
 """The environment variable that keeps `tell` from writing to standard error."""

@@ -4,108 +4,19 @@ The equations of sideslip are plain scalar functions over tuples. `jit` compiles
 rebuilds the very same functions for Python floats, NumPy arrays or any other table of primitives.
 """
 
-import contextlib
-import functools
-import hashlib
-import os
-import shutil
-import types
-from collections.abc import Callable, Mapping
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any, TypeVar
 
 import numba
-from numba.core.dispatcher import Dispatcher
 
+from .arrays import put_all
+from .cache import _LAYERS, _kept_folder
 from .compiler import Kernel
-from .packed import abreast, at, fixed_tuple, of_lane, put, put_all, put_along, ramp
-from .primitives import (
-    ARRAYS,
-    absolute,
-    anywhere,
-    floor,
-    maximum,
-    minimum,
-    select,
-    sqrt,
-    to_float,
-    whole,
-)
 
-__all__ = [
-    "ARRAYS",
-    "abreast",
-    "absolute",
-    "anywhere",
-    "apart",
-    "at",
-    "config",
-    "copied",
-    "fixed_tuple",
-    "floor",
-    "inlined",
-    "jit",
-    "maximum",
-    "minimum",
-    "of_lane",
-    "plain",
-    "put",
-    "put_all",
-    "put_along",
-    "ramp",
-    "select",
-    "sqrt",
-    "to_float",
-    "whole",
-]  # fmt: skip
-
-_PACKAGE = Path(__file__).resolve().parent.parent
-_PREFIX = __name__.removesuffix("envs.backend")
-_LAYERS = ("envs", "estimators", "agents", "benchmarks")  # each calls only those before it
-_TABLED = {fixed_tuple.__module__, minimum.__module__}  # what a table may replace
-_KEPT_CACHES = 12
+_PREFIX = __name__.removesuffix("envs.backend.decorators")
 
 config: Any = numba.config
 F = TypeVar("F", bound=Callable[..., Any])
-
-
-def source_stamp(layer: str = _LAYERS[-1]) -> str:
-    """The hash of all source files a layer's kernels may call, which names their folder.
-
-    numba watches only the file of the function itself: an edit in a callee's module would
-    otherwise silently give the numbers of the old text. Calls point one way, so an edit in
-    `benchmarks` leaves the kernels of `envs` alone.
-    """
-    digest = hashlib.sha256()
-    for folder in _LAYERS[: _LAYERS.index(layer) + 1]:
-        for path in sorted((_PACKAGE / folder).rglob("*.py")):
-            digest.update(str(path.relative_to(_PACKAGE)).encode())
-            digest.update(path.read_bytes())
-    return digest.hexdigest()[:16]
-
-
-def _cache_folder(layer: str = _LAYERS[-1]) -> str | None:
-    """The folder of a layer's kernels, or None where there can be none; older ones are pruned.
-
-    One that is there but cannot be written is read.
-    """
-    home = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
-    base = Path(os.environ.get("NUMBA_CACHE_DIR") or Path(home) / "sideslip" / "kernels")
-    folder = base / source_stamp(layer)
-    with contextlib.suppress(OSError):
-        folder.mkdir(parents=True, exist_ok=True)
-        os.utime(folder)
-    if not folder.is_dir():
-        return None
-    if "NUMBA_CACHE_DIR" not in os.environ:  # a folder of the user's own is not ours to prune
-        with contextlib.suppress(OSError):  # another process may prune as well
-            newest = sorted(base.iterdir(), key=lambda path: path.stat().st_mtime, reverse=True)
-            for old in newest[_KEPT_CACHES:]:
-                shutil.rmtree(old, ignore_errors=True)
-    return str(folder)
-
-
-_kept_folder = functools.cache(_cache_folder)
 
 
 def jit(function: F) -> F:
@@ -158,32 +69,7 @@ def copied(source: Any, target: Any) -> None:
         target[i] = source[i]
 
 
-def plain(function: F, table: Mapping[str, Callable[..., Any]] | None = None) -> F:
-    """The same text without the compiler.
-
-    Parameters: `function`, compiled by `jit` or not; `table`, primitives by name that replace
-    ours (`ARRAYS` for NumPy arrays, None for Python floats).
-    Returns: a function built from the same code object, its callees replaced likewise.
-    """
-    rebuilt: F = _rebuild(function, dict(table or {}), {})
-    return rebuilt
-
-
-def _rebuild(function: Any, table: dict[str, Any], done: dict[Any, Any]) -> Any:
-    source = function.py_func if isinstance(function, Dispatcher) else function
-    if source.__name__ in table and source.__module__ in _TABLED:
-        return table[source.__name__]
-    if source in done:
-        return done[source]
-    names: dict[str, Any] = dict(source.__globals__)
-    rebuilt = types.FunctionType(source.__code__, names, source.__name__, source.__defaults__)
-    done[source] = rebuilt
-    for name in source.__code__.co_names:
-        callee = names.get(name)
-        ours = isinstance(callee, types.FunctionType) and (callee.__module__ or "").startswith(
-            __name__.rpartition(".envs")[0]
-        )
-        if isinstance(callee, Dispatcher) or ours:
-            names[name] = _rebuild(callee, table, done)
-    del names["__name__"]  # by which torch.compile would look the names up in the module itself
-    return rebuilt
+@jit
+def store(vector: Any, start: int, values: Any) -> None:
+    """Write a tuple into a vector from `start` on."""
+    put_all(vector, values, 0, start)

@@ -6,7 +6,8 @@ only + - * / and correctly rounded square roots. Errors are stated at each funct
 
 from typing import Any
 
-from .backend import absolute, floor, jit, maximum, minimum, select, sqrt
+from .decorators import jit
+from .primitives import absolute, floor, maximum, minimum, select, sqrt
 
 _TWO_OVER_PI = 0.6366197723675814
 _PI_2_HIGH = 1.5707963267341256  # the first 33 bits of pi/2, so that k * high is exact
@@ -132,3 +133,9 @@ def exp(x: Any) -> Any:
     for _ in range(6):
         p = p * p
     return p
+
+
+@jit
+def clip(value: Any, low: Any, high: Any) -> Any:
+    """The value kept within [low, high]."""
+    return minimum(maximum(value, low), high)

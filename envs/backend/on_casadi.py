@@ -4,7 +4,7 @@ import types
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-from ..envs.backend import plain
+from .rebuild import plain
 
 try:
     import casadi as ca
@@ -33,7 +33,7 @@ _ELEMENTARY: dict[str, Callable[..., Any]] = {
 }
 """CasADi's own in place of our polynomials: they agree to 1e-15 and have short derivatives."""
 
-_OURS = __name__.rpartition(".agents")[0]
+_OURS = __name__.rpartition(".envs")[0]
 
 
 def symbolic(function: F) -> F:

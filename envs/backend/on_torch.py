@@ -9,7 +9,7 @@ from collections.abc import Callable
 from types import FunctionType, MethodType
 from typing import Any
 
-from ..backend import plain
+from .rebuild import plain
 
 try:
     import torch as torch  # for the other modules of the device engine

@@ -16,7 +16,7 @@ from numba.core import cgutils, types
 from numba.core.imputils import lower_builtin
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 
-from .lanes import BOOLS, FLOATS, INTS, LANES, Lanes, compare, meet
+from .simd import BOOLS, FLOATS, INTS, LANES, Lanes, compare, meet
 
 
 def minimum(a: Any, b: Any) -> Any:

@@ -7,8 +7,9 @@ compiled code, Python, NumPy and torch compute the same words.
 
 from typing import Any, NamedTuple
 
-from .backend import jit, select, sqrt, to_float
+from .decorators import jit
 from .elementary import PI, cos_kernel, quadrant, sin_kernel
+from .primitives import select, sqrt, to_float
 
 _MASK = 0xFFFFFFFF
 _M0, _M1 = 0xD2511F53, 0xCD9E8D57

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from .numbers import torch
+from ..backend.on_torch import torch
 from .step import Brought, Held, Step
 
 Tensor = torch.Tensor

@@ -8,21 +8,22 @@ import numpy as np
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, VectorEnv
 
-from ..border import count_of, mask_of, mode_of, named
-from ..kernel import kind_of
-from ..layout import P
+from ..arguments import count_of, mask_of, mode_of, named
+from ..backend.on_torch import torch
+from ..engine.layout import P, Switches
+from ..engine.packing import Template
+from ..engine.step import kind_of
+from ..engine.tick import Kind
 from ..record import CAMERA, SLOW_NAMES
-from ..sensors import Link
-from ..switches import REPORT, RUNNING, Report, Switches
-from ..template import Template
-from ..tick import Kind
+from ..sensors.link import Link
+from ..task.failures import RUNNING
+from ..task.info import REPORT, Report
 from ..vector import StabilityVectorEnv
-from .graph import Graphed
-from .numbers import torch
-from .rows import Rows
-from .slow import Most, most_of
+from .cuda_graph import Graphed
+from .packets import Most, most_of
 from .state import compiles, device_of, dtype_of, told_actions
 from .step import Brought, Held, Step
+from .transfer import Rows
 
 Tensor = torch.Tensor
 Infos = dict[str, Any]

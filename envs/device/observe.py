@@ -2,15 +2,17 @@
 
 from typing import Any
 
-from ..backend import select
-from ..layout import AGE_CAP, SAMPLED, Slow
-from ..record import CAMERA, FAST, PACKET, TICK, VALUES
-from ..reference import rest_of_cost
-from ..sensors import NEVER
-from ..summary import clip
-from ..switches import BAD_ACTION, RUNNING, Report
-from .numbers import on_tensors, torch
-from .slow import Delivered
+from ..backend.elementary import clip
+from ..backend.on_torch import on_tensors, torch
+from ..backend.primitives import select
+from ..engine.layout import Slow
+from ..record import CAMERA, FAST, PACKET, VALUES
+from ..task.cost import rest_of_cost
+from ..task.failures import BAD_ACTION, RUNNING
+from ..task.info import Report
+from ..task.observation import AGE_CAP, SAMPLED
+from ..ticks import NEVER, TICK
+from .packets import Delivered
 from .ticks import Now, Told
 
 Tensor = torch.Tensor

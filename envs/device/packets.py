@@ -8,25 +8,19 @@ off the front what has arrived.
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from ..backend import select
-from ..delivery import FAR
-from ..dynamics import Motion, Road
-from ..elementary import exp
-from ..layout import P, Slow, Z
-from ..noise import CHANNELS, normals
+from ..backend.elementary import exp
+from ..backend.on_torch import on_tensors, torch
+from ..backend.primitives import select
+from ..backend.random import CHANNELS, normals
+from ..engine.layout import P, Slow, Z
+from ..engine.packets import FAR
 from ..record import CAMERA, PACKET, PACKET_WIDTH, VALUES
-from ..sensors import (
-    NEVER,
-    Link,
-    Noise,
-    Sky,
-    arrivals,
-    camera_sample,
-    gps_sample,
-    most_under_way,
-    sky_deviation,
-)
-from .numbers import on_tensors, torch
+from ..sensors.camera import camera_sample
+from ..sensors.gps import Sky, gps_sample, sky_deviation
+from ..sensors.link import Link, arrivals, most_under_way
+from ..sensors.noise import Noise
+from ..ticks import NEVER
+from ..vehicle.dynamics import Motion, Road
 
 Tensor = torch.Tensor
 _NEWEST = Slow._fields.index("captured")

@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..border import actions_of
-from ..dynamics import Motion
-from ..layout import Array, Drive, Z
-from .numbers import DTYPES, torch
-from .slow import read_packed, write_packed
+from ..arguments import actions_of
+from ..backend.on_torch import DTYPES, torch
+from ..engine.layout import Drive, Z
+from ..record import Array
+from ..vehicle.dynamics import Motion
+from .packets import read_packed, write_packed
 from .step import Held
 
 Tensor = torch.Tensor

@@ -3,14 +3,16 @@ function that never waits for the device."""
 
 from typing import Any, NamedTuple
 
-from ..backend import select
-from ..layout import Array, P
-from ..summary import clip
-from ..switches import BAD_ACTION, REPORT, RUNNING
-from ..tick import Kind
-from .numbers import compiled, on_tensors, torch
-from .slow import Most, SlowSensors, Under, Window
-from .tell import Telling
+from ..backend.elementary import clip
+from ..backend.on_torch import compiled, on_tensors, torch
+from ..backend.primitives import select
+from ..engine.layout import P
+from ..engine.tick import Kind
+from ..record import Array
+from ..task.failures import BAD_ACTION, RUNNING
+from ..task.info import REPORT
+from .observe import Telling
+from .packets import Most, SlowSensors, Under, Window
 from .ticks import Now, Ticks, start_of
 
 Tensor = torch.Tensor

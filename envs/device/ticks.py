@@ -7,17 +7,18 @@ branches on values, so the device never waits for the host.
 
 from typing import Any, NamedTuple
 
-from ..backend import select
-from ..delivery import Chance
-from ..dynamics import Motion
-from ..kernel import fixed_of
-from ..layout import Drive, P
-from ..noise import CHANNELS, normals
-from ..programme import STEERING_WIDTH, steering_at
-from ..record import FAST_WIDTH, TICK
-from ..switches import RUNNING
-from ..tick import Kind, Moving, advance, changed, failure_of
-from .numbers import compiled, on_tensors, torch
+from ..backend.on_torch import compiled, on_tensors, torch
+from ..backend.primitives import select
+from ..backend.random import CHANNELS, normals
+from ..engine.layout import Drive, P
+from ..engine.step import fixed_of
+from ..engine.tick import Kind, Moving, advance, changed, failure_of
+from ..record import FAST_WIDTH
+from ..scenarios.steering import STEERING_WIDTH, steering_at
+from ..sensors.inertial import Chance
+from ..task.failures import RUNNING
+from ..ticks import TICK
+from ..vehicle.dynamics import Motion
 
 Tensor = torch.Tensor
 Numbers = tuple[Tensor, ...]

@@ -4,10 +4,10 @@ from typing import Any
 
 import numpy as np
 
-from ..fleet import Fleet, Whole
+from ..backend.on_torch import torch
+from ..engine.episodes import Fleet, Whole
 from ..record import PACKET_WIDTH
-from .numbers import torch
-from .slow import Most
+from .packets import Most
 from .state import held_of, write_states
 from .step import Brought, Held
 

@@ -2,11 +2,14 @@
 
 from typing import Any
 
-from .backend import abreast, copied, jit
-from .block import step_block
-from .kernel import kind_of, shares_of, step_vehicle
-from .restart import reset_vehicle
-from .switches import REFUSED, REPORT, RUNNING, Switches
+from ..backend.arrays import abreast
+from ..backend.decorators import copied, jit
+from ..task.failures import REFUSED, RUNNING
+from ..task.info import REPORT
+from .lanes import step_block
+from .layout import Switches
+from .reset import reset_vehicle
+from .step import kind_of, shares_of, step_vehicle
 
 _FAIL_BAD = Switches._fields.index("fail_bad")
 _FEW = 2  # up to so many vehicles are stepped one by one

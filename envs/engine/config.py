@@ -9,14 +9,38 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from .dynamics import Motion
-from .layout import Array, Entry, observation_layout
-from .manoeuvres import scenario_from
-from .record import SlowSensor
-from .scenario import Scenario
-from .sensor_sets import SENSOR_SETS, in_scenario, most_packets, with_changes
-from .template import Template, template_of
-from .vehicle import Vehicle, vehicle_from
+from ..record import Array, SlowSensor
+from ..scenarios.checks import SHORTEST_GPS_PERIOD
+from ..scenarios.manoeuvres import scenario_from
+from ..scenarios.scenario import Scenario
+from ..sensors.link import IN_FLIGHT
+from ..sensors.sets import SENSOR_SETS, with_changes
+from ..task.observation import Entry, observation_layout
+from ..ticks import ticks
+from ..vehicle.dynamics import Motion
+from ..vehicle.vehicle import Vehicle, vehicle_from
+from .packing import Template, template_of
+
+
+def in_scenario(sensors: dict[str, SlowSensor], scenario: Scenario) -> dict[str, SlowSensor]:
+    """The sensors with the clocks and delays that a scenario sets for those that are there."""
+    told = dict(sensors)
+    if "camera" in told and scenario.camera_delays is not None:
+        told["camera"] = dataclasses.replace(
+            told["camera"], delays=scenario.camera_delays, jitter=scenario.camera_jitter
+        )
+    if "gps" in told and scenario.gps_period is not None:
+        told["gps"] = dataclasses.replace(told["gps"], period=scenario.gps_period)
+    if "gps" in told and scenario.gps_delays is not None:
+        told["gps"] = dataclasses.replace(told["gps"], delays=scenario.gps_delays, jitter=0.0)
+    return told
+
+
+def most_packets(sensor: SlowSensor, n: int) -> int:
+    """Room for the worst case: all frames of a step and all that were under way."""
+    period = min(sensor.period, SHORTEST_GPS_PERIOD)  # of any scenario
+    return 2 * (n // int(ticks(period)) + 1) + IN_FLIGHT
+
 
 OPTIONS = ("scenario", "vehicle", "friction", "state", "duration")
 

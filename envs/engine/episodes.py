@@ -7,20 +7,21 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.utils import seeding
 
+from ..arguments import options_of
+from ..record import FAST_WIDTH, PACKET_WIDTH, Array, Record, SlowSensor
+from ..scenarios.draws import DRAWS_WIDTH
+from ..scenarios.scenario import Scenario
+from ..task.info import REPORT
+from ..ticks import TICK
+from ..vehicle.dynamics import Motion
+from ..vehicle.vehicle import Vehicle
 from .batch import reset_rows
-from .block import block_of
-from .border import options_of
-from .dynamics import Motion
-from .episode import Each, record_in, slow_in, vehicle_in
-from .layout import Array, P, Z
-from .programme import DRAWS_WIDTH
-from .record import FAST_WIDTH, PACKET_WIDTH, TICK, Record, SlowSensor
-from .scenario import Scenario
-from .scratch import scratch_of
-from .setting import Setting
-from .switches import REPORT, Switches
-from .template import Template
-from .vehicle import Vehicle
+from .config import Setting
+from .lanes import block_of
+from .layout import P, Switches, Z
+from .packing import Template
+from .views import Each, record_in, slow_in, vehicle_in
+from .window import scratch_of
 
 Whole = npt.NDArray[np.int64]
 Made = tuple[Template, Array]

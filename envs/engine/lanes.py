@@ -5,13 +5,14 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from .backend import abreast, apart, at
-from .kernel import conclude, drive_on, kind_of, shares_of
-from .lanes import LANES
-from .layout import Array, P, Z
-from .record import FAST_WIDTH
-from .scratch import foresee_abreast, scratch_of
-from .switches import REPORT
+from ..backend.arrays import abreast, at
+from ..backend.decorators import apart
+from ..backend.simd import LANES
+from ..record import FAST_WIDTH, Array
+from ..task.info import REPORT
+from .layout import P, Z
+from .step import conclude, drive_on, kind_of, shares_of
+from .window import foresee_abreast, scratch_of
 
 _TOLD = len(REPORT)
 _MOVING = Z.camera  # what a tick changes comes first in a state, but for the driver's angle

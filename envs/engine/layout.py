@@ -7,19 +7,19 @@ complete snapshot. New parts go at the end of `_PARAMS` or `_STATE`; nothing els
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-from .actuators import Lag
-from .driver import Driver
-from .dynamics import Car, Motion, Road
-from .pace import Pace
-from .programme import STEERING_WIDTH, Wind
-from .record import FAST, FAST_UNITS, PACKET_WIDTH, SLOW_NAMES, SLOW_VALUES
-from .reference import Target
-from .sensors import IN_FLIGHT, Link, Noise, Sky
-from .tracks import Path
-
-Array = npt.NDArray[np.float64]
+from ..record import PACKET_WIDTH
+from ..scenarios.driver import Driver
+from ..scenarios.speed import Pace
+from ..scenarios.steering import STEERING_WIDTH
+from ..scenarios.tracks import Path
+from ..scenarios.wind import Wind
+from ..sensors.gps import Sky
+from ..sensors.link import IN_FLIGHT, Link
+from ..sensors.noise import Noise
+from ..task.reference import Target
+from ..vehicle.actuators import Lag
+from ..vehicle.dynamics import Car, Motion, Road
 
 
 class Disturbance(NamedTuple):
@@ -173,53 +173,13 @@ class StateAt(NamedTuple):
 P, Z = ParamsAt(**_PARAMS), StateAt(**_STATE)
 
 
-class Entry(NamedTuple):
-    """One number of an observation: its name, unit and finite bounds."""
+class Switches(NamedTuple):
+    """Integers that choose the text of the plant and the task, the same for a whole batch."""
 
-    name: str
-    unit: str
-    low: float
-    high: float
-
-
-SAMPLED = 6  # the first columns of a fast row are sensors; the policy sees last and mean of each
-AGE_CAP = 10.0  # s
-
-_FAST_BOUNDS = (10.0, 50.0, 50.0, 10.0, 100.0, 100.0, 1.0, 2000.0, 2000.0, 1.0, 50.0)
-_SLOW_BOUNDS = {
-    "psi": float(np.pi),
-    "y_l": 200.0,
-    "course": float(np.pi),
-    "speed": 100.0,
-    "X": 1e5,
-    "Y": 1e5,
-    "hdop": 100.0,
-    "satellites": 50.0,
-}
-
-
-def observation_layout(slow: tuple[str, ...], n: int, fast: str) -> tuple[Entry, ...]:
-    """The entries of an observation.
-
-    slow: names of the slow sensors present. n: ticks of a control period. fast: "summary" (last
-    sample and mean over the step) or "all" (every sample of the step).
-    """
-    entries = []
-    for column in range(SAMPLED):
-        name, unit, bound = FAST._fields[column], FAST_UNITS[column], _FAST_BOUNDS[column]
-        names = (name, f"{name}_mean") if fast == "summary" else [f"{name}_{j}" for j in range(n)]
-        entries += [Entry(each, unit, -bound, bound) for each in names]
-    for name in ("steer", "torque_left", "torque_right", "steer_command"):
-        column = getattr(FAST, name)
-        bound = _FAST_BOUNDS[column]
-        entries.append(Entry(name, FAST_UNITS[column], -bound, bound))
-    for sensor in SLOW_NAMES:
-        if sensor in slow:
-            for name, unit in SLOW_VALUES[sensor]:
-                bound = _SLOW_BOUNDS[name]
-                entries.append(Entry(f"{sensor}_{name}", unit, -bound, bound))
-            entries.append(Entry(f"{sensor}_age", "s", 0.0, AGE_CAP))
-            entries.append(Entry(f"{sensor}_fresh", "-", 0.0, 1.0))
-    entries.append(Entry("beta_ref", "rad", -1.0, 1.0))
-    entries.append(Entry("gamma_ref", "rad/s", -10.0, 10.0))
-    return tuple(entries)
+    small_angle: int
+    law: int
+    reference: int
+    steering: int  # kind of steering programme, used at reset
+    all_samples: int  # the observation holds every fast sample
+    fail_bad: int  # a non-finite action ends the episode instead of being refused
+    roll: int  # the body rolls

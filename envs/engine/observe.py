@@ -2,17 +2,14 @@
 
 from typing import Any
 
-from .backend import jit, maximum, minimum, select
-from .layout import AGE_CAP, SAMPLED, P, Z
-from .record import CAMERA, FAST, PACKET, TICK, VALUES
-from .sensors import NEVER
-from .switches import REPORT
-
-
-@jit
-def clip(value: Any, low: Any, high: Any) -> Any:
-    """The value kept within [low, high]."""
-    return minimum(maximum(value, low), high)
+from ..backend.decorators import jit
+from ..backend.elementary import clip
+from ..backend.primitives import select
+from ..record import CAMERA, FAST, PACKET, VALUES
+from ..task.info import REPORT
+from ..task.observation import AGE_CAP, SAMPLED
+from ..ticks import NEVER, TICK
+from .layout import P, Z
 
 
 @jit

@@ -3,41 +3,25 @@
 Packets are delivered in the order (captured tick, sensor); what is under way lies in the state.
 """
 
-from typing import Any, NamedTuple
+from typing import Any
 
-from .backend import fixed_tuple, inlined, jit, minimum, put_all
-from .dynamics import Road
-from .elementary import exp
+from ..backend.arrays import fixed_tuple
+from ..backend.decorators import jit, store
+from ..backend.elementary import exp
+from ..backend.primitives import minimum
+from ..backend.random import CHANNELS, normals
+from ..record import CAMERA, GPS, PACKET, PACKET_WIDTH, VALUES
+from ..sensors.camera import camera_sample
+from ..sensors.gps import Sky, gps_sample, sky_deviation
+from ..sensors.link import Link, arrivals
+from ..sensors.noise import Noise
+from ..ticks import NEVER
+from ..vehicle.dynamics import Road
 from .layout import P, Z
-from .noise import CHANNELS, normals
-from .record import CAMERA, GPS, PACKET, PACKET_WIDTH, VALUES
-from .sensors import (
-    NEVER,
-    Link,
-    Noise,
-    Sky,
-    arrivals,
-    camera_sample,
-    gps_sample,
-    sky_deviation,
-)
 
 FAR = 1e15
 _LINK, _NOISE, _ROAD = len(Link._fields), len(Noise._fields), len(Road._fields)
 _SKY = len(Sky._fields)
-
-
-class Chance(NamedTuple):
-    """The random numbers of a tick, four standard normal ones each."""
-
-    inertial: Any
-    wheels: Any
-
-
-@jit
-def store(vector: Any, start: int, values: Any) -> None:
-    """Write a tuple into a vector from `start` on."""
-    put_all(vector, values, 0, start)
 
 
 @jit
@@ -95,29 +79,6 @@ def _deliver(z: Any, tick: Any, packets: Any, count: int) -> int:
             z[best + i] = z[last + i]
         z[Z.under_way] = under_way - 1.0
         count += 1
-
-
-@inlined
-def fast_row(motion: Any, accel: Any, acted: Any, d_f: Any, noise: Any, chance: Any) -> Any:
-    """The fast sensors at a tick, columns as in `Fast`.
-
-    accel: (a_x, a_y) specific forces. acted: what acted, in the order of `Fast` from `steer` on.
-    """
-    n, wheels = chance.inertial, chance.wheels
-    half = 0.5 * d_f * motion.gamma
-    return (
-        motion.gamma + noise.gyro_bias + noise.gyro * n[0],
-        accel[1] + noise.accel_y_bias + noise.accel * n[1],
-        accel[0] + noise.accel * n[2],
-        motion.phi_dot + noise.roll_rate * n[3],
-        motion.v_x - half + noise.wheel * wheels[0],
-        motion.v_x + half + noise.wheel * wheels[1],
-        acted[0],
-        acted[1],
-        acted[2],
-        acted[3],
-        acted[4],
-    )
 
 
 @jit

@@ -6,20 +6,23 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from .actuators import lag_of
-from .driver import Driver
-from .dynamics import Car, Road
-from .layout import Array, Change, Disturbance, P, Task
-from .pace import Pace
-from .programme import FOREVER, STEERING_KINDS, STEERING_WIDTH, Wind
-from .record import TICK, SlowSensor
-from .reference import REFERENCES, target_of
-from .scenario import Scenario
-from .sensors import HDOP_LAWS, Link, Noise, Sky, link_of, ticks
-from .switches import Switches
-from .tracks import path_of
-from .tyres import FIALA, LINEAR
-from .vehicle import GRAVITY, Vehicle
+from ..record import Array, SlowSensor
+from ..scenarios.driver import Driver
+from ..scenarios.scenario import Scenario
+from ..scenarios.speed import Pace
+from ..scenarios.steering import STEERING_KINDS, STEERING_WIDTH
+from ..scenarios.tracks import path_of
+from ..scenarios.wind import Wind
+from ..sensors.gps import HDOP_LAWS, Sky
+from ..sensors.link import Link, link_of
+from ..sensors.noise import Noise
+from ..task.reference import REFERENCES, target_of
+from ..ticks import FOREVER, TICK, ticks
+from ..vehicle.actuators import lag_of
+from ..vehicle.dynamics import Car, Road
+from ..vehicle.tyres import FIALA, LINEAR
+from ..vehicle.vehicle import GRAVITY, Vehicle
+from .layout import Change, Disturbance, P, Switches, Task
 
 SPIN_ANGLE = 0.5  # rad of sideslip: the car has spun
 

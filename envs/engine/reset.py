@@ -2,28 +2,26 @@
 
 from typing import Any
 
-from .backend import apart, copied, fixed_tuple, jit, select
-from .delivery import FAR, Chance, fast_row, sense_slow, store
-from .driver import Driver, wanted_angle
-from .dynamics import Car, Motion, Road, gravity_at, sideslip_angle
+from ..backend.arrays import fixed_tuple
+from ..backend.decorators import apart, copied, jit, store
+from ..backend.primitives import select
+from ..backend.random import CHANNELS, normals
+from ..record import CAMERA, FAST
+from ..scenarios.draws import realise
+from ..scenarios.driver import Driver, wanted_angle
+from ..scenarios.steering import DRIVER, STEERING_WIDTH, steering_at, write_steering
+from ..scenarios.tracks import Path, laid
+from ..sensors.inertial import Chance, fast_row
+from ..sensors.link import Link, clock_phase
+from ..sensors.noise import Noise
+from ..task.info import REPORT
+from ..task.reference import Target, reference
+from ..ticks import FOREVER, NEVER, whole_ticks
+from ..vehicle.dynamics import Car, Motion, Road, gravity_at, sideslip_angle
+from ..vehicle.vehicle import GRAVITY
 from .layout import P, Z
-from .noise import CHANNELS, normals
-from .programme import (
-    DRIVER,
-    FOREVER,
-    STEERING_WIDTH,
-    realise,
-    steering_at,
-    whole_ticks,
-    write_steering,
-)
-from .record import CAMERA, FAST
-from .reference import Target, reference
-from .sensors import NEVER, Link, Noise, clock_phase
-from .summary import observe, write_report
-from .switches import REPORT
-from .tracks import Path, laid
-from .vehicle import GRAVITY
+from .observe import observe, write_report
+from .packets import FAR, sense_slow
 
 _CAR, _MOTION, _LINK, _TARGET = (len(each._fields) for each in (Car, Motion, Link, Target))
 _ROAD, _DRIVER, _PATH, _NOISE = (len(each._fields) for each in (Road, Driver, Path, Noise))

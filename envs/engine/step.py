@@ -10,23 +10,29 @@ scratch array, `drive_on` moves the car tick by tick, `conclude` handles the slo
 
 from typing import Any
 
-from .actuators import Lag
-from .backend import anywhere, apart, at, copied, fixed_tuple, jit, put, put_all, select
-from .delivery import due, sense_slow
-from .driver import Driver
-from .dynamics import Car, Motion, Road
-from .layout import Change, Disturbance, Drive, P, Task, Z
-from .pace import Pace
-from .programme import DRIVER, Wind
-from .record import TICK
-from .reference import Target, rest_of_cost
-from .scratch import AHEAD, TRACK, chance_at, foresee, motion_at
-from .sensors import Noise
-from .summary import clip, observe, write_report
-from .switches import BAD_ACTION, REFUSED, REPORT, RUNNING, Switches
+from ..backend.arrays import at, fixed_tuple, put, put_all
+from ..backend.decorators import apart, copied, jit
+from ..backend.elementary import clip
+from ..backend.primitives import anywhere, select
+from ..scenarios.driver import Driver
+from ..scenarios.speed import Pace
+from ..scenarios.steering import DRIVER
+from ..scenarios.tracks import Path
+from ..scenarios.wind import Wind
+from ..sensors.noise import Noise
+from ..task.cost import rest_of_cost
+from ..task.failures import BAD_ACTION, REFUSED, RUNNING
+from ..task.info import REPORT
+from ..task.reference import Target
+from ..ticks import TICK
+from ..vehicle.actuators import Lag
+from ..vehicle.dynamics import Car, Motion, Road
+from ..vehicle.tyres import shifts
+from .layout import Change, Disturbance, Drive, P, Switches, Task, Z
+from .observe import observe, write_report
+from .packets import due, sense_slow
 from .tick import Fixed, Kind, Moving, advance, changed, failure_of, standing_load
-from .tracks import Path
-from .tyres import shifts
+from .window import AHEAD, TRACK, chance_at, foresee, motion_at
 
 _CAR, _MOTION, _ROAD, _LAG = (len(each._fields) for each in (Car, Motion, Road, Lag))
 _WIND, _PACE, _TARGET = (len(each._fields) for each in (Wind, Pace, Target))

@@ -6,20 +6,23 @@ The text of a tick is the same for one car, abreast in lanes, and tensors of the
 
 from typing import Any, NamedTuple
 
-from .actuators import distribute, lagged, slewed, within_stop, yaw_moment
-from .backend import absolute, anywhere, inlined, jit, select
-from .delivery import Chance, fast_row
-from .driver import steered
-from .dynamics import Car, Push, gravity_at, rk4, sideslip_angle
+from ..backend.decorators import inlined, jit
+from ..backend.primitives import absolute, anywhere, select
+from ..record import FAST
+from ..scenarios.driver import steered
+from ..scenarios.speed import acceleration_command
+from ..scenarios.tracks import path_offset
+from ..scenarios.wind import wind_at
+from ..sensors.inertial import Chance, fast_row
+from ..task.cost import cost_rate
+from ..task.failures import NOT_FINITE, OFF_ROAD, RUNNING, SPIN
+from ..task.reference import reference
+from ..ticks import TICK
+from ..vehicle.actuators import distribute, lagged, slewed, within_stop, yaw_moment
+from ..vehicle.dynamics import Car, Push, gravity_at, rk4, sideslip_angle
+from ..vehicle.tyres import Inputs, load_of
+from ..vehicle.vehicle import GRAVITY
 from .layout import Drive
-from .pace import acceleration_command
-from .programme import wind_at
-from .record import FAST, TICK
-from .reference import cost_rate, reference
-from .switches import NOT_FINITE, OFF_ROAD, RUNNING, SPIN
-from .tracks import path_offset
-from .tyres import Inputs, load_of
-from .vehicle import GRAVITY
 
 NO_LAG, ONE_LAGS = range(2)  # 2: both lag
 

@@ -2,24 +2,16 @@
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import Any, TypeVar, overload
+from typing import TypeVar, overload
 
-import numpy as np
-import numpy.typing as npt
-
-from .dynamics import Motion
-from .layout import Array, P, Z
-from .record import SLOW_NAMES, TICK, Record, SlowSensor
-from .sensors import ticks
-from .switches import REPORT, RUNNING
-from .template import Template
-from .vehicle import Vehicle
+from ..record import SLOW_NAMES, Array, Record, SlowSensor
+from ..ticks import TICK, ticks
+from ..vehicle.dynamics import Motion
+from ..vehicle.vehicle import Vehicle
+from .layout import P, Z
+from .packing import Template
 
 T = TypeVar("T")
-
-_NUMBERS = REPORT._fields[: REPORT.failure]  # of `info`; `failure` and `is_success` follow
-_KEYS = (*_NUMBERS, "failure", "is_success")
-_MASKS = tuple(f"_{key}" for key in _KEYS)
 
 
 def vehicle_in(template: Template, params: Array, state: Array) -> Vehicle:
@@ -55,49 +47,6 @@ def motion_in(state: Array) -> Motion:
 def record_in(state: Array, rows: Array, packets: Array) -> Record:
     """The record whose fast rows end now (copies)."""
     return Record(rows.copy(), packets.copy(), int(state[Z.clock + 2]) - len(rows) + 1)
-
-
-def info_of(report: Array) -> tuple[dict[str, Any], int]:
-    """`info` of a step or a reset from a report (len(Report),), and how many packets came."""
-    (
-        t, beta, gamma, psi, beta_ref, gamma_ref, steer, yaw_moment, cost,
-        code, delivered, _, ended,
-    ) = report.tolist()  # fmt: skip
-    failure = int(code)
-    return {
-        "t": t,
-        "beta": beta,
-        "gamma": gamma,
-        "psi": psi,
-        "beta_ref": beta_ref,
-        "gamma_ref": gamma_ref,
-        "steer": steer,
-        "yaw_moment": yaw_moment,
-        "cost": cost,
-        "failure": failure,
-        "is_success": ended == 1.0 and failure == RUNNING,
-    }, int(delivered)
-
-
-def infos_of(reports: Array, rows: npt.NDArray[np.bool_]) -> dict[str, Any]:
-    """The infos of some rows of a batch as Gymnasium's vector environments tell them.
-
-    reports: (N, len(Report)). rows: (N,) whose infos are told; of the others stand zeros. Every
-    key has an array (N,) and, with an underscore before it, a mask.
-    """
-    if rows.all():
-        columns = reports.T.copy()
-    else:
-        columns = np.zeros(reports.shape[::-1])
-        columns[:, rows] = reports[rows].T
-    failure = columns[REPORT.failure].astype(np.int64)
-    success = (columns[REPORT.ended] == 1.0) & (failure == RUNNING)
-    told = (*columns[: len(_NUMBERS)], failure, success)
-    masks = np.empty((len(told), len(rows)), np.bool_)
-    masks[:] = rows
-    infos: dict[str, Any] = dict(zip(_KEYS, told, strict=True))
-    infos.update(zip(_MASKS, masks, strict=True))
-    return infos
 
 
 class Each(Sequence[T]):

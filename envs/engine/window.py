@@ -8,25 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from .backend import (
-    abreast,
-    at,
-    fixed_tuple,
-    jit,
-    of_lane,
-    put,
-    put_all,
-    put_along,
-    ramp,
-    to_float,
-    whole,
-)
-from .delivery import Chance
-from .dynamics import Motion
-from .lanes import LANES
-from .layout import Array, P, Z
-from .noise import CHANNELS, normals
-from .programme import STEERING_WIDTH, steering_at
+from ..backend.arrays import abreast, at, fixed_tuple, of_lane, put, put_all, put_along, ramp
+from ..backend.decorators import jit
+from ..backend.primitives import to_float, whole
+from ..backend.random import CHANNELS, normals
+from ..backend.simd import LANES
+from ..record import Array
+from ..scenarios.steering import STEERING_WIDTH, steering_at
+from ..sensors.inertial import Chance
+from ..vehicle.dynamics import Motion
+from .layout import P, Z
 
 CHANCE, AHEAD, TRACK = 0, 8, 9  # its rows: two times four normal numbers, rad, a Motion
 _ROWS = TRACK + len(Motion._fields)

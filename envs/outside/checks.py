@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
-from .scenario import Scenario
+from ..scenarios.scenario import Scenario
 
 CRAWL = 1.0  # m/s: the multi-body model's least speed; below 0.1 it freezes while its wheels spin
 

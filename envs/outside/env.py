@@ -6,26 +6,33 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from .actuators import Lag, distribute, lagged, slewed, within_stop, yaw_moment
-from .backend import absolute
-from .delivery import Chance, due, fast_row, sense_slow, store
-from .driver import Driver, steered
-from .dynamics import Motion, Road, sideslip_angle
-from .layout import Disturbance, Drive, P, Task, Z
-from .manoeuvres import scenario_from
-from .noise import CHANNELS, normals
-from .outside import OUTSIDE_PLANTS, Acting, OutsidePlant, outside_vehicle
-from .outside_checks import check_options, check_scenario
-from .pace import Pace, acceleration_command
-from .programme import DRIVER, STEERING_WIDTH, Wind, steering_at, wind_at
-from .record import FAST, TICK
-from .reference import Target, cost_rate, reference, rest_of_cost
-from .scenario import Scenario
-from .sensors import Noise
-from .stability import StabilityEnv
-from .summary import clip, observe, write_report
-from .switches import NOT_FINITE, OFF_ROAD, REPORT, RUNNING, SPIN
-from .tracks import Path, path_offset
+from ..backend.decorators import store
+from ..backend.elementary import clip
+from ..backend.primitives import absolute
+from ..backend.random import CHANNELS, normals
+from ..engine.layout import Disturbance, Drive, P, Task, Z
+from ..engine.observe import observe, write_report
+from ..engine.packets import due, sense_slow
+from ..record import FAST
+from ..scenarios.driver import Driver, steered
+from ..scenarios.manoeuvres import scenario_from
+from ..scenarios.scenario import Scenario
+from ..scenarios.speed import Pace, acceleration_command
+from ..scenarios.steering import DRIVER, STEERING_WIDTH, steering_at
+from ..scenarios.tracks import Path, path_offset
+from ..scenarios.wind import Wind, wind_at
+from ..sensors.inertial import Chance, fast_row
+from ..sensors.noise import Noise
+from ..stability import StabilityEnv
+from ..task.cost import cost_rate, rest_of_cost
+from ..task.failures import NOT_FINITE, OFF_ROAD, RUNNING, SPIN
+from ..task.info import REPORT
+from ..task.reference import Target, reference
+from ..ticks import TICK
+from ..vehicle.actuators import Lag, distribute, lagged, slewed, within_stop, yaw_moment
+from ..vehicle.dynamics import Motion, Road, sideslip_angle
+from .checks import check_options, check_scenario
+from .plants import OUTSIDE_PLANTS, Acting, OutsidePlant, outside_vehicle
 
 
 class OutsideEnv(StabilityEnv):

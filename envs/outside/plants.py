@@ -22,10 +22,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from .actuators import yaw_moment
-from .dynamics import Motion
-from .template import car_of
-from .vehicle import GRAVITY, Vehicle
+from ..engine.packing import car_of
+from ..vehicle.actuators import yaw_moment
+from ..vehicle.dynamics import Motion
+from ..vehicle.vehicle import GRAVITY, Vehicle
 
 Array = npt.NDArray[np.float64]
 

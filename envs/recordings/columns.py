@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .record import Array
-from .vehicle import GRAVITY
+from ..record import Array
+from ..vehicle.vehicle import GRAVITY
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -5,21 +5,21 @@ from pathlib import Path
 
 import numpy as np
 
-from .columns import COLUMNS, column_name, parse_mapping, read_quantities
-from .record import (
+from ..record import (
     FAST,
     FAST_WIDTH,
     PACKET,
     PACKET_WIDTH,
     SLOW_NAMES,
-    TICK,
     Array,
     Fast,
     Log,
     Record,
     SlowSensor,
 )
-from .sensors import COURSE_SPEED
+from ..sensors.gps import COURSE_SPEED
+from ..ticks import TICK
+from .columns import COLUMNS, column_name, parse_mapping, read_quantities
 
 __all__ = ["COLUMNS", "NEEDED", "column_name", "packet_rows", "parse_mapping", "read_log"]
 

@@ -3,8 +3,10 @@
 import math
 from typing import TYPE_CHECKING
 
-from .programme import STEERING_KINDS, Draws
-from .sensors import HDOP_LAWS, Noise
+from ..sensors.gps import HDOP_LAWS
+from ..sensors.noise import Noise
+from .draws import Draws
+from .steering import STEERING_KINDS
 from .tracks import PATHS
 
 if TYPE_CHECKING:

@@ -9,12 +9,13 @@ follow as a first-order lag within a largest rate.
 
 from typing import Any, NamedTuple
 
-from .actuators import lagged, slewed
-from .backend import jit, maximum, minimum
-from .dynamics import curvature_at
-from .elementary import sincos
+from ..backend.decorators import jit
+from ..backend.elementary import sincos
+from ..backend.primitives import maximum, minimum
+from ..vehicle.actuators import lagged, slewed
+from ..vehicle.dynamics import curvature_at
+from ..vehicle.tyres import SLOW
 from .tracks import path_offset
-from .tyres import SLOW
 
 NEAR = 1.0  # wheelbases: a driver looks no nearer
 

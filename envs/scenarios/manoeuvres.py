@@ -4,8 +4,9 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
-from .paper_simulations import ROAD_TESTS, SIMULATIONS
-from .scenario import KMH, Scenario
+from .draws import KMH
+from .papers import ROAD_TESTS, SIMULATIONS
+from .scenario import Scenario
 
 _DRAWN: dict[str, Any] = {
     "mirror": True,

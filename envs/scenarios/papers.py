@@ -8,8 +8,9 @@ wandering HDOP in the twins.
 
 from typing import Any
 
-from .scenario import KMH, Scenario
-from .vehicle import COMS
+from ..vehicle.vehicle import COMS
+from .draws import KMH
+from .scenario import Scenario
 
 
 def _tyres(stiffness: float) -> dict[str, float]:

@@ -7,14 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from .layout import Array
-from .programme import DRAWS_WIDTH, Draws
-from .scenario_checks import SIDES, check
-
-Range = float | tuple[float, float]
-"""A number, or the (low, high) that the seed draws from uniformly."""
-
-KMH = 1.0 / 3.6
+from ..record import Array
+from .checks import SIDES, check
+from .draws import DRAWS_WIDTH, KMH, Draws, Range
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,9 +2,10 @@
 
 from typing import Any, NamedTuple
 
-from .backend import anywhere, inlined, maximum, minimum, select
-from .elementary import sincos
-from .record import TICK
+from ..backend.decorators import inlined
+from ..backend.elementary import sincos
+from ..backend.primitives import anywhere, maximum, minimum, select
+from ..ticks import TICK
 
 
 class Pace(NamedTuple):

@@ -14,8 +14,8 @@ from collections.abc import Callable
 from itertools import pairwise
 from typing import Any, NamedTuple
 
-from .backend import jit
-from .elementary import smoothstep
+from ..backend.decorators import jit
+from ..backend.elementary import smoothstep
 
 LEAD = 0.15  # of a gap's length: how far the path's transition reaches into the lanes beside it
 

@@ -1,49 +1,14 @@
-"""Sensors: what they measure, their noise, and when a captured sample arrives."""
+"""A slow sensor's clock and link: when samples are captured, and when they arrive."""
 
 from typing import Any, NamedTuple
 
-import numpy as np
+from ..backend.decorators import jit
+from ..backend.primitives import floor, select, whole
+from ..backend.random import CHANNELS, uniforms
+from ..record import SlowSensor
+from ..ticks import NEVER, ticks
 
-from .backend import floor, jit, maximum, minimum, select, sqrt, whole
-from .dynamics import curvature_at, sideslip_angle
-from .elementary import sincos, wrap
-from .noise import CHANNELS, uniforms
-from .record import TICK, SlowSensor
-from .tyres import SLOW
-
-NEVER = -1.0
 IN_FLIGHT = 8  # packets of one sensor under way at once, duplicates included
-COURSE_SPEED = 1.0  # m/s; below it a course has quality 0
-HDOP_LAWS = {"constant": 0.0, "half": 0.5, "table": 1.0}
-"""How much of the GPS's noise follows HDOP: its standard deviations are (1 + w (HDOP - 1)) times
-those of `Noise`, which are those at HDOP 1."""
-OUTAGE_JUMP = 3.0  # of the spread of log HDOP, upwards where an outage ends
-
-
-class Noise(NamedTuple):
-    """Standard deviations and biases; the defaults are those of the project's simulations."""
-
-    gyro: Any = 0.005  # rad/s
-    gyro_bias: Any = 0.0
-    accel: Any = 0.1  # m/s2, both axes
-    accel_y_bias: Any = 0.0
-    roll_rate: Any = 0.005  # rad/s
-    wheel: Any = 0.02  # m/s
-    camera_psi: Any = 3.5e-3  # rad
-    camera_y: Any = 0.02  # m
-    course: Any = 0.14 * np.pi / 180.0 * (60.0 / 3.6)  # rad m/s: 0.14 deg at 60 km/h, as 1 / V
-    gps_speed: Any = 0.05  # m/s
-    gps_position: Any = 0.5  # m
-
-
-class Sky(NamedTuple):
-    """What the GPS sees of the satellites: log HDOP is an Ornstein-Uhlenbeck process."""
-
-    median: Any  # log of the median HDOP
-    spread: Any  # standard deviation of log HDOP
-    keep: Any  # what is left of a deviation after one period of the GPS
-    fresh: Any  # sqrt(1 - keep^2)
-    weight: Any  # of HDOP in the noise, HDOP_LAWS
 
 
 class Link(NamedTuple):
@@ -61,11 +26,6 @@ class Link(NamedTuple):
     duplicate: Any
     outage_start: Any
     outage_end: Any
-
-
-def ticks(seconds: float) -> float:
-    """Whole ticks of a time in seconds."""
-    return float(round(seconds / TICK))
 
 
 def link_of(sensor: SlowSensor | None, outage: tuple[float, float] | None = None) -> Link:
@@ -125,58 +85,6 @@ def arrivals(link: Any, frame: Any, tick: Any, key_low: int, key_high: int, bloc
     second = first + 1.0 + floor(again * link.period)
     first = select(gone, NEVER, first)
     return first, select(gone | (twice >= link.duplicate), NEVER, second)
-
-
-@jit
-def camera_sample(motion: Any, road: Any, l_pre: Any, noise: Any, n: Any) -> Any:
-    """(psi, y_l): heading relative to the road, and offset at the preview point.
-
-    y_l = y_cg + l_pre psi - kappa l_pre^2 / 2, tie-vision (4) with curvature.
-    """
-    psi = motion.psi - motion.theta
-    bend = 0.5 * curvature_at(road, motion.s) * l_pre * l_pre
-    y_l = motion.y + l_pre * psi - bend
-    return wrap(psi + noise.camera_psi * n[0]), y_l + noise.camera_y * n[1]
-
-
-@jit
-def sky_deviation(before: Any, sky: Any, link: Any, tick: Any, n: Any) -> Any:
-    """The deviation of log HDOP at a capture, from that at the one before."""
-    back = (link.outage_end > link.outage_start) & (tick >= link.outage_end)
-    back = back & (tick - link.period < link.outage_end)
-    jump = select(back, OUTAGE_JUMP * sky.spread, 0.0)
-    return sky.keep * before + sky.fresh * sky.spread * n[0] + jump
-
-
-@jit
-def satellites_at(hdop: Any) -> Any:
-    """How many satellites a receiver sees at an HDOP: 12 at 1, 4 up to 5, fewer above."""
-    return floor(2.0 + minimum(10.0 / hdop, 28.0))
-
-
-@jit
-def gps_sample(
-    motion: Any, ahead: Any, left: Any, hdop: Any, weight: Any, noise: Any, n: Any, small_angle: int
-) -> Any:
-    """(course, speed, X, Y, hdop, satellites, quality) of an antenna at (ahead, left).
-
-    course = psi + beta, dakf-stability (3), where beta, as all else, is the antenna's.
-    """
-    v_x, v_y = motion.v_x - motion.gamma * left, motion.v_y + motion.gamma * ahead
-    s, c = sincos(motion.psi)
-    size = 1.0 + weight * (hdop - 1.0)
-    v = sqrt(v_x * v_x + v_y * v_y)
-    angle = motion.psi + sideslip_angle(v_x, v_y, small_angle)
-    course = wrap(angle + noise.course * size / maximum(v, SLOW) * n[0])
-    return (
-        course,
-        v + noise.gps_speed * size * n[1],
-        motion.X + (ahead * c - left * s) + noise.gps_position * size * n[2],
-        motion.Y + (ahead * s + left * c) + noise.gps_position * size * n[3],
-        hdop,
-        satellites_at(hdop),
-        select(v < COURSE_SPEED, 0.0, 1.0),
-    )
 
 
 @jit

@@ -2,15 +2,12 @@
 
 from typing import Any, NamedTuple
 
-from .backend import absolute, jit, maximum, minimum
-from .record import TICK
-from .vehicle import GRAVITY, Vehicle
+from ..backend.decorators import jit
+from ..backend.primitives import maximum, minimum
+from ..vehicle.vehicle import GRAVITY, Vehicle
 
 ZERO_SLIP, MODEL, LIMITED = range(3)
 REFERENCES = ("zero-slip", "model", "limited")
-
-BETA_SCALE, GAMMA_SCALE, STEER_SCALE = 0.02, 0.1, 0.05
-EFFORT_WEIGHT, COST_CAP = 0.01, 100.0
 
 
 class Target(NamedTuple):
@@ -56,23 +53,3 @@ def reference(steer: Any, v: Any, target: Any, kind: int) -> Any:
         beta = minimum(maximum(beta, 0.0 - most_beta), most_beta)
         gamma = minimum(maximum(gamma, 0.0 - most_gamma), most_gamma)
     return beta, gamma
-
-
-@jit
-def cost_rate(e_beta: Any, e_gamma: Any, moment_share: Any, steer_added: Any, kind: int) -> Any:
-    """The cost per second of a tick, capped at 100.
-
-    c = (e_beta/0.02)^2 + (e_gamma/0.1)^2 + 0.01 (N_z/N_max)^2 + 0.01 (steer/0.05)^2
-    """
-    b, s = e_beta * (1.0 / BETA_SCALE), steer_added * (1.0 / STEER_SCALE)
-    c = b * b + EFFORT_WEIGHT * (moment_share * moment_share) + EFFORT_WEIGHT * (s * s)
-    if kind != ZERO_SLIP:
-        g = e_gamma * (1.0 / GAMMA_SCALE)
-        c = c + g * g
-    return minimum(absolute(c), COST_CAP)
-
-
-@jit
-def rest_of_cost(duration: Any, tick: Any) -> Any:
-    """What an episode of `duration` ticks costs besides where it fails: failing never pays."""
-    return COST_CAP * (duration - tick) * TICK

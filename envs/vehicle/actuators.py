@@ -3,7 +3,8 @@
 import math
 from typing import Any, NamedTuple
 
-from .backend import absolute, jit, maximum, minimum
+from ..backend.decorators import jit
+from ..backend.primitives import absolute, maximum, minimum
 
 
 class Lag(NamedTuple):

@@ -13,8 +13,9 @@ force, a_y = v_y' + v_x gamma + g phi, and a road banked by b adds g sin b.
 
 from typing import Any, NamedTuple
 
-from .backend import anywhere, inlined, jit, maximum, minimum, select
-from .elementary import atan2, sincos
+from ..backend.decorators import inlined, jit
+from ..backend.elementary import atan2, sincos
+from ..backend.primitives import anywhere, maximum, minimum, select
 from .tyres import SLOW, tyre_forces
 from .vehicle import GRAVITY
 

@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.linalg import expm
 
-from .backend import jit
+from ..backend.decorators import jit
 from .vehicle import GRAVITY, Vehicle
 
 if TYPE_CHECKING:

@@ -5,8 +5,9 @@ Scalar functions over tuples, without branches on values, as in `dynamics`.
 
 from typing import Any, NamedTuple
 
-from .backend import absolute, inlined, jit, maximum, minimum, sqrt
-from .elementary import atan, sincos
+from ..backend.decorators import inlined, jit
+from ..backend.elementary import atan, sincos
+from ..backend.primitives import absolute, maximum, minimum, sqrt
 from .vehicle import GRAVITY
 
 LINEAR, FIALA = 0, 1

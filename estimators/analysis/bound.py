@@ -14,14 +14,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..envs.linear import LinearModel, vision
-from ..envs.record import SLOW_NAMES, TICK, Record, SlowSensor
-from ..envs.vehicle import Vehicle
-from . import kalman
-from .make import make_estimator
-from .models import COURSE_SPEED, ROWS, states_for
-from .options import DISTURBANCE, NOISE
-from .schedule import whole_ticks
+from ...envs.record import SLOW_NAMES, Record, SlowSensor
+from ...envs.ticks import TICK
+from ...envs.vehicle.linear import LinearModel, vision
+from ...envs.vehicle.vehicle import Vehicle
+from ..design import kalman
+from ..design.models import COURSE_SPEED, ROWS, states_for
+from ..design.options import DISTURBANCE, NOISE
+from ..design.schedule import whole_ticks
+from ..make import make_estimator
 
 Array = npt.NDArray[np.float64]
 

@@ -14,17 +14,17 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..envs.record import CAMERA, FAST_WIDTH, PACKET, PACKET_WIDTH
-from .compiled import advance_entry, receive_entry
-from .core import begin_all
-from .delay import IGNORE
-from .estimates import Estimates, UnobservableWarning
-from .intersample import SPREAD
-from .matrices import covariance, matrix, square, vector
-from .memory import CORE, FILTER, INPUTS, ROWS
-from .spread import GAINS, RULES, frame_map, shares_of, write_shares
-from .stability import MARGINAL, spectral_radius, unobservable
-from .transition import GIVEN
+from ...envs.record import CAMERA, FAST_WIDTH, PACKET, PACKET_WIDTH
+from ..core.delay import IGNORE
+from ..core.entry import advance_entry, receive_entry
+from ..core.intersample import SPREAD
+from ..core.memory import CORE, FILTER, INPUTS, ROWS
+from ..core.run import begin_all
+from ..core.transition import GIVEN
+from ..design.checks import covariance, matrix, square, vector
+from ..design.dual_rate import GAINS, RULES, frame_map, shares_of, write_shares
+from ..design.error_map import MARGINAL, spectral_radius, unobservable
+from ..estimates import Estimates, UnobservableWarning
 
 Array = npt.NDArray[np.float64]
 

@@ -12,18 +12,18 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..envs.backend import jit
-from ..envs.record import FAST, PACKET, Log
-from .arrivals import receive
-from .core import tick
-from .delay import IGNORE
-from .estimates import Estimates
-from .estimator import Estimator
-from .intersample import NONE
-from .make import make_estimator
-from .memory import WINDOW
-from .schedule import whole_ticks
-from .step import read
+from ...envs.backend.decorators import jit
+from ...envs.record import FAST, PACKET, Log
+from ..core.delay import IGNORE
+from ..core.fast import read
+from ..core.intersample import NONE
+from ..core.memory import WINDOW
+from ..core.packets import receive
+from ..core.run import tick
+from ..design.schedule import whole_ticks
+from ..estimates import Estimates
+from ..estimator import Estimator
+from ..make import make_estimator
 
 Array = npt.NDArray[np.float64]
 

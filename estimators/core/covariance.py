@@ -6,7 +6,7 @@ a time, so that a gain is a division and not a matrix inverse.
 
 from typing import Any
 
-from ..envs.backend import jit
+from ...envs.backend.decorators import jit
 
 
 @jit

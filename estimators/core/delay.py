@@ -16,13 +16,12 @@ literal, lag: the model has late states that follow at every step, by one step (
 literally at 1 ms) or by a first-order lag of the delay. ignore: late samples are taken for fresh.
 """
 
-import math
 from typing import Any
 
-from ..envs.backend import jit
-from ..envs.record import GPS, SLOW_NAMES, SlowSensor
+from ...envs.backend.decorators import jit
+from ...envs.record import GPS
 from .covariance import clone_covariance, measure_state
-from .memory import COUNTERS, EVERY, FRAMES, RECENT, SEEN, SLOW, WIDTH, WINDOW
+from .memory import COUNTERS, SEEN, SLOW, WINDOW
 
 RULES = ("clone", "ignore", "stored", "constant", "larsen", "buffer", "literal", "lag")
 CLONE, IGNORE, STORED, CONSTANT, LARSEN, BUFFER = range(6)
@@ -36,77 +35,6 @@ HELD = -3
 def direct() -> int:
     """DIRECT, as a number: a literal argument would have every callee compiled once more."""
     return DIRECT
-
-
-def rule_code(rule: str) -> int:
-    """The number of a rule; "literal" and "lag" are models whose samples count as fresh."""
-    return IGNORE if rule in ("literal", "lag") else RULES.index(rule)
-
-
-def frames_held(sensor: SlowSensor, rule: str) -> int:
-    """Frames that must be held at once for the sensor's longest delay."""
-    if rule not in ("clone", "larsen"):
-        return 0
-    return math.ceil(sensor.longest_delay / sensor.period - 1e-9)
-
-
-def place_clones(f: Any, sensors: dict[str, SlowSensor], rule: str, who: str) -> None:
-    """Lay the clones of every sensor behind the states; ValueError if there are too many."""
-    f.late = rule_code(rule)
-    f.total = f.n
-    for name, sensor in sensors.items():
-        s, frames = SLOW_NAMES.index(name), frames_held(sensor, rule)
-        most = 1 if rule == "larsen" else FRAMES
-        if frames > most:
-            raise ValueError(
-                f"{who}: the {name} can be {sensor.longest_delay:g} s late, {frames} of its periods"
-                f" of {sensor.period:g} s; delay={rule!r} can hold {most}"
-            )
-        f.frames[s] = frames
-        if rule == "clone":
-            f.home[s] = f.total
-            f.total += frames * f.rows[s]
-    if rule == "larsen" and f.frames.sum() > 1:
-        raise ValueError(f"{who}: delay='larsen' is for one late sensor")
-    if f.total > WIDTH:
-        raise ValueError(
-            f"{who}: {f.n} states and {f.total - f.n} clones are more than there is room for "
-            f"({WIDTH}); delay='buffer' needs no clones"
-        )
-
-
-def check_window(f: Any, sensors: dict[str, SlowSensor], who: str) -> None:
-    """ValueError for a sensor that can be later than the filter's window, and for what a rule
-    cannot do."""
-    dt = float(f.step / f.stride)
-    if f.late == CONSTANT and f.assumed >= WINDOW:
-        raise ValueError(
-            f"{who}: assumed_delay of {f.assumed * dt:g} s is not within the window of "
-            f"{WINDOW * dt:g} s ({WINDOW} ticks)"
-        )
-    if f.late == LARSEN and (f.gate.any() or f.knots > 0):
-        raise ValueError(
-            f"{who}: delay='larsen' weighs a sample before it is here, so it takes no gate and no "
-            "hdop_table"
-        )
-    if f.late == BUFFER and f.pace > 1:
-        raise ValueError(f"{who}: delay='buffer' is for filters that listen at every tick")
-    if f.late not in (BUFFER, STORED):
-        return
-    window = WINDOW - EVERY if f.late == BUFFER else WINDOW - 1
-    kept = 0
-    for name, sensor in sensors.items():
-        if sensor.longest_delay > (window + 1e-6) * dt:
-            raise ValueError(
-                f"{who}: the {name} can be {sensor.longest_delay:g} s late; "
-                f"delay={RULES[f.late]!r} has a window of {window * dt:g} s ({window} ticks)"
-            )
-        kept += 2 + math.ceil((sensor.longest_delay + EVERY * dt) / sensor.period)
-    if f.late == BUFFER and kept > RECENT:
-        raise ValueError(
-            f"{who}: {kept} samples of {' and '.join(sensors)} can come within the longest delay; "
-            f"delay='buffer' keeps {RECENT}"
-        )
 
 
 @jit

@@ -7,9 +7,9 @@ import numba
 import numpy as np
 from numba.core.dispatcher import Dispatcher
 
-from ..envs.record import PACKET_WIDTH
-from .core import advance, receive_all, step_all
+from ...envs.record import PACKET_WIDTH
 from .memory import FILTER
+from .run import advance, receive_all, step_all
 
 
 def entry(function: Any, *example: Any) -> Any:

@@ -2,8 +2,9 @@
 
 from typing import Any
 
-from ..envs.backend import jit, maximum, minimum, sqrt
-from ..envs.record import GPS, PACKET
+from ...envs.backend.decorators import jit
+from ...envs.backend.primitives import maximum, minimum, sqrt
+from ...envs.record import GPS, PACKET
 from .covariance import project, project_clone
 from .delay import CLONE
 

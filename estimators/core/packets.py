@@ -4,14 +4,15 @@ from typing import Any
 
 import numpy as np
 
-from ..envs.backend import apart, floor, jit
-from ..envs.record import GPS, PACKET, PACKET_WIDTH
+from ...envs.backend.decorators import apart, jit
+from ...envs.backend.primitives import floor
+from ...envs.record import GPS, PACKET, PACKET_WIDTH
 from .delay import BUFFER, DROPPED, find, known
 from .innovation import SATELLITES
-from .measure import measure
 from .memory import COUNTERS, SLOW, WAITING
 from .rewind import take_late
 from .speed import finite
+from .update import measure
 
 
 @jit

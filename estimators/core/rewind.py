@@ -10,23 +10,14 @@ that it refuses leaves everything as it was.
 
 from typing import Any
 
-from ..envs.backend import apart, jit, maximum
-from ..envs.record import PACKET, PACKET_WIDTH
+from ...envs.backend.decorators import apart, jit
+from ...envs.backend.primitives import maximum
+from ...envs.record import PACKET, PACKET_WIDTH
 from .delay import direct
-from .measure import measure
-from .memory import (
-    COUNTERS,
-    EVERY,
-    FASTS,
-    INPUTS,
-    RECENT,
-    ROWS,
-    SLOW,
-    SNAPSHOTS,
-    WINDOW,
-)
-from .step import advance_state, correct_fast
+from .fast import advance_state, correct_fast
+from .memory import COUNTERS, EVERY, FASTS, INPUTS, RECENT, ROWS, SLOW, SNAPSHOTS, WINDOW
 from .transition import VELOCITY_ROLL, build
+from .update import measure
 
 _GONE = -1  # the captured tick of a place that is empty
 _NOW = SNAPSHOTS  # the snapshot of now, while the past is told

@@ -10,15 +10,16 @@ from typing import Any
 
 import numpy as np
 
-from ..envs.backend import apart, counted, jit, maximum, sqrt
-from ..envs.record import FAST, PACKET
-from .arrivals import receive, use_waiting
+from ...envs.backend.decorators import apart, counted, jit
+from ...envs.backend.primitives import maximum, sqrt
+from ...envs.record import FAST, PACKET
 from .delay import BUFFER, latch_due
-from .layers import pass_on
+from .fast import advance_state, correct_fast, read
 from .memory import COUNTERS, FRAMES, INPUTS, ROWS, SEEN, SLOW, WIDTH, WINDOW
+from .packets import receive, use_waiting
 from .rewind import forget, remember
+from .second_layer import pass_on
 from .speed import next_cell
-from .step import advance_state, correct_fast, read
 from .transition import build
 
 

@@ -2,12 +2,13 @@
 
 from typing import Any
 
-from ..envs.backend import jit, maximum
-from ..envs.elementary import sincos
-from ..envs.record import GPS, PACKET
-from .arrivals import receive_sample
+from ...envs.backend.decorators import jit
+from ...envs.backend.elementary import sincos
+from ...envs.backend.primitives import maximum
+from ...envs.record import GPS, PACKET
 from .innovation import HDOP, dilution
 from .memory import COUNTERS, WINDOW
+from .packets import receive_sample
 from .speed import finite
 
 SPEED = 1  # value of a GPS packet

@@ -2,7 +2,8 @@
 
 from typing import Any
 
-from ..envs.backend import absolute, jit, maximum, minimum
+from ...envs.backend.decorators import jit
+from ...envs.backend.primitives import absolute, maximum, minimum
 from .transition import SLOWEST
 
 LARGEST = 1e15  # of a number that a filter takes: below it, whole floats are exact as int

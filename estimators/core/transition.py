@@ -2,10 +2,11 @@
 
 from typing import Any
 
-from ..envs.backend import absolute, apart, jit, maximum
-from ..envs.linear import bicycle_coefficients
-from ..envs.record import GPS
-from ..envs.vehicle import GRAVITY
+from ...envs.backend.decorators import apart, jit
+from ...envs.backend.primitives import absolute, maximum
+from ...envs.record import GPS
+from ...envs.vehicle.linear import bicycle_coefficients
+from ...envs.vehicle.vehicle import GRAVITY
 from .memory import CORE, INPUTS
 
 LATERAL, ROLL, KINEMATIC, VELOCITY_ROLL, YAW, FORCES, GIVEN = range(7)

@@ -6,17 +6,17 @@ from typing import Any
 
 import numpy as np
 
-from ..envs.record import SLOW_NAMES, SlowSensor
-from .delay import CONSTANT, STORED
-from .intersample import NONE, PSEUDO, SPREAD
+from ...envs.record import SLOW_NAMES, SlowSensor
+from ..core.delay import CONSTANT, STORED
+from ..core.intersample import NONE, PSEUDO, SPREAD
+from ..core.transition import KINEMATIC, SLOWEST, VELOCITY_ROLL
+from ..filters import Filter
 from .kalman import gain
 from .models import SMOOTHING_TIME
 from .options import Options, gates, hdop_table
-from .papers import Filter
 from .periodic import measured_rows, slow_index
+from .request import Wish
 from .schedule import NO_SENSOR, Schedule, schedules, whole_ticks
-from .transition import KINEMATIC, SLOWEST, VELOCITY_ROLL
-from .wish import Wish
 
 FASTEST = 80.0  # m/s, of the tables of gains
 SPACING = 0.5  # m/s between them

@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from . import kalman
-from .intersample import inverse
-from .placed import observer_gain, whole
+from .pole_placement import observer_gain, whole
+from .pseudo_gains import inverse
 
 Array = npt.NDArray[np.float64]
 

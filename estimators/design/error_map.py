@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from .delay import CLONE, CONSTANT, STORED
-from .intersample import PSEUDO, SPREAD
+from ..core.delay import CLONE, CONSTANT, STORED
+from ..core.intersample import PSEUDO, SPREAD
+from .dual_rate import frame_map
 from .periodic import measured_rows, slow_index
-from .placed import whole
+from .pole_placement import whole
 from .schedule import Schedule
-from .spread import frame_map
 
 Array = npt.NDArray[np.float64]
 

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..envs.linear import roll
-from ..envs.record import CAMERA, FAST, GPS, SLOW_NAMES
-from ..envs.vehicle import Vehicle
-from .transition import FORCES, KINEMATIC, LATERAL, ROLL, VELOCITY_ROLL, YAW
+from ...envs.record import CAMERA, FAST, GPS, SLOW_NAMES
+from ...envs.vehicle.linear import roll
+from ...envs.vehicle.vehicle import Vehicle
+from ..core.transition import FORCES, KINEMATIC, LATERAL, ROLL, VELOCITY_ROLL, YAW
 
 Array = npt.NDArray[np.float64]
 

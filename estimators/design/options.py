@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.stats import chi2
 
-from .matrices import check_covariance
-from .memory import KNOTS, ROWS
+from ..core.memory import KNOTS, ROWS
+from .checks import check_covariance
 from .models import Model
 
 Array = npt.NDArray[np.float64]

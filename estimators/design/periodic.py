@@ -11,16 +11,18 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..envs.backend import absolute, jit, maximum
-from ..envs.record import SLOW_NAMES
-from .core import begin, tick
-from .covariance import measure_clone, measure_state
-from .delay import CLONE, DIRECT, DROPPED, IGNORE, find
-from .intersample import NONE, PSEUDO, SPREAD, constant_gain, inverse
-from .memory import Filters
-from .placed import place
+from ...envs.backend.decorators import jit
+from ...envs.backend.primitives import absolute, maximum
+from ...envs.record import SLOW_NAMES
+from ..core.covariance import measure_clone, measure_state
+from ..core.delay import CLONE, DIRECT, DROPPED, IGNORE, find
+from ..core.intersample import NONE, PSEUDO, SPREAD
+from ..core.memory import Filters
+from ..core.run import begin, tick
+from .dual_rate import shares
+from .pole_placement import place
+from .pseudo_gains import constant_gain, inverse
 from .schedule import Schedule
-from .spread import shares
 
 Array = npt.NDArray[np.float64]
 

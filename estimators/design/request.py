@@ -3,12 +3,13 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from ..envs.record import SLOW_NAMES, SlowSensor
-from . import intersample, spread
-from .delay import RULES
+from ...envs.record import SLOW_NAMES, SlowSensor
+from ..core.delay import RULES
+from ..filters import Filter
+from . import dual_rate as spread
 from .models import MODELS, Model, bicycle_model
 from .options import Options, poles_of
-from .papers import Filter
+from .pseudo_gains import INVERSES
 
 
 @dataclass(frozen=True)
@@ -68,7 +69,7 @@ def wish_of(name: str, row: Filter, used: tuple[str, ...], told: Options) -> Wis
     between = "hold"
     if row.intersample == "single-rate":
         between = told.one_of("between", "hold", ("hold", "predict"))
-    inverse = told.one_of("inverse", intersample.INVERSES[0], intersample.INVERSES)
+    inverse = told.one_of("inverse", INVERSES[0], INVERSES)
     late = told.one_of("delay", row.delay, RULES)
     assumed = told.positive("assumed_delay", 0.033) if late == "constant" else 0.0
     poles = poles_of(name, row.poles, told) if placed or gains == "placed" else ()

@@ -7,13 +7,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..envs.record import FAST_WIDTH, PACKET_WIDTH, TICK, Log, Record, SlowSensor
-from ..envs.vehicle import COMS, Vehicle, vehicle_from
-from .batched import batch_entry, nothing_observed
+from ...envs.record import FAST_WIDTH, PACKET_WIDTH, Log, Record, SlowSensor
+from ...envs.ticks import TICK
+from ...envs.vehicle.vehicle import COMS, Vehicle, vehicle_from
+from ..core.memory import FILTER, Counters
+from ..estimates import Estimates
+from ..estimator import Estimator
 from .designs import Designs, Told
-from .estimates import Estimates
-from .estimator import Estimator
-from .memory import FILTER, Counters
+from .kernel import batch_entry, nothing_observed
 
 Array = npt.NDArray[np.float64]
 Whole = npt.NDArray[np.int64]

@@ -12,17 +12,16 @@ from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
-from ..envs.layout import Entry
-from ..envs.vehicle import Vehicle, vehicle_from
+from ...envs.task.observation import Entry
+from ...envs.vehicle.vehicle import Vehicle, vehicle_from
+from ..wrappers.estimate import TRUTH, usual_estimator
+from ..wrappers.estimate import EstimateObservation as Single
+from ..wrappers.outputs import BETA, NEES, outputs_of
+from ..wrappers.truth import as_built, tell_stiffness
 from .batch import BatchEstimator
 from .designs import Told
-from .outputs import BETA, NEES, outputs_of
 from .records import Batch, BatchedRecords, SyncRecords, records_of, true_vehicles
-from .truth import as_built, tell_stiffness
-from .truth_vector import TruthObservation as TruthObservation
-from .twin import twin_spec
-from .wrappers import TRUTH, usual_estimator
-from .wrappers import EstimateObservation as Single
+from .spec import twin_spec
 
 Observations = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]

@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from ..envs.backend import counted, maximum
-from .compiled import entry
-from .memory import FILTER
-from .observing import observe
+from ...envs.backend.decorators import counted
+from ...envs.backend.primitives import maximum
+from ..core.entry import entry
+from ..core.memory import FILTER
+from ..wrappers.kernel import observe
 
 
 @counted

@@ -7,11 +7,11 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv, VectorEnv
 
-from ..envs.layout import Entry
-from ..envs.record import FAST_WIDTH, PACKET_WIDTH, SlowSensor
-from ..envs.vehicle import Vehicle
+from ...envs.record import FAST_WIDTH, PACKET_WIDTH, SlowSensor
+from ...envs.task.observation import Entry
+from ...envs.vehicle.vehicle import Vehicle
+from ..wrappers.estimate import base_of
 from .designs import Told
-from .wrappers import base_of
 
 Array = npt.NDArray[np.float64]
 Whole = npt.NDArray[np.int64]

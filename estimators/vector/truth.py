@@ -11,10 +11,10 @@ from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
+from ..wrappers.truth import STIFFNESSES, parameters_of, truth_entries
+from ..wrappers.truth import TruthObservation as Single
 from .records import true_vehicles
-from .truth import STIFFNESSES, parameters_of, truth_entries
-from .truth import TruthObservation as Single
-from .twin import twin_spec
+from .spec import twin_spec
 
 Observations = npt.NDArray[np.float32]
 

@@ -9,11 +9,11 @@ import numpy.typing as npt
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker
 
-from ..envs.layout import Entry
-from ..envs.vehicle import Vehicle, vehicle_from
-from .estimator import Estimator
-from .make import make_estimator
-from .observing import observe_entry
+from ...envs.task.observation import Entry
+from ...envs.vehicle.vehicle import Vehicle, vehicle_from
+from ..estimator import Estimator
+from ..make import make_estimator
+from .kernel import observe_entry
 from .outputs import BETA, outputs_of
 from .truth import as_built, tell_stiffness
 

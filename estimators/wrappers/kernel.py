@@ -5,11 +5,12 @@ from typing import Any
 
 import numpy as np
 
-from ..envs.backend import apart, jit, maximum, minimum
-from ..envs.elementary import wrap
-from .compiled import entry
-from .core import advance, covariance_of, deviation
-from .memory import FILTER
+from ...envs.backend.decorators import apart, jit
+from ...envs.backend.elementary import wrap
+from ...envs.backend.primitives import maximum, minimum
+from ..core.entry import entry
+from ..core.memory import FILTER
+from ..core.run import advance, covariance_of, deviation
 
 
 @jit

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..envs.layout import Entry
-from .models import UNITS
+from ...envs.task.observation import Entry
+from ..design.models import UNITS
 
 BOUNDS = {
     "beta": np.pi / 2.0,

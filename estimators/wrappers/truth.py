@@ -9,9 +9,9 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.utils import RecordConstructorArgs
 
-from ..envs.layout import Entry
-from ..envs.vehicle import Vehicle
-from .estimator import Estimator
+from ...envs.task.observation import Entry
+from ...envs.vehicle.vehicle import Vehicle
+from ..estimator import Estimator
 
 STIFFNESSES = ("front_stiffness", "rear_stiffness")
 LARGEST = 1e7  # of any parameter of a vehicle, SI

@@ -10,9 +10,9 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 import sideslip
 from sideslip.agents import AGENTS, make_agent
-from sideslip.agents.informed import PARAMETERS
+from sideslip.agents.controllers.informed import PARAMETERS
 from sideslip.estimators import EstimateObservation
-from sideslip.estimators.truth import TruthObservation
+from sideslip.estimators.wrappers.truth import TruthObservation
 from tests.envs.helpers import bits
 
 STATES = ["beta", "gamma", "d1", "d2"]

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import pytest
 
-from sideslip.benchmarks import cli
+from sideslip.benchmarks.cli import main as cli
 
 Run = Callable[..., tuple[int, str, str]]
 

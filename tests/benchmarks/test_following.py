@@ -5,7 +5,7 @@ import pytest
 
 from sideslip.benchmarks.following import BANDWIDTHS, KEEPERS, Case, follow, keep_lane, loop_radius
 from sideslip.envs import COMS
-from sideslip.envs.linear import bicycle
+from sideslip.envs.vehicle.linear import bicycle
 
 
 def test_a_slow_loop_has_the_poles_of_its_design() -> None:

@@ -11,18 +11,18 @@ import pytest
 
 import sideslip
 from sideslip.agents import make_agent
-from sideslip.agents.network import Network
-from sideslip.agents.policy_card import Card
-from sideslip.agents.policy_file import load_policy, save_policy, shipped
-from sideslip.agents.schedule import gain_table
-from sideslip.benchmarks import control
-from sideslip.benchmarks.enjoy import enjoy, evaluate, evaluation, suite_of
-from sideslip.benchmarks.matrix import seeds
-from sideslip.benchmarks.matrix.contest import estimate_options, make_contest
-from sideslip.benchmarks.matrix.contestants import LEARNED, MANOEUVRES, STEERING, YAW, Cell, cells
-from sideslip.benchmarks.matrix.drive import Chunk
-from sideslip.benchmarks.matrix.kept import Kept
-from sideslip.benchmarks.matrix.seeds import salt_of, salted_seeds
+from sideslip.agents.design.gain_schedule import gain_table
+from sideslip.agents.learned.card import Card
+from sideslip.agents.learned.files import load_policy, save_policy, shipped
+from sideslip.agents.learned.network import Network
+from sideslip.benchmarks.control import seeds
+from sideslip.benchmarks.control import suite as control
+from sideslip.benchmarks.control.build import estimate_options, make_contest
+from sideslip.benchmarks.control.cache import Kept
+from sideslip.benchmarks.control.cells import LEARNED, MANOEUVRES, STEERING, YAW, Cell, cells
+from sideslip.benchmarks.control.episodes import Chunk
+from sideslip.benchmarks.control.seeds import salt_of, salted_seeds
+from sideslip.benchmarks.policies import enjoy, evaluate, evaluation, suite_of
 from tests.benchmarks.conftest import Run
 
 SHORT = {"base": "random-steering", "duration": 1.5}

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from sideslip.benchmarks import estimation
-from sideslip.benchmarks.cases import run_cases
+from sideslip.benchmarks.harness.parallel import run_cases
 
 
 def _ratio(squares: np.ndarray, of: int, to: int) -> float:

@@ -7,7 +7,8 @@ import gymnasium
 import numpy as np
 import pytest
 
-from sideslip.envs import FAILURES, StabilityEnv, kernel
+from sideslip.envs import FAILURES, StabilityEnv
+from sideslip.envs.engine import step as kernel
 
 from .helpers import LINEAR, bits, play
 

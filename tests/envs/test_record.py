@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from sideslip.envs import COMS, Log, Record, SlowSensor, StabilityEnv
-from sideslip.envs.dynamics import Motion, Push, Road, rk4
-from sideslip.envs.layout import Z
+from sideslip.envs.engine.layout import Z
+from sideslip.envs.engine.packing import car_of
 from sideslip.envs.record import (
     FAST,
     FAST_UNITS,
@@ -15,14 +15,14 @@ from sideslip.envs.record import (
     PACKET_WIDTH,
     SLOW_NAMES,
     SLOW_VALUES,
-    TICK,
     VALUES,
     Fast,
     concatenate,
 )
-from sideslip.envs.template import car_of
-from sideslip.envs.tyres import LINEAR as LINEAR_TYRES
-from sideslip.envs.tyres import Inputs, load_of
+from sideslip.envs.ticks import TICK
+from sideslip.envs.vehicle.dynamics import Motion, Push, Road, rk4
+from sideslip.envs.vehicle.tyres import LINEAR as LINEAR_TYRES
+from sideslip.envs.vehicle.tyres import Inputs, load_of
 
 from .helpers import IDS, LINEAR, bits, play, unwrapped
 

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from scipy.linalg import expm, solve_triangular
 
-from sideslip.envs.linear import vision
 from sideslip.envs.record import FAST, FAST_WIDTH, PACKET, PACKET_WIDTH, SLOW_NAMES, Record
-from sideslip.envs.vehicle import COMS
+from sideslip.envs.vehicle.linear import vision
+from sideslip.envs.vehicle.vehicle import COMS
 
 STATES = ("beta", "gamma", "psi", "y_l")
 PUSHED = {"d1": 0, "d2": 1, "d3": 2}

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from sideslip.envs import Log, SlowSensor, StabilityEnv
-from sideslip.envs.linear import LinearModel, vision
 from sideslip.envs.record import FAST, PACKET, Record, concatenate
-from sideslip.envs.scenario import Scenario
-from sideslip.envs.sensors import Noise
+from sideslip.envs.scenarios.scenario import Scenario
+from sideslip.envs.sensors.noise import Noise
+from sideslip.envs.vehicle.linear import LinearModel, vision
 
 STATES = ("beta", "gamma", "psi", "y_l", "F_d", "N_d")
 _PERFECT: dict[str, Any] = {

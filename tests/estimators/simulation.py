@@ -10,7 +10,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import lfilter
 
-from sideslip.envs.linear import LinearModel, vision
 from sideslip.envs.record import (
     FAST,
     FAST_WIDTH,
@@ -21,7 +20,8 @@ from sideslip.envs.record import (
     Record,
     SlowSensor,
 )
-from sideslip.envs.vehicle import COMS, GRAVITY, Vehicle
+from sideslip.envs.vehicle.linear import LinearModel, vision
+from sideslip.envs.vehicle.vehicle import COMS, GRAVITY, Vehicle
 
 KMH = 1.0 / 3.6
 CAMERA = SlowSensor(period=0.033, delays=(0.030,))

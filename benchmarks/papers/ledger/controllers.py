@@ -6,10 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from ...agents import make_agent
-from ...agents.rollout import rollout
-from .. import tracking
-from . import lane_change
+from ....agents import make_agent
+from ....agents.rollout import rollout
+from . import lane_change, tracking
 from .claim import Array, Example, Measured
 from .simulations import FIRST, Numbers, chunked, rms, stacked
 

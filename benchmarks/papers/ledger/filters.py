@@ -8,12 +8,13 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from ...agents.rollout import rollout
-from ...envs.manoeuvres import scenario_from
-from ...envs.record import PACKET, Log
-from ...envs.vehicle import Vehicle
-from ...estimators import UnobservableWarning, make_estimator
-from ...estimators.bound import bound
+from ....agents.rollout import rollout
+from ....envs.record import PACKET, Log
+from ....envs.scenarios.manoeuvres import scenario_from
+from ....envs.vehicle.vehicle import Vehicle
+from ....estimators.analysis.bound import bound
+from ....estimators.estimates import UnobservableWarning
+from ....estimators.make import make_estimator
 from .claim import Array, Example, Measured
 from .simulations import FIRST, Numbers, chunked, rms, stacked
 

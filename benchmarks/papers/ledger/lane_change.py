@@ -5,8 +5,8 @@ from typing import Any
 
 import gymnasium as gym
 
-from ...envs import scenario_from
-from ...estimators import EstimateObservation
+from ....envs.scenarios.manoeuvres import scenario_from
+from ....estimators.wrappers.estimate import EstimateObservation
 
 ENV_ID = "sideslip/YawVision-v0"
 

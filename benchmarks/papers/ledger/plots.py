@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ...envs.record import PACKET
+from ....envs.record import PACKET
 from .claim import Array, Example
 
 Draw = Callable[[Example], Any]
@@ -33,7 +33,7 @@ def curves(
     """A signal of everybody (or of those named) over time. window: s, of the time axis."""
 
     def draw(example: Example) -> Any:
-        from ..figures import time_series
+        from ...report.figures import time_series
 
         shown = [name for name in who or example.curves if signal in example.curves.get(name, {})]
         inside = _inside(example.time, window)
@@ -47,7 +47,7 @@ def loops(y_label: str) -> Draw:
     """Open loops over frequency in Hz, on a logarithmic axis."""
 
     def draw(example: Example) -> Any:
-        from ..figures import time_series
+        from ...report.figures import time_series
 
         series = {name: signals["magnitude"] for name, signals in example.curves.items()}
         figure = time_series("", example.time, series, y_label, "frequency / Hz")
@@ -62,7 +62,7 @@ def course(y_label: str, who: Sequence[str], window: tuple[float, float] | None 
     """The course psi + beta: the truth, the receiver's samples and each filter's."""
 
     def draw(example: Example) -> Any:
-        from ..figures import time_series
+        from ...report.figures import time_series
 
         inside = _inside(example.time, window)
         series = {name: example.curves[name]["psi"] + example.curves[name]["beta"] for name in who}
@@ -95,7 +95,7 @@ def measured_offset(y_label: str, who: Sequence[str], window: tuple[float, float
     """The lateral offset: truth, the camera's held late samples, and each filter's."""
 
     def draw(example: Example) -> Any:
-        from ..figures import time_series
+        from ...report.figures import time_series
 
         inside = _inside(example.time, window)
         series = {name: example.curves[name]["y_l"][inside] for name in who}
@@ -107,7 +107,7 @@ def measured_offset(y_label: str, who: Sequence[str], window: tuple[float, float
 
 def delays(example: Example) -> Any:
     """The delay of the newest frame over the time of its capture, for the first second."""
-    from ..figures import time_series
+    from ...report.figures import time_series
 
     packets = example.packets["camera"]
     late = np.full(len(example.time), np.nan)

@@ -9,10 +9,11 @@ import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 
-from ..agents import make_agent
-from ..agents.rollout import Rollout, rollout
-from ..envs.scenario import Scenario
-from ..estimators import EstimateObservation, UnobservableWarning
+from ....agents import make_agent
+from ....agents.rollout import Rollout, rollout
+from ....envs.scenarios.scenario import Scenario
+from ....estimators.estimates import UnobservableWarning
+from ....estimators.wrappers.estimate import EstimateObservation
 
 Array = npt.NDArray[np.float64]
 Manoeuvre = str | Mapping[str, Any] | Scenario

@@ -5,15 +5,16 @@ import math
 import numpy as np
 from scipy.linalg import expm
 
-from ...envs.linear import course
-from ...envs.scenario import KMH
-from ...envs.vehicle import COMS
-from ...estimators import kalman, spread
+from ....envs.scenarios.draws import KMH
+from ....envs.vehicle.linear import course
+from ....envs.vehicle.vehicle import COMS
+from ....estimators.design import dual_rate as spread
+from ....estimators.design import kalman
+from ..ledger.claim import Array, Bound, Claim, Measured, Part, number
+from ..ledger.plots import PaperFigure
+from ..ledger.simulations import Analysis
 from . import error_maps
-from .claim import Array, Bound, Claim, Measured, Part, number
-from .draw import PaperFigure
 from .observability import coms_ranks
-from .simulations import Analysis
 
 PAPER = "dual-rate"
 MAPS, GAINS, RANKS = "dual-rate-maps", "dual-rate-gains", "dual-rate-rank"

@@ -7,7 +7,7 @@ error X~_{k|k-1} at the sample, without noise.
 import numpy as np
 import numpy.typing as npt
 
-from ...estimators import spread
+from ....estimators.design import dual_rate as spread
 
 Array = npt.NDArray[np.float64]
 

@@ -5,8 +5,8 @@ from fractions import Fraction
 
 import numpy as np
 
-from ...envs.vehicle import COMS, Vehicle
-from .claim import Measured
+from ....envs.vehicle.vehicle import COMS, Vehicle
+from ..ledger.claim import Measured
 
 Matrix = list[list[Fraction]]
 SPEED = Fraction(125, 18)  # m/s, 25 km/h

@@ -11,7 +11,7 @@ from functools import reduce
 
 import numpy as np
 
-from .claim import Array, Measured
+from ..ledger.claim import Array, Measured
 
 STEPS = 6
 STATES, OUTPUTS = 4, 3

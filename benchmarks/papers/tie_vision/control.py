@@ -5,18 +5,18 @@ import math
 import gymnasium as gym
 import numpy as np
 
-from ...agents import make_agent
-from ...agents.loops import PRINTED, Found, LoopDesign, estimator_loop, plain_loop, search
-from ...agents.margins import margins
-from ...agents.rollout import rollout
-from ...agents.two_dof import CAMERA_PERIOD
-from ...envs.record import TICK
-from ...envs.scenario import KMH
-from ...envs.vehicle import COMS
-from .claim import Bound, Claim, Example, Measured, Part, number, ratio, smaller
-from .controlled import Slip
-from .draw import PaperFigure, curves, loops
-from .simulations import Analysis
+from ....agents import make_agent
+from ....agents.controllers.two_dof import CAMERA_PERIOD
+from ....agents.rollout import rollout
+from ....envs.scenarios.draws import KMH
+from ....envs.ticks import TICK
+from ....envs.vehicle.vehicle import COMS
+from ..ledger.claim import Bound, Claim, Example, Measured, Part, number, ratio, smaller
+from ..ledger.controllers import Slip
+from ..ledger.plots import PaperFigure, curves, loops
+from ..ledger.simulations import Analysis
+from .margins import margins
+from .table_two import PRINTED, Found, LoopDesign, estimator_loop, plain_loop, search
 
 PAPER = "tie-vision"
 FIG8, STIFF, FIG10 = "tie-vision-fig8", "tie-vision-fig8-stiff", "tie-vision-fig10"

@@ -9,16 +9,17 @@ the frame.
 import numpy as np
 from scipy.linalg import solve_discrete_are
 
-from ...envs.linear import vision
-from ...envs.scenario import KMH
-from ...envs.sensor_sets import CAMERA_33_30
-from ...envs.vehicle import COMS
-from ...estimators import kalman, make_estimator
-from . import error_maps
-from .claim import Array, Bound, Claim, Example, Measured, Part, number
-from .draw import PaperFigure, curves
-from .simulations import FIRST, Analysis
-from .tie_vision_appendix import residuals
+from ....envs.scenarios.draws import KMH
+from ....envs.sensors.sets import CAMERA_33_30
+from ....envs.vehicle.linear import vision
+from ....envs.vehicle.vehicle import COMS
+from ....estimators.design import kalman
+from ....estimators.make import make_estimator
+from ..ledger.claim import Array, Bound, Claim, Example, Measured, Part, number
+from ..ledger.plots import PaperFigure, curves
+from ..ledger.simulations import FIRST, Analysis
+from ..theory import error_maps
+from .appendix import residuals
 
 PAPER = "tie-vision"
 MAPS, TUNINGS, APPENDIX = "tie-vision-maps", "tie-vision-tunings", "tie-vision-appendix"

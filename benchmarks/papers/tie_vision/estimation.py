@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from .claim import Bound, Claim, Measured, Part, over_others, ratio, smaller
-from .draw import PaperFigure, curves
-from .estimation import Estimation, Filter
+from ..ledger.claim import Bound, Claim, Measured, Part, over_others, ratio, smaller
+from ..ledger.filters import Estimation, Filter
+from ..ledger.plots import PaperFigure, curves
 
 PAPER = "tie-vision"
 FIG7, FIG9 = "tie-vision-fig7", "tie-vision-fig9"

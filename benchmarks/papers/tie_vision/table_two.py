@@ -16,14 +16,14 @@ import numpy as np
 import numpy.typing as npt
 from scipy.linalg import solve_discrete_are
 
-from ..envs.linear import bicycle, vision
-from ..envs.record import TICK
-from ..envs.scenario import KMH
-from ..envs.vehicle import Vehicle
-from ..estimators.kalman import gain
+from ....agents.controllers.two_dof import CAMERA_PERIOD
+from ....agents.design.pi import PI, PLACEMENTS, POLE, design_pi
+from ....envs.scenarios.draws import KMH
+from ....envs.ticks import TICK
+from ....envs.vehicle.linear import bicycle, vision
+from ....envs.vehicle.vehicle import Vehicle
+from ....estimators.design.kalman import gain
 from .margins import Margins, margins
-from .pi import PI, PLACEMENTS, POLE, design_pi
-from .two_dof import CAMERA_PERIOD
 
 if TYPE_CHECKING:
     from control import StateSpace

@@ -5,7 +5,7 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-from ...envs.vehicle import Vehicle, vehicle_from_file_values
+from ....envs.vehicle.vehicle import Vehicle, vehicle_from_file_values
 
 _HERE = Path(__file__).parent
 

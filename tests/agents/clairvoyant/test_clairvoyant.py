@@ -8,26 +8,21 @@ import numpy as np
 import pytest
 
 import sideslip
-from sideslip.envs.actuators import distribute
-from sideslip.envs.layout import P, Z
-from sideslip.envs.programme import Wind, wind_at
+from sideslip.envs.engine.layout import P, Z
+from sideslip.envs.scenarios.wind import Wind, wind_at
+from sideslip.envs.vehicle.actuators import distribute
 from sideslip.estimators import EstimateObservation
 
 ca = pytest.importorskip("casadi")
 pytest.importorskip("osqp")
-from sideslip.agents import clairvoyant, clairvoyant_nonlinear, make_agent  # noqa: E402
-from sideslip.agents.clairvoyant import (  # noqa: E402
-    Replay,
-    actions_of,
-    ceiling,
-    drive,
-    plan,
-    replay,
-)
-from sideslip.agents.foreseen import Known, State, foresee  # noqa: E402
-from sideslip.agents.foreseen_plant import advance  # noqa: E402
+from sideslip.agents import make_agent  # noqa: E402
+from sideslip.agents.clairvoyant import plan as clairvoyant  # noqa: E402
+from sideslip.agents.clairvoyant import shooting as clairvoyant_nonlinear  # noqa: E402
+from sideslip.agents.clairvoyant.foresight import Known, State, foresee  # noqa: E402
+from sideslip.agents.clairvoyant.plan import Replay, actions_of, ceiling, drive, plan, replay  # noqa: E402
+from sideslip.agents.clairvoyant.plant import advance  # noqa: E402
 from sideslip.agents.rollout import rollout  # noqa: E402
-from sideslip.agents.symbolic import symbolic  # noqa: E402
+from sideslip.envs.backend.on_casadi import symbolic  # noqa: E402
 
 assert sideslip.__version__
 ID = "sideslip/YawFusion-v0"

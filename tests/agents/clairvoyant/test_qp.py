@@ -10,7 +10,7 @@ import sideslip
 
 pytest.importorskip("casadi")
 pytest.importorskip("osqp")
-from sideslip.agents.clairvoyant import plan, replay
+from sideslip.agents.clairvoyant.plan import plan, replay
 
 assert sideslip.__version__
 

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from sideslip.agents import make_agent
-from sideslip.agents.esc import yaw_gains
+from sideslip.agents.controllers.esc import yaw_gains
 from sideslip.envs import COMS, PASSENGER_CAR, critical_speed
-from sideslip.envs.linear import bicycle
+from sideslip.envs.vehicle.linear import bicycle
 from sideslip.estimators import EstimateObservation
 
 T = 0.01

@@ -9,15 +9,15 @@ import pytest
 from gymnasium.vector import SyncVectorEnv
 
 from sideslip.agents import make_agent
-from sideslip.agents.design_model import design_model, regulator
-from sideslip.agents.informed import GRIP, OUTPUTS, PARAMETERS, levels_of, make_informed
-from sideslip.agents.lqr import Lqr
+from sideslip.agents.controllers.informed import GRIP, OUTPUTS, PARAMETERS, levels_of, make_informed
+from sideslip.agents.controllers.lqr import Lqr
+from sideslip.agents.design.sampled_model import design_model, regulator
 from sideslip.envs import COMS
-from sideslip.envs.manoeuvres import SCENARIOS
+from sideslip.envs.scenarios.manoeuvres import SCENARIOS
 from sideslip.estimators import EstimateObservation, make_estimator
-from sideslip.estimators import vector as vectorised
-from sideslip.estimators.truth import TruthObservation
-from sideslip.estimators.truth_vector import TruthObservation as VectorTruthObservation
+from sideslip.estimators.vector import estimate as vectorised
+from sideslip.estimators.vector.truth import TruthObservation as VectorTruthObservation
+from sideslip.estimators.wrappers.truth import TruthObservation
 from tests.envs.helpers import bits
 
 FUSION = "sideslip/YawFusion-v0"

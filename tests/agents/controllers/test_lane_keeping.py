@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from sideslip.agents import make_agent
-from sideslip.agents.design_model import optimal
-from sideslip.agents.lane_keeping import HASTE, MOVED, LaneKeeping, lane_model
-from sideslip.agents.schedule import SPEEDS
+from sideslip.agents.controllers.lane_keeping import HASTE, MOVED, LaneKeeping, lane_model
+from sideslip.agents.design.gain_schedule import SPEEDS
+from sideslip.agents.design.sampled_model import optimal
 from sideslip.envs import COMS
 from sideslip.estimators import EstimateObservation
 

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 
 from sideslip.agents import Lqr, make_agent
-from sideslip.agents.design_model import (
+from sideslip.agents.design.gain_schedule import SPEEDS
+from sideslip.agents.design.sampled_model import (
     DYNAMIC,
     Purpose,
     closed_loop,
     design_model,
     regulator,
 )
-from sideslip.agents.schedule import SPEEDS
 from sideslip.envs import COMS, PASSENGER_CAR
-from sideslip.envs.reference import MODEL, ZERO_SLIP, reference, target_of
+from sideslip.envs.task.reference import MODEL, ZERO_SLIP, reference, target_of
 from sideslip.estimators import EstimateObservation
 
 SMALL = {

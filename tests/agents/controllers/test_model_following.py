@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from sideslip.agents import make_agent
-from sideslip.agents.model_following import ModelFollowing, feedback_gains
+from sideslip.agents.controllers.model_following import ModelFollowing, feedback_gains
 from sideslip.envs import COMS, critical_speed
-from sideslip.envs.linear import LinearModel, bicycle
-from sideslip.envs.reference import MODEL, reference, target_of
+from sideslip.envs.task.reference import MODEL, reference, target_of
+from sideslip.envs.vehicle.linear import LinearModel, bicycle
 from sideslip.estimators import EstimateObservation
 
 V = 25.0 / 3.6

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from sideslip.agents import make_agent
-from sideslip.agents.lqr import Lqr
-from sideslip.agents.mpc import NOT_FINITE, Mpc
-from sideslip.agents.schedule import SPEEDS
+from sideslip.agents.controllers.lqr import Lqr
+from sideslip.agents.controllers.mpc import NOT_FINITE, Mpc
+from sideslip.agents.design.gain_schedule import SPEEDS
 from sideslip.envs import COMS
 from sideslip.estimators import EstimateObservation
 from tests.envs.helpers import bits

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from sideslip.agents import make_agent
-from sideslip.agents.sliding_mode import SlidingMode, surface
+from sideslip.agents.controllers.sliding_mode import SlidingMode, surface
 from sideslip.envs import COMS, critical_speed
-from sideslip.envs.linear import bicycle
+from sideslip.envs.vehicle.linear import bicycle
 from sideslip.estimators import EstimateObservation
 
 T = 0.01

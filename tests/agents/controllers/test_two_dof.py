@@ -10,10 +10,10 @@ import pytest
 
 import sideslip
 from sideslip.agents import make_agent
-from sideslip.agents.pi import COMS_PI, POLE, design_pi, sample_pi
-from sideslip.agents.two_dof import feedforward_gain
+from sideslip.agents.controllers.two_dof import feedforward_gain
+from sideslip.agents.design.pi import COMS_PI, POLE, design_pi, sample_pi
 from sideslip.envs import COMS, PASSENGER_CAR
-from sideslip.envs.linear import bicycle
+from sideslip.envs.vehicle.linear import bicycle
 from sideslip.estimators import EstimateObservation
 
 KMH = 1 / 3.6

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sideslip.agents.within import best_within
+from sideslip.agents.controllers.lqr import best_within
 
 
 @pytest.mark.parametrize("seed", range(30))

@@ -16,9 +16,9 @@ import pytest
 from safetensors import safe_open
 from safetensors.numpy import save_file
 
-from sideslip.agents.network import Network
-from sideslip.agents.policy_card import Card
-from sideslip.agents.policy_file import FORMAT, load_policy, save_policy, shipped
+from sideslip.agents.learned.card import Card
+from sideslip.agents.learned.files import FORMAT, load_policy, save_policy, shipped
+from sideslip.agents.learned.network import Network
 
 pytestmark = pytest.mark.plain
 CARD = Card(
@@ -105,7 +105,7 @@ def test_a_kill_during_a_save_keeps_the_old_file(file: Path) -> None:
     before = file.read_bytes()
     code = (
         "import os, signal, sys\n"
-        "from sideslip.agents.policy_file import load_policy, save_policy\n"
+        "from sideslip.agents.learned.files import load_policy, save_policy\n"
         "policy = load_policy(sys.argv[1])\n"
         "os.fsync = lambda _: os.kill(os.getpid(), signal.SIGKILL)\n"
         "save_policy(sys.argv[1], policy.network.reading(policy.reads), policy.card)\n"

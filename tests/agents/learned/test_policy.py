@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from sideslip.agents import Learned, make_agent
-from sideslip.agents.network import Network
-from sideslip.agents.policy_card import Card
-from sideslip.agents.policy_file import Policy, save_policy
+from sideslip.agents.learned.card import Card
+from sideslip.agents.learned.files import Policy, save_policy
+from sideslip.agents.learned.network import Network
 from sideslip.estimators import EstimateObservation
 
 VISION, FUSION, STEERING = (

@@ -9,7 +9,7 @@ import pytest
 from gymnasium import spaces
 
 import sideslip  # noqa: F401  registers the ids
-from sideslip.agents.from_sb3 import network_from_sb3
+from sideslip.agents.training.export import network_from_sb3
 
 stable_baselines3 = pytest.importorskip("stable_baselines3")
 import torch  # noqa: E402

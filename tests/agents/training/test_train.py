@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.agents.costs import costs_of
-from sideslip.agents.learned import Learned
+from sideslip.agents.learned.policy import Learned
+from sideslip.agents.rollout import costs_of
 from sideslip.envs.vector import StabilityVectorEnv
 
 pytest.importorskip("stable_baselines3")
@@ -24,13 +24,13 @@ from safetensors.torch import save
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sideslip.agents import train
-from sideslip.agents.algorithms import ALGORITHMS
-from sideslip.agents.checkpoint import read_told
-from sideslip.agents.from_sb3 import network_from_sb3
-from sideslip.agents.scaling import CLIP, Standardised, measured
-from sideslip.agents.train import BEST, CHECKPOINT, CURVE, POLICY, Progress, Task, task_in
-from sideslip.agents.vec_env import make_vec_env
+from sideslip.agents.training import train
+from sideslip.agents.training.algorithms import ALGORITHMS
+from sideslip.agents.training.checkpoint import read_told
+from sideslip.agents.training.export import network_from_sb3
+from sideslip.agents.training.normalise import CLIP, Standardised, measured
+from sideslip.agents.training.train import BEST, CHECKPOINT, CURVE, POLICY, Progress, Task, task_in
+from sideslip.agents.vec_env.env import make_vec_env
 
 TINY = Task(num_envs=8, env_options={"scenario": "sine-with-dwell"}, seed=3)
 ROLLOUT = 256  # steps of 8 environments

@@ -12,7 +12,7 @@ import pytest
 from sideslip.agents import make_agent
 from sideslip.envs import SCENARIOS, StabilityVectorEnv
 from sideslip.estimators import EstimateObservation
-from sideslip.estimators.truth import TruthObservation
+from sideslip.estimators.wrappers.truth import TruthObservation
 
 pytest.importorskip("stable_baselines3")
 from stable_baselines3 import PPO
@@ -25,7 +25,7 @@ from stable_baselines3.common.vec_env import (
     VecNormalize,
 )
 
-from sideslip.agents.vec_env import NOTHING, NativeVecEnv, make_vec_env
+from sideslip.agents.vec_env.env import NOTHING, NativeVecEnv, make_vec_env
 
 VISION, FUSION = "sideslip/YawVision-v0", "sideslip/AfsYawFusion-v0"
 SHORT: dict[str, Any] = {"base": "random-steering", "duration": 0.25}

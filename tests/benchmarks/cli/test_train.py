@@ -7,11 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from sideslip.agents.policy_file import load_policy
+from sideslip.agents.learned.files import load_policy
 
 pytest.importorskip("stable_baselines3")
-from sideslip.agents import train
-from sideslip.benchmarks import enjoy, train_command
+from sideslip.agents.training import train
+from sideslip.benchmarks import policies as enjoy
+from sideslip.benchmarks.cli import train as train_command
 from tests.benchmarks.conftest import Run
 
 TINY = ("--num-envs", 8, "--option", "scenario=sine-with-dwell")
@@ -87,11 +88,11 @@ def test_without_the_extra_the_command_names_it(
 ) -> None:
     for name in list(sys.modules):
         if name.split(".")[0] in ("torch", "stable_baselines3") or name in (
-            "sideslip.agents.train",
-            "sideslip.agents.algorithms",
-            "sideslip.agents.scaling",
-            "sideslip.agents.checkpoint",
-            "sideslip.agents.vec_env",
+            "sideslip.agents.training.train",
+            "sideslip.agents.training.algorithms",
+            "sideslip.agents.training.normalise",
+            "sideslip.agents.training.checkpoint",
+            "sideslip.agents.vec_env.env",
         ):
             monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, missing, None)

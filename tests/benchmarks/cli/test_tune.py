@@ -7,8 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from sideslip.benchmarks import tune_file, tune_study
-from sideslip.estimators import tunings
+from sideslip.benchmarks.tuning import file as tune_file
+from sideslip.benchmarks.tuning import study as tune_study
+from sideslip.estimators.design import tunings
 from tests.benchmarks.conftest import Run
 
 SCENARIO = "tie-vision-fig8"

@@ -9,9 +9,9 @@ import pytest
 
 pytest.importorskip("casadi")
 pytest.importorskip("osqp")
-from sideslip.agents import clairvoyant
-from sideslip.agents.clairvoyant import Ceiling
-from sideslip.benchmarks.calibrate import (
+from sideslip.agents.clairvoyant import plan as clairvoyant
+from sideslip.agents.clairvoyant.plan import Ceiling
+from sideslip.benchmarks.control.calibration import (
     calibrate,
     calibration_seeds,
     cases_of,

@@ -9,18 +9,20 @@ import pytest
 
 from sideslip.agents import make_agent
 from sideslip.agents.rollout import rollout
-from sideslip.benchmarks import control
-from sideslip.benchmarks.calibrate import Entry, Episode, read_calibration
-from sideslip.benchmarks.matrix import contest, drive, results
-from sideslip.benchmarks.matrix.ceiling import carried, judged, refusals_of, tops_of
-from sideslip.benchmarks.matrix.contestants import MANOEUVRES, STEERING, YAW, Cell, cells
-from sideslip.benchmarks.matrix.drive import NUMBERS, Chunk
-from sideslip.benchmarks.matrix.illustrate import _SHOWN, run_of
-from sideslip.benchmarks.matrix.kept import Kept
-from sideslip.benchmarks.matrix.price import SCENARIO
-from sideslip.benchmarks.matrix.results import measure
-from sideslip.benchmarks.matrix.scores import Ceiling, Resampled
-from sideslip.benchmarks.matrix.tables import _metrics, rows_of, standings
+from sideslip.benchmarks.control import build as contest
+from sideslip.benchmarks.control import episodes as drive
+from sideslip.benchmarks.control import run as results
+from sideslip.benchmarks.control import suite as control
+from sideslip.benchmarks.control.cache import Kept
+from sideslip.benchmarks.control.calibration import Entry, Episode, read_calibration
+from sideslip.benchmarks.control.ceiling import carried, judged, refusals_of, tops_of
+from sideslip.benchmarks.control.cells import MANOEUVRES, STEERING, YAW, Cell, cells
+from sideslip.benchmarks.control.delay_price import SCENARIO
+from sideslip.benchmarks.control.episodes import NUMBERS, Chunk
+from sideslip.benchmarks.control.figures import _SHOWN, run_of
+from sideslip.benchmarks.control.run import measure
+from sideslip.benchmarks.control.scores import Ceiling, Resampled
+from sideslip.benchmarks.control.tables import _metrics, rows_of, standings
 from sideslip.envs import FAILURES, SCENARIOS
 from sideslip.estimators import EstimateObservation
 
@@ -138,18 +140,18 @@ def test_a_stopped_run_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     chunk = Chunk(Cell(YAW, "gust", "", "none"), SEEDS, keep=True)
     kept = Kept(tmp_path, "salt")
     first = kept(chunk)
-    monkeypatch.setattr("sideslip.benchmarks.matrix.kept.drive", None)
+    monkeypatch.setattr("sideslip.benchmarks.control.cache.drive", None)
     again = kept(chunk)
     assert np.array_equal(first.numbers, again.numbers)
     assert first.series is not None and again.series is not None
     assert np.array_equal(first.series, again.series)
     with pytest.raises(TypeError):  # another salt or chunk is driven
         Kept(tmp_path, "other")(chunk)
-    monkeypatch.setattr("sideslip.benchmarks.matrix.kept.sources", lambda: "edited")
+    monkeypatch.setattr("sideslip.benchmarks.control.cache.sources", lambda: "edited")
     with pytest.raises(TypeError):  # other sources: driven again
         kept(chunk)
     monkeypatch.undo()
-    monkeypatch.setattr("sideslip.benchmarks.matrix.kept.drive", None)
+    monkeypatch.setattr("sideslip.benchmarks.control.cache.drive", None)
     (found,) = tmp_path.iterdir()
     found.write_bytes(found.read_bytes()[:100])  # cut short by a kill or a full disk
     with pytest.raises(TypeError):
@@ -181,7 +183,7 @@ def test_standings_put_the_best_first_and_rows_hold_them(monkeypatch: pytest.Mon
     rows = rows_of(standing[0], found.salt)
     assert {row.scenario for row in rows} == {*MANOEUVRES[:3], "all"}
     monkeypatch.setattr(
-        "sideslip.benchmarks.matrix.ceiling.ceilings",
+        "sideslip.benchmarks.control.ceiling.ceilings",
         lambda *_: {MANOEUVRES[0]: Ceiling(4.0, 0.01)},
     )
     raised, log = tops_of(found, YAW)
@@ -241,10 +243,10 @@ def test_a_small_matrix_from_end_to_end(monkeypatch: pytest.MonkeyPatch) -> None
     ]
     top = {SCENARIO: Ceiling(0.1, 0.01)}
     monkeypatch.setattr(control, "cells", lambda: few)
-    monkeypatch.setattr("sideslip.benchmarks.matrix.ceiling.ceilings", lambda *_: top)
-    monkeypatch.setattr("sideslip.benchmarks.matrix.price.DELAYS", (0.0, 0.3))
-    monkeypatch.setattr("sideslip.benchmarks.control.DELAYS", (0.0, 0.3))
-    monkeypatch.setattr("sideslip.benchmarks.matrix.illustrate.DELAYS", (0.0, 0.3))
+    monkeypatch.setattr("sideslip.benchmarks.control.ceiling.ceilings", lambda *_: top)
+    monkeypatch.setattr("sideslip.benchmarks.control.delay_price.DELAYS", (0.0, 0.3))
+    monkeypatch.setattr("sideslip.benchmarks.control.suite.DELAYS", (0.0, 0.3))
+    monkeypatch.setattr("sideslip.benchmarks.control.figures.DELAYS", (0.0, 0.3))
     suite = control.run(4, jobs=1)
     assert {row.env_version.split()[0] for row in suite.rows} == {YAW, STEERING}
     assert {row.metric for row in suite.rows} >= {"score", "iqm", "cost_over_informed", "spin_rate"}

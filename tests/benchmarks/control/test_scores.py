@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.stats import mannwhitneyu, trim_mean
 
-from sideslip.benchmarks.matrix.scores import Ceiling, Resampled, improvement, normalised
-from sideslip.benchmarks.matrix.seeds import salt_of, salted_seeds
+from sideslip.benchmarks.control.scores import Ceiling, Resampled, improvement, normalised
+from sideslip.benchmarks.control.seeds import salt_of, salted_seeds
 
 TOP = Ceiling(1.0, 0.0)
 

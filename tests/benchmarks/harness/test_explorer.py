@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.explorer import POINTS, Explorer, Panel
+from sideslip.benchmarks.harness.explorer import POINTS, Explorer, Panel
 
 PANELS = (Panel("slip / mrad", (("beta", "true", "#0072B2"),)),)
 

@@ -7,7 +7,13 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
-from sideslip.benchmarks.rows import Row, read_json, write_json, write_parquet, write_text
+from sideslip.benchmarks.harness.results import (
+    Row,
+    read_json,
+    write_json,
+    write_parquet,
+    write_text,
+)
 
 ROWS = [
     Row("estimation", "tie-vision-fig7", "rmse", 0.005, "dakf", low=0.004, high=0.006, n=100),

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.cases import run_cases
-from sideslip.benchmarks.stats import interval, mean, ratio_of_roots, root_mean
+from sideslip.benchmarks.harness.parallel import run_cases
+from sideslip.benchmarks.harness.stats import interval, mean, ratio_of_roots, root_mean
 
 
 def test_interval_covers_the_mean_nineteen_times_in_twenty() -> None:

@@ -6,9 +6,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.benchmarks import papers
-from sideslip.benchmarks.claims import CLAIMS, FIGURES, SIMULATIONS, observability
-from sideslip.benchmarks.claims.claim import (
+from sideslip.benchmarks.harness.results import METRICS, VERDICTS
+from sideslip.benchmarks.papers import suite as papers
+from sideslip.benchmarks.papers.claims import CLAIMS, FIGURES, SIMULATIONS
+from sideslip.benchmarks.papers.ledger.claim import (
     Bound,
     Claim,
     Measured,
@@ -19,11 +20,11 @@ from sideslip.benchmarks.claims.claim import (
     ratio,
     verdict,
 )
-from sideslip.benchmarks.claims.simulations import joined
-from sideslip.benchmarks.claims.tie_vision_appendix import residuals
-from sideslip.benchmarks.rows import METRICS, VERDICTS
-from sideslip.envs.linear import vision
-from sideslip.envs.vehicle import COMS
+from sideslip.benchmarks.papers.ledger.simulations import joined
+from sideslip.benchmarks.papers.theory import observability
+from sideslip.benchmarks.papers.tie_vision.appendix import residuals
+from sideslip.envs.vehicle.linear import vision
+from sideslip.envs.vehicle.vehicle import COMS
 
 
 def judged(*parts: tuple[Any, Any]) -> str:

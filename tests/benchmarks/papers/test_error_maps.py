@@ -4,10 +4,10 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from sideslip.benchmarks.claims import error_maps
-from sideslip.benchmarks.claims.dual_rate_gains import COURSE_SD, RATIO, extended
-from sideslip.estimators import spread
-from sideslip.estimators.kalman import gain
+from sideslip.benchmarks.papers.theory import error_maps
+from sideslip.benchmarks.papers.theory.dual_rate_gains import COURSE_SD, RATIO, extended
+from sideslip.estimators.design import dual_rate as spread
+from sideslip.estimators.design.kalman import gain
 
 Array = npt.NDArray[np.float64]
 

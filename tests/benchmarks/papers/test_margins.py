@@ -6,7 +6,7 @@ import control
 import numpy as np
 import pytest
 
-from sideslip.agents.margins import margins
+from sideslip.benchmarks.papers.tie_vision.margins import margins
 
 DT = 0.01
 

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from sideslip.agents.rollout import rollout
-from sideslip.benchmarks.claims.controlled import Following, Slip
-from sideslip.benchmarks.claims.estimation import SETTLED, Estimation, Filter
-from sideslip.benchmarks.claims.simulations import chunked
+from sideslip.benchmarks.papers.ledger.controllers import Following, Slip
+from sideslip.benchmarks.papers.ledger.filters import SETTLED, Estimation, Filter
+from sideslip.benchmarks.papers.ledger.simulations import chunked
 from sideslip.estimators import make_estimator
 
 VISION = "sideslip/YawVision-v0"

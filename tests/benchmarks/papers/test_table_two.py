@@ -7,7 +7,9 @@ import control
 import numpy as np
 import pytest
 
-from sideslip.agents.loops import (
+from sideslip.agents.design.pi import PLACEMENTS, POLE, design_pi
+from sideslip.benchmarks.papers.tie_vision.margins import margins
+from sideslip.benchmarks.papers.tie_vision.table_two import (
     INTEGRALS,
     PRINTED,
     SENSORS,
@@ -17,11 +19,9 @@ from sideslip.agents.loops import (
     search,
     table_two,
 )
-from sideslip.agents.margins import margins
-from sideslip.agents.pi import PLACEMENTS, POLE, design_pi
 from sideslip.envs import COMS
-from sideslip.envs.linear import bicycle, vision
-from sideslip.estimators.kalman import gain, joseph, predict
+from sideslip.envs.vehicle.linear import bicycle, vision
+from sideslip.estimators.design.kalman import gain, joseph, predict
 
 V = 25.0 / 3.6
 DESIGN = LoopDesign()

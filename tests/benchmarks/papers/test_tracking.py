@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.tracking import drive, tracking
+from sideslip.benchmarks.papers.ledger.tracking import drive, tracking
 
 FIG7: dict[str, Any] = {
     "base": "dakf-fig6",

@@ -8,9 +8,9 @@ import pytest
 pytest.importorskip("vehiclemodels")
 from sideslip.benchmarks.procedures import fmvss126
 from sideslip.benchmarks.procedures.drive import Drive, Fields, Law, Series, TestCar, prescribed
-from sideslip.envs.dynamics import Motion
-from sideslip.envs.outside import Drift, outside_vehicle
-from sideslip.envs.vehicle import GRAVITY
+from sideslip.envs.outside.plants import Drift, outside_vehicle
+from sideslip.envs.vehicle.dynamics import Motion
+from sideslip.envs.vehicle.vehicle import GRAVITY
 
 V = 80.0 / 3.6
 BMW = TestCar(outside_vehicle(), V, 16.0, 4.508, 0.8)

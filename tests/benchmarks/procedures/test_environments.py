@@ -6,18 +6,12 @@ import numpy as np
 import pytest
 
 from sideslip.benchmarks.procedures import fmvss126, iso3888, iso4138, iso7401
-from sideslip.benchmarks.procedures.cars import CARS, CONTESTANTS
-from sideslip.benchmarks.procedures.drive import (
-    CALM,
-    Drive,
-    Series,
-    of_env,
-    steering_programme,
-)
+from sideslip.benchmarks.procedures.contestants import CARS, CONTESTANTS
+from sideslip.benchmarks.procedures.drive import CALM, Drive, Series, of_env, steering_programme
 from sideslip.envs import Scenario
-from sideslip.envs.programme import steering_at
-from sideslip.envs.record import TICK
-from sideslip.envs.vehicle import GRAVITY
+from sideslip.envs.scenarios.steering import steering_at
+from sideslip.envs.ticks import TICK
+from sideslip.envs.vehicle.vehicle import GRAVITY
 
 EACH = pytest.mark.parametrize("name", CARS)
 LINEAR = {"small_angle": True, "linear_tyres": True, "lags": False, "roll": False}

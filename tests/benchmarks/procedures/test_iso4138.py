@@ -6,7 +6,7 @@ import pytest
 from sideslip.benchmarks.procedures import iso4138
 from sideslip.benchmarks.procedures.drive import Series
 from sideslip.envs import COMS, PASSENGER_CAR, Vehicle
-from sideslip.envs.linear import bicycle
+from sideslip.envs.vehicle.linear import bicycle
 
 CARS = pytest.mark.parametrize("vehicle", [COMS, PASSENGER_CAR], ids=lambda car: car.name)
 

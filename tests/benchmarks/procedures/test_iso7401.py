@@ -9,7 +9,7 @@ from scipy.signal import chirp, lsim
 from sideslip.benchmarks.procedures import iso7401
 from sideslip.benchmarks.procedures.drive import Series
 from sideslip.envs import COMS, PASSENGER_CAR, Vehicle
-from sideslip.envs.linear import bicycle
+from sideslip.envs.vehicle.linear import bicycle
 
 V = 20.0
 

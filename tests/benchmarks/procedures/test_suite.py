@@ -4,10 +4,10 @@ import pytest
 
 pytest.importorskip("vehiclemodels")
 from sideslip.benchmarks.procedures import outside, suite
-from sideslip.benchmarks.procedures.cars import CARS, CONTESTANTS
-from sideslip.benchmarks.procedures.found import Case
+from sideslip.benchmarks.procedures.cases import Case
+from sideslip.benchmarks.procedures.contestants import CARS, CONTESTANTS
 from sideslip.benchmarks.suites import SUITES
-from sideslip.envs.outside import OUTSIDE_PLANTS
+from sideslip.envs.outside.plants import OUTSIDE_PLANTS
 
 
 def test_every_contestant_drives_every_procedure_that_has_a_verdict() -> None:

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from sideslip.envs.linear import bicycle
-from sideslip.envs.vehicle import PASSENGER_CAR
+from sideslip.envs.vehicle.linear import bicycle
+from sideslip.envs.vehicle.vehicle import PASSENGER_CAR
 
 Array = npt.NDArray[np.float64]
 

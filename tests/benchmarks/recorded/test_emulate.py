@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.emulate import Emulation, heading, path
-from sideslip.envs.logs import read_log
+from sideslip.benchmarks.recorded.emulate import Emulation, heading, path
 from sideslip.envs.record import FAST, PACKET, PACKET_WIDTH, Log, Record
+from sideslip.envs.recordings.log_file import read_log
 
 from .slalom import DT, ROWS, SPEED, columns, saved
 

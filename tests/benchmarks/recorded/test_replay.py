@@ -8,13 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.emulate import Emulation, heading
-from sideslip.benchmarks.recorded import ESTIMATORS, GYRO_ONLY
-from sideslip.benchmarks.replay import corners, read_vehicle, replay, replay_file
-from sideslip.benchmarks.rows import Suite, read_json, write_json
-from sideslip.envs.logs import read_log
+from sideslip.benchmarks.harness.results import Suite, read_json, write_json
+from sideslip.benchmarks.recorded.emulate import Emulation, heading
+from sideslip.benchmarks.recorded.run import ESTIMATORS, GYRO_ONLY
+from sideslip.benchmarks.recorded.suite import corners, replay, replay_file
+from sideslip.benchmarks.recorded.vehicles import read_vehicle
 from sideslip.envs.record import Log
-from sideslip.envs.vehicle import PASSENGER_CAR
+from sideslip.envs.recordings.log_file import read_log
+from sideslip.envs.vehicle.vehicle import PASSENGER_CAR
 from sideslip.estimators import make_estimator
 
 from .slalom import ROWS, VEHICLE, columns, saved

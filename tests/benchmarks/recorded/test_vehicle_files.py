@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from sideslip.benchmarks.replay import read_vehicle
-from sideslip.envs.vehicle import PASSENGER_CAR
+from sideslip.benchmarks.recorded.vehicles import read_vehicle
+from sideslip.envs.vehicle.vehicle import PASSENGER_CAR
 
 from .slalom import VEHICLE
 

@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.explorer import Explorer, Panel
-from sideslip.benchmarks.rows import Suite, Table
+from sideslip.benchmarks.harness.explorer import Explorer, Panel
+from sideslip.benchmarks.harness.results import Suite, Table
 
 HOSTILE = "</script><b>1 & 2</b>"
 COMMAND = "sideslip bench --html report.html --json results.json"
@@ -55,7 +55,7 @@ def control() -> Suite:
 
 def drawn() -> list[tuple[str, Any, str]]:
     """Plausible signals: a sine of the sideslip angle, and estimates with their own errors."""
-    figures = pytest.importorskip("sideslip.benchmarks.figures")
+    figures = pytest.importorskip("sideslip.benchmarks.report.figures")
     rng = np.random.default_rng(0)
     t = np.arange(0.0, 10.0, 1e-3)
     beta = 12.0 * np.sin(2 * np.pi * 0.5 * t) * np.minimum(t, 1.0)
@@ -92,7 +92,7 @@ def drawn() -> list[tuple[str, Any, str]]:
 
 def matrix() -> Suite:
     """What only the matrix has: a heat map, a figure with menus, cars in motion, a file."""
-    pictures = pytest.importorskip("sideslip.benchmarks.matrix.pictures")
+    pictures = pytest.importorskip("sideslip.benchmarks.report.heat_maps")
     t = np.linspace(0.0, 8.0, 801)
     cells = {
         (manoeuvre, who): {"t": t, "beta": k * np.sin(t + k)}

@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.colours import COLOURS, INK, colour, line_styles
+from sideslip.benchmarks.report.colours import COLOURS, INK, colour, line_styles
 
 
 def test_colours_stay_with_their_names() -> None:
@@ -21,13 +21,13 @@ def test_colours_stay_with_their_names() -> None:
 
 def test_without_plotly_the_error_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "plotly", None)
-    monkeypatch.delitem(sys.modules, "sideslip.benchmarks.figures", raising=False)
+    monkeypatch.delitem(sys.modules, "sideslip.benchmarks.report.figures", raising=False)
     with pytest.raises(ModuleNotFoundError, match=r"sideslip\[report\]"):
-        importlib.import_module("sideslip.benchmarks.figures")
+        importlib.import_module("sideslip.benchmarks.report.figures")
 
 
 def test_time_series_keep_every_peak_and_gap() -> None:
-    figures = pytest.importorskip("sideslip.benchmarks.figures")
+    figures = pytest.importorskip("sideslip.benchmarks.report.figures")
     t = np.arange(100_001) * 1e-3
     y = np.sin(t)
     y[54_321], y[77_777] = 5.0, -4.0
@@ -48,7 +48,7 @@ def test_time_series_keep_every_peak_and_gap() -> None:
 
 
 def test_small_ranges_far_from_zero_keep_their_shape() -> None:
-    figures = pytest.importorskip("sideslip.benchmarks.figures")
+    figures = pytest.importorskip("sideslip.benchmarks.report.figures")
     t = 1.6e9 + np.arange(1000) * 0.01
     nothing = np.full(t.size, np.nan)
     series = {"dakf": np.sin(t), "lost": nothing}
@@ -58,7 +58,7 @@ def test_small_ranges_far_from_zero_keep_their_shape() -> None:
 
 
 def test_figures_refuse_unequal_lengths() -> None:
-    figures = pytest.importorskip("sideslip.benchmarks.figures")
+    figures = pytest.importorskip("sideslip.benchmarks.report.figures")
     with pytest.raises(ValueError, match="'dakf' has shape"):
         figures.time_series("", np.arange(3.0), {"dakf": np.arange(2.0)}, "angle / rad")
     with pytest.raises(ValueError, match="track 'truth'"):
@@ -70,7 +70,7 @@ def test_figures_refuse_unequal_lengths() -> None:
 
 
 def test_curves_stand_on_logarithmic_axes() -> None:
-    figures = pytest.importorskip("sideslip.benchmarks.figures")
+    figures = pytest.importorskip("sideslip.benchmarks.report.figures")
     x, y = np.array([1.0, 1024.0, 65536.0]), np.array([8.0, 1.0, 1.0])
     figure = figures.curves("", x, {"gym.make": y}, "CPU time / us", "environments")
     (line,) = figure.data
@@ -83,7 +83,7 @@ def test_curves_stand_on_logarithmic_axes() -> None:
 
 
 def test_tracks_have_equal_axes() -> None:
-    figures = pytest.importorskip("sideslip.benchmarks.figures")
+    figures = pytest.importorskip("sideslip.benchmarks.report.figures")
     figure = figures.track(np.arange(5000.0), np.arange(5000.0))
     assert figure.layout.yaxis.scaleanchor == "x"
     assert len(figure.data[0].x) == figures.POINTS
@@ -91,7 +91,7 @@ def test_tracks_have_equal_axes() -> None:
 
 
 def test_whiskers_are_the_interval() -> None:
-    figures = pytest.importorskip("sideslip.benchmarks.figures")
+    figures = pytest.importorskip("sideslip.benchmarks.report.figures")
     (bar,) = figures.bars_with_interval(
         ["a", "b", "c"], [2.0, 3.0, 4.0], [1.5, np.nan, 4.0], [3.0, np.nan, 4.0], "m"
     ).data

@@ -5,7 +5,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.kml import ORIGIN, degrees, track_kml
+from sideslip.benchmarks.report.kml import ORIGIN, degrees, track_kml
 
 NAMES = {"kml": "http://www.opengis.net/kml/2.2"}
 

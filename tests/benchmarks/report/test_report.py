@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.benchmarks import report
-from sideslip.benchmarks.report import number, write_report
-from sideslip.benchmarks.rows import Suite, Table
+from sideslip.benchmarks.harness.results import Suite, Table
+from sideslip.benchmarks.report import html as report
+from sideslip.benchmarks.report.html import number, write_report
 
 from .demo import COMMAND, HOSTILE, VERSIONS, control, drawn, estimation
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.report import write_report
-from sideslip.benchmarks.rows import Suite
+from sideslip.benchmarks.harness.results import Suite
+from sideslip.benchmarks.report.html import write_report
 
 from .demo import COMMAND, HOSTILE, VERSIONS, control, drawn, estimation, matrix
 

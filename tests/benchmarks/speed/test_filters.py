@@ -6,9 +6,9 @@ import sys
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.rows import Suite
+from sideslip.benchmarks.harness.results import Suite
 from sideslip.benchmarks.speed import filters, timing
-from sideslip.benchmarks.speed.rivals import Rival, four_states, six_states
+from sideslip.benchmarks.speed.filterpy_rival import Rival, four_states, six_states
 
 SHORT = timing.Effort(rounds=1, seconds=0.0)
 

@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.rows import Suite
+from sideslip.benchmarks.harness.results import Suite
+from sideslip.benchmarks.speed import c_plant as yardstick
+from sideslip.benchmarks.speed import contestants as field
 from sideslip.benchmarks.speed import (
     env_steps,
-    field,
     first_use,
     learning,
     plant,
@@ -18,9 +19,8 @@ from sideslip.benchmarks.speed import (
     suite,
     targets,
     timing,
-    yardstick,
 )
-from sideslip.envs.lanes import LANES
+from sideslip.envs.backend.simd import LANES
 
 SHORT = timing.Effort(rounds=1, seconds=0.0)
 compiler = pytest.mark.skipif(
@@ -133,7 +133,7 @@ def test_commonroads_single_track_runs() -> None:
 
 def test_learning_without_torch_is_absent(monkeypatch: pytest.MonkeyPatch) -> None:
     without(monkeypatch, "torch", "stable_baselines3")
-    monkeypatch.delitem(sys.modules, "sideslip.agents.vec_env", raising=False)
+    monkeypatch.delitem(sys.modules, "sideslip.agents.vec_env.env", raising=False)
     measured = Suite("speed", "", "")
     taken, absent = learning.add(measured, SHORT)
     assert taken == {} and measured.tables == []

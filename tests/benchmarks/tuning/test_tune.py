@@ -9,9 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.benchmarks import tune, tune_file, tune_study, tune_task
-from sideslip.benchmarks.tune_task import Drive, Task
-from sideslip.estimators import make_estimator, tunings
+from sideslip.benchmarks.tuning import file as tune_file
+from sideslip.benchmarks.tuning import study as tune_study
+from sideslip.benchmarks.tuning import suite as tune
+from sideslip.benchmarks.tuning import task as tune_task
+from sideslip.benchmarks.tuning.task import Drive, Task
+from sideslip.estimators import make_estimator
+from sideslip.estimators.design import tunings
 
 SCENARIO = "tie-vision-fig8"
 optuna = pytest.importorskip("optuna")

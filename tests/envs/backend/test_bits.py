@@ -6,24 +6,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.envs import (
-    COMS,
-    PASSENGER_CAR,
-    dynamics,
-    elementary,
-    kernel,
-    noise,
-    programme,
-    restart,
-    stability,
-    tyres,
-)
-from sideslip.envs.backend import ARRAYS, plain
-from sideslip.envs.dynamics import Motion, Push, Road
-from sideslip.envs.template import car_of
-from sideslip.envs.tyres import Inputs
+from sideslip.envs import COMS, PASSENGER_CAR, stability
+from sideslip.envs.backend import elementary
+from sideslip.envs.backend import random as noise
+from sideslip.envs.backend.primitives import ARRAYS
+from sideslip.envs.backend.rebuild import plain
+from sideslip.envs.engine import reset as restart
+from sideslip.envs.engine import step as kernel
+from sideslip.envs.engine.packing import car_of
+from sideslip.envs.scenarios import steering as programme
+from sideslip.envs.ticks import FOREVER
+from sideslip.envs.vehicle import dynamics, tyres
+from sideslip.envs.vehicle.dynamics import Motion, Push, Road
+from sideslip.envs.vehicle.tyres import Inputs
 
-from .helpers import FULL, IDS, LINEAR, bits, play, unwrapped
+from ..helpers import FULL, IDS, LINEAR, bits, play, unwrapped
 
 pytestmark = pytest.mark.plain
 
@@ -94,7 +91,7 @@ def test_sideslip_angle(small_angle: int) -> None:
 def test_steering() -> None:
     numbers = RNG.uniform(0.01, 2.0, programme.STEERING_WIDTH)
     numbers[3 : 5 * programme.SINES : 5] = 100.0, 0.0, 300.0, 40.0
-    numbers[4 : 5 * programme.SINES : 5] = 900.0, programme.FOREVER, 1200.0, 50.0
+    numbers[4 : 5 * programme.SINES : 5] = 900.0, FOREVER, 1200.0, 50.0
     numbers[5 * programme.SINES + 2 :: 3] = 200.0
     code = tuple(numbers.tolist())
     ticks = [float(tick) for tick in range(0, 2000, 7)]

@@ -10,7 +10,7 @@ import numba
 import numpy as np
 import pytest
 
-from sideslip.envs.compiler import Kernel
+from sideslip.envs.backend.compiler import Kernel
 
 MODULE = '''
 """Kernels in a folder named by the first argument."""
@@ -20,7 +20,7 @@ import sys
 
 import numpy as np
 
-from sideslip.envs.compiler import Kernel
+from sideslip.envs.backend.compiler import Kernel
 
 
 def kernel(function, apart=False):
@@ -105,7 +105,7 @@ def start(folder: Path, code: str = USE, **variables: str) -> subprocess.Popen[s
     )
 
 
-SOURCE = Path(__file__).resolve().parents[2] / "src"
+SOURCE = Path(__file__).resolve().parents[3] / "src"
 
 
 def run(folder: Path, code: str = USE, **variables: str) -> tuple[list[str], str]:

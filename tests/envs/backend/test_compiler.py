@@ -11,8 +11,9 @@ import pytest
 from numba.core.dispatcher import Dispatcher
 
 from sideslip.envs import backend
+from sideslip.envs.backend import cache
 
-PACKAGE = backend._PACKAGE
+PACKAGE = cache._PACKAGE
 FOLDERS = ("envs", "estimators", "agents", "benchmarks")
 
 
@@ -42,22 +43,23 @@ def run(code: str, home: Path, **variables: str) -> str:
 
 @pytest.mark.smoke
 def test_stamp_is_that_of_the_sources(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    stamp = backend.source_stamp()
-    monkeypatch.setattr(backend, "_PACKAGE", copy)
-    assert backend.source_stamp() == stamp
+    stamp = cache.source_stamp()
+    monkeypatch.setattr(cache, "_PACKAGE", copy)
+    assert cache.source_stamp() == stamp
     seen = {stamp}
     # one more byte in any module of any folder
     for module in (*(f"{folder}/__init__.py" for folder in FOLDERS), "benchmarks/speed/plant.py"):
         with open(copy / module, "a") as source:
             source.write("\n")
-        seen.add(backend.source_stamp())
-    (copy / "envs" / "linear.py").rename(copy / "envs" / "linear_2.py")
-    seen.add(backend.source_stamp())
+        seen.add(cache.source_stamp())
+    room = copy / "envs" / "vehicle"
+    (room / "linear.py").rename(room / "linear_2.py")
+    seen.add(cache.source_stamp())
     assert len(seen) == 7
 
 
 SHIFT = """
-from sideslip.envs.tracks import Path, path_offset
+from sideslip.envs.scenarios.tracks import Path, path_offset
 print(path_offset(Path(1.0, 0.0, 1.0, 0.0, 0.0, 1.0), 0.25))
 """
 
@@ -73,7 +75,7 @@ def test_an_edit_in_a_callee_reaches_its_cached_callers(copy: Path, tmp_path: Pa
     assert float(run(SHIFT, copy, **variables)) == exact
     again = sorted(cache.rglob("tracks.path_offset*.kernel"))
     assert again == kernels  # the second run compiled nothing
-    source = copy / "envs" / "elementary.py"
+    source = copy / "envs" / "backend" / "elementary.py"
     text = source.read_text()
     changed = text.replace("return t * t * (3.0 - 2.0 * t)", "return t * t * (6.0 - 4.0 * t)")
     assert changed != text
@@ -99,15 +101,15 @@ def test_old_versions_are_pruned_but_not_in_a_folder_of_the_users_own(
         monkeypatch.delenv(variable, raising=False)
         base = tmp_path / variable
         kernels = base / "sideslip" / "kernels" if variable == "XDG_CACHE_HOME" else base
-        for age in range(backend._KEPT_CACHES + 3):
+        for age in range(cache._KEPT_CACHES + 3):
             old = kernels / f"version-{age}"
             old.mkdir(parents=True)
             os.utime(old, (1e9 - age, 1e9 - age))
         monkeypatch.setenv(variable, str(base))
-        assert backend._cache_folder() == str(kernels / backend.source_stamp())
-        left = {path.name for path in kernels.iterdir()} - {backend.source_stamp()}
+        assert cache._cache_folder() == str(kernels / cache.source_stamp())
+        left = {path.name for path in kernels.iterdir()} - {cache.source_stamp()}
         # our own newest folder is one of those kept
-        kept = backend._KEPT_CACHES + (-1 if variable == "XDG_CACHE_HOME" else 3)
+        kept = cache._KEPT_CACHES + (-1 if variable == "XDG_CACHE_HOME" else 3)
         assert left == {f"version-{age}" for age in range(kept)}
 
 
@@ -118,7 +120,7 @@ def test_compiling_leaves_numbas_own_settings_alone() -> None:
 
 
 def test_plain_replaces_every_callee_and_leaves_the_original_alone() -> None:
-    from sideslip.envs.dynamics import rk4
+    from sideslip.envs.vehicle.dynamics import rk4
 
     function = backend.plain(rk4)
     seen: set[str] = set()
@@ -139,17 +141,17 @@ def test_a_folder_that_can_only_be_read_is_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    folder = tmp_path / backend.source_stamp("envs")
-    assert backend._cache_folder("envs") == str(folder)  # made
+    folder = tmp_path / cache.source_stamp("envs")
+    assert cache._cache_folder("envs") == str(folder)  # made
 
     def refuse(*_: object, **__: object) -> None:
         raise PermissionError("read-only")
 
     monkeypatch.setattr(Path, "mkdir", refuse)
     monkeypatch.setattr(os, "utime", refuse)
-    assert backend._cache_folder("envs") == str(folder)
+    assert cache._cache_folder("envs") == str(folder)
     folder.rmdir()
-    assert backend._cache_folder("envs") is None
+    assert cache._cache_folder("envs") is None
 
 
 def test_a_folder_that_another_process_prunes_meanwhile_is_no_trouble(
@@ -159,4 +161,4 @@ def test_a_folder_that_another_process_prunes_meanwhile_is_no_trouble(
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     gone = [tmp_path / "gone"]
     monkeypatch.setattr(Path, "iterdir", lambda path: iter(gone))
-    assert backend._cache_folder("envs") is not None
+    assert cache._cache_folder("envs") is not None

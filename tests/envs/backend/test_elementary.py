@@ -9,9 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sideslip.envs import elementary
-from sideslip.envs.backend import ARRAYS, absolute, floor, maximum, minimum, plain, select, sqrt
-from sideslip.envs.elementary import PI
+from sideslip.envs.backend import elementary
+from sideslip.envs.backend.elementary import PI
+from sideslip.envs.backend.primitives import ARRAYS, absolute, floor, maximum, minimum, select, sqrt
+from sideslip.envs.backend.rebuild import plain
 
 pytestmark = pytest.mark.plain
 

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from sideslip.envs import noise
-from sideslip.envs.backend import ARRAYS, plain
-from sideslip.envs.noise import CHANNELS, normals, philox, uniform, uniforms
+from sideslip.envs.backend import random as noise
+from sideslip.envs.backend.primitives import ARRAYS
+from sideslip.envs.backend.random import CHANNELS, normals, philox, uniform, uniforms
+from sideslip.envs.backend.rebuild import plain
 
 pytestmark = pytest.mark.plain
 

@@ -9,11 +9,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sideslip.envs import StabilityVectorEnv
-from sideslip.envs.device import DeviceVectorEnv
-from sideslip.envs.layout import Z
+from sideslip.envs.device.env import DeviceVectorEnv
+from sideslip.envs.engine.layout import Z
 from sideslip.envs.record import PACKET, PACKET_WIDTH
 
-from .batches import batch
+from ..batches import batch
 
 FUSION, UNEVEN = "sideslip/YawFusion-v0", "sideslip/YawVisionUneven-v0"
 EXACT = 1e-9

@@ -7,18 +7,18 @@ import pytest
 
 from sideslip.envs import SCENARIOS, StabilityVectorEnv
 
-from .helpers import FULL, IDS, unwrapped
+from ..helpers import FULL, IDS, unwrapped
 
 torch = pytest.importorskip("torch")
 
-from sideslip.envs import noise  # noqa: E402
-from sideslip.envs.device import DeviceVectorEnv  # noqa: E402
-from sideslip.envs.device.numbers import on_tensors  # noqa: E402
-from sideslip.envs.dynamics import Motion  # noqa: E402
-from sideslip.envs.layout import Z  # noqa: E402
+from sideslip.envs.backend import random as noise  # noqa: E402
+from sideslip.envs.backend.on_torch import on_tensors  # noqa: E402
+from sideslip.envs.device.env import DeviceVectorEnv  # noqa: E402
+from sideslip.envs.engine.layout import Z  # noqa: E402
 from sideslip.envs.record import FAST  # noqa: E402
+from sideslip.envs.vehicle.dynamics import Motion  # noqa: E402
 
-from .batches import MODES, batch  # noqa: E402
+from ..batches import MODES, batch  # noqa: E402
 from .moments import (  # noqa: E402
     EXACT,
     FUSION,

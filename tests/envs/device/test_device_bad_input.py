@@ -12,11 +12,11 @@ from gymnasium.error import ResetNeeded
 
 import sideslip
 
-from .helpers import bits
+from ..helpers import bits
 
 torch = pytest.importorskip("torch")
 
-from sideslip.envs.device import DeviceVectorEnv  # noqa: E402
+from sideslip.envs.device.env import DeviceVectorEnv  # noqa: E402
 
 pytestmark = pytest.mark.plain
 

@@ -6,9 +6,9 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from sideslip.envs.device import DeviceVectorEnv  # noqa: E402
+from sideslip.envs.device.env import DeviceVectorEnv  # noqa: E402
 
-from .batches import MODES  # noqa: E402
+from ..batches import MODES  # noqa: E402
 from .moments import FUSION, UNEVEN, agrees, episodes  # noqa: E402
 
 

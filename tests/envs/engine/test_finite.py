@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sideslip.envs import FAILURES, SCENARIOS, StabilityEnv, vehicle_from
-from sideslip.envs.layout import P, Task
+from sideslip.envs.engine.layout import P, Task
 
-from .helpers import FULL, Moment, fast_rows, play
+from ..helpers import FULL, Moment, fast_rows, play
 
 
 def assert_finite(env: StabilityEnv, start: Any, moments: list[Moment]) -> None:

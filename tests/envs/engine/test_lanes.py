@@ -6,27 +6,26 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.envs import noise
-from sideslip.envs.backend import (
+from sideslip.envs.backend import random as noise
+from sideslip.envs.backend.arrays import at, put_all
+from sideslip.envs.backend.decorators import jit
+from sideslip.envs.backend.elementary import atan, atan2, exp, sincos, smoothstep, wrap
+from sideslip.envs.backend.primitives import (
     absolute,
     anywhere,
-    at,
     floor,
-    jit,
     maximum,
     minimum,
-    put_all,
     select,
     sqrt,
     to_float,
     whole,
 )
-from sideslip.envs.elementary import atan, atan2, exp, sincos, smoothstep, wrap
-from sideslip.envs.lanes import LANES
-from sideslip.envs.noise import normals, uniforms
+from sideslip.envs.backend.random import normals, uniforms
+from sideslip.envs.backend.simd import LANES
 
-from .batches import SHORT, batch, drive, pair, same, same_cars
-from .helpers import bits
+from ..batches import SHORT, batch, drive, pair, same, same_cars
+from ..helpers import bits
 
 FUSION = "sideslip/YawFusion-v0"
 

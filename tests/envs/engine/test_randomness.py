@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from sideslip.envs import SCENARIOS, StabilityEnv
-from sideslip.envs.layout import Z
+from sideslip.envs.engine.layout import Z
 from sideslip.envs.record import FAST
 
-from .helpers import IDS, LINEAR, SILENT, bits, fast_rows, play, unwrapped
+from ..helpers import IDS, LINEAR, SILENT, bits, fast_rows, play, unwrapped
 
 pytestmark = pytest.mark.plain
 

@@ -5,13 +5,13 @@ from typing import Any
 import gymnasium as gym
 import pytest
 
-from sideslip.envs.dynamics import Motion
+from sideslip.envs.vehicle.dynamics import Motion
 
-from .helpers import SILENT
+from ..helpers import SILENT
 
 pytest.importorskip("vehiclemodels")
-from sideslip.envs.outside import OUTSIDE_PLANTS, Acting
-from sideslip.envs.outside_env import OutsideEnv
+from sideslip.envs.outside.env import OutsideEnv
+from sideslip.envs.outside.plants import OUTSIDE_PLANTS, Acting
 
 MODELS = tuple(OUTSIDE_PLANTS)
 V = 80.0 / 3.6

@@ -11,13 +11,13 @@ from gymnasium.utils.env_checker import check_env
 from sideslip.agents import make_agent
 from sideslip.agents.rollout import rollout
 from sideslip.envs import FAILURES
-from sideslip.envs.layout import Drive, Z
+from sideslip.envs.engine.layout import Drive, Z
 from sideslip.estimators import EstimateObservation
 
 pytest.importorskip("vehiclemodels")
-from sideslip.envs.outside import Acting, outside_vehicle
+from sideslip.envs.outside.plants import Acting, outside_vehicle
 
-from .outside_cars import CALM, MODELS, STEP, V, driven, outside
+from .cars import CALM, MODELS, STEP, V, driven, outside
 
 
 @pytest.mark.parametrize("model", MODELS)

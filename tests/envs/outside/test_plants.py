@@ -5,13 +5,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.envs.dynamics import Motion
-from sideslip.envs.linear import LinearModel, bicycle
+from sideslip.envs.vehicle.dynamics import Motion
+from sideslip.envs.vehicle.linear import LinearModel, bicycle
 
 pytest.importorskip("vehiclemodels")
-from sideslip.envs.outside import OUTSIDE_PLANTS, Acting, outside_vehicle
+from sideslip.envs.outside.plants import OUTSIDE_PLANTS, Acting, outside_vehicle
 
-from .outside_cars import CALM, MODELS, STEP, V, driven, outside
+from .cars import CALM, MODELS, STEP, V, driven, outside
 
 
 def test_the_single_track_is_the_bicycle_of_the_vehicle_that_is_told() -> None:

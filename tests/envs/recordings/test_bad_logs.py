@@ -9,7 +9,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from sideslip.envs.logs import parse_mapping, read_log
+from sideslip.envs.recordings.columns import parse_mapping
+from sideslip.envs.recordings.log_file import read_log
 
 from .drives import drive, saved
 
@@ -123,7 +124,7 @@ def test_nothing_and_a_folder(tmp_path: Path) -> None:
 def test_pandas_is_loaded_late_and_its_extra_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    code = "import sys, sideslip.envs.logs; sys.exit('pandas' in sys.modules)"
+    code = "import sys, sideslip.envs.recordings.log_file; sys.exit('pandas' in sys.modules)"
     env_path = {"PYTHONPATH": ":".join(sys.path)}
     subprocess.run([sys.executable, "-c", code], check=True, env=env_path)
     path = saved(drive(), tmp_path)

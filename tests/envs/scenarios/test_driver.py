@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 
 from sideslip.envs import COMS, FAILURES, StabilityEnv
-from sideslip.envs.backend import ARRAYS, plain
-from sideslip.envs.driver import Driver, steered, wanted_angle
-from sideslip.envs.dynamics import Motion, Road
-from sideslip.envs.layout import P
-from sideslip.envs.reference import target_of
-from sideslip.envs.tracks import Path, laid, path_of, path_offset, sections
+from sideslip.envs.backend.primitives import ARRAYS
+from sideslip.envs.backend.rebuild import plain
+from sideslip.envs.engine.layout import P
+from sideslip.envs.scenarios.driver import Driver, steered, wanted_angle
+from sideslip.envs.scenarios.tracks import Path, laid, path_of, path_offset, sections
+from sideslip.envs.task.reference import target_of
+from sideslip.envs.vehicle.dynamics import Motion, Road
 
-from .helpers import FULL, LINEAR, Moment, bits, play
+from ..helpers import FULL, LINEAR, Moment, bits, play
 
 T = 1.0
 QUICK = Driver(T, 1.0, 0.0, 1.0)

@@ -5,14 +5,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.envs import COMS, StabilityEnv, kernel, restart, stability
-from sideslip.envs.backend import plain
-from sideslip.envs.layout import P
-from sideslip.envs.programme import FOREVER
-from sideslip.envs.template import car_of
-from sideslip.envs.tyres import Inputs, load_of
+from sideslip.envs import COMS, StabilityEnv, stability
+from sideslip.envs.backend.rebuild import plain
+from sideslip.envs.engine import reset as restart
+from sideslip.envs.engine import step as kernel
+from sideslip.envs.engine.layout import P
+from sideslip.envs.engine.packing import car_of
+from sideslip.envs.ticks import FOREVER
+from sideslip.envs.vehicle.tyres import Inputs, load_of
 
-from .helpers import FULL, LINEAR, bits, play
+from ..helpers import FULL, LINEAR, bits, play
 
 pytestmark = pytest.mark.plain
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from sideslip.envs import SCENARIOS, StabilityEnv
-from sideslip.envs.paper_simulations import ROAD_TESTS
 from sideslip.envs.record import PACKET
+from sideslip.envs.scenarios.papers import ROAD_TESTS
 
 TWINS = [scenario.name for scenario in ROAD_TESTS]
 

@@ -10,8 +10,8 @@ import pytest
 from scipy import stats
 
 from sideslip.envs import COMS, SCENARIOS, Scenario, StabilityEnv, scenario_from
-from sideslip.envs.programme import DRAWS_WIDTH, Draws, realise, stable
-from sideslip.envs.template import car_of
+from sideslip.envs.engine.packing import car_of
+from sideslip.envs.scenarios.draws import DRAWS_WIDTH, Draws, realise, stable
 
 pytestmark = pytest.mark.plain
 

@@ -8,23 +8,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sideslip.envs import COMS, FAILURES, StabilityEnv, critical_speed
-from sideslip.envs.pace import Pace, acceleration_command
-from sideslip.envs.programme import (
-    DRAWS_WIDTH,
-    FOREVER,
+from sideslip.envs.engine.packing import car_of
+from sideslip.envs.record import FAST, PACKET
+from sideslip.envs.scenarios.draws import DRAWS_WIDTH, Draws, stable
+from sideslip.envs.scenarios.speed import Pace, acceleration_command
+from sideslip.envs.scenarios.steering import (
     STEERING_KINDS,
     STEERING_WIDTH,
-    Draws,
-    Wind,
-    stable,
     steering_at,
-    wind_at,
     write_steering,
 )
-from sideslip.envs.record import FAST, PACKET, TICK
-from sideslip.envs.template import car_of
+from sideslip.envs.scenarios.wind import Wind, wind_at
+from sideslip.envs.ticks import FOREVER, TICK
 
-from .helpers import FULL, LINEAR, fast_rows, packets, play
+from ..helpers import FULL, LINEAR, fast_rows, packets, play
 
 pytestmark = pytest.mark.plain
 

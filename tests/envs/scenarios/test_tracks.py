@@ -7,8 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sideslip.envs.backend import ARRAYS, plain
-from sideslip.envs.tracks import PATHS, Path, laid, path_of, path_offset, sections
+from sideslip.envs.backend.primitives import ARRAYS
+from sideslip.envs.backend.rebuild import plain
+from sideslip.envs.scenarios.tracks import PATHS, Path, laid, path_of, path_offset, sections
 
 pytestmark = pytest.mark.plain
 

@@ -9,11 +9,11 @@ from scipy import stats
 
 from sideslip.envs import SlowSensor, StabilityEnv
 from sideslip.envs.record import CAMERA, GPS, PACKET
-from sideslip.envs.scenario_checks import SHORTEST_GPS_PERIOD
-from sideslip.envs.sensor_sets import SENSOR_SETS
-from sideslip.envs.sensors import IN_FLIGHT, link_of
+from sideslip.envs.scenarios.checks import SHORTEST_GPS_PERIOD
+from sideslip.envs.sensors.link import IN_FLIGHT, link_of
+from sideslip.envs.sensors.sets import SENSOR_SETS
 
-from .helpers import IDS, LINEAR, packets, play, unwrapped
+from ..helpers import IDS, LINEAR, packets, play, unwrapped
 
 CAPTURED, ARRIVED, SEQUENCE = PACKET.captured, PACKET.arrived, PACKET.sequence
 ENDLESS = LINEAR | {"duration": 1000.0}

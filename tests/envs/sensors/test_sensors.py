@@ -8,18 +8,13 @@ import pytest
 from scipy import stats
 
 from sideslip.envs import COMS, StabilityEnv
-from sideslip.envs.dynamics import Motion, Road
 from sideslip.envs.record import FAST, PACKET
-from sideslip.envs.sensors import (
-    HDOP_LAWS,
-    OUTAGE_JUMP,
-    Noise,
-    camera_sample,
-    gps_sample,
-    satellites_at,
-)
+from sideslip.envs.sensors.camera import camera_sample
+from sideslip.envs.sensors.gps import HDOP_LAWS, OUTAGE_JUMP, gps_sample, satellites_at
+from sideslip.envs.sensors.noise import Noise
+from sideslip.envs.vehicle.dynamics import Motion, Road
 
-from .helpers import FULL, LINEAR, SILENT, fast_rows, packets, play
+from ..helpers import FULL, LINEAR, SILENT, fast_rows, packets, play
 
 CALM = (0.0, 0.0, 0.0, 0.0)
 QUIET = Noise()._replace(**SILENT)

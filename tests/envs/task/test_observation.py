@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from sideslip.envs import Record, SlowSensor, StabilityEnv
-from sideslip.envs.layout import AGE_CAP, SAMPLED
-from sideslip.envs.record import FAST, PACKET, SLOW_NAMES, SLOW_VALUES, TICK, Fast
-from sideslip.envs.sensor_sets import SENSOR_SETS
+from sideslip.envs.record import FAST, PACKET, SLOW_NAMES, SLOW_VALUES, Fast
+from sideslip.envs.sensors.sets import SENSOR_SETS
+from sideslip.envs.task.observation import AGE_CAP, SAMPLED
+from sideslip.envs.ticks import TICK
 
-from .helpers import FULL, IDS, LINEAR, play, unwrapped
+from ..helpers import FULL, IDS, LINEAR, play, unwrapped
 
 pytestmark = pytest.mark.plain
 

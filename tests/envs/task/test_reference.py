@@ -9,10 +9,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sideslip.envs import COMS, FAILURES, StabilityEnv, Vehicle
-from sideslip.envs.record import FAST, TICK
-from sideslip.envs.reference import LIMITED, MODEL, ZERO_SLIP, cost_rate, reference, target_of
+from sideslip.envs.record import FAST
+from sideslip.envs.task.cost import cost_rate
+from sideslip.envs.task.reference import LIMITED, MODEL, ZERO_SLIP, reference, target_of
+from sideslip.envs.ticks import TICK
 
-from .helpers import FULL, IDS, LINEAR, fast_rows, play, unwrapped
+from ..helpers import FULL, IDS, LINEAR, fast_rows, play, unwrapped
 
 pytestmark = pytest.mark.plain
 

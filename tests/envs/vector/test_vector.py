@@ -16,8 +16,8 @@ from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
 from sideslip.envs import SCENARIOS, StabilityVectorEnv
 
-from .batches import MODES, SHORT, actions, batch, drive, pair, plain, same, same_cars, sync
-from .helpers import IDS, bits, unwrapped
+from ..batches import MODES, SHORT, actions, batch, drive, pair, plain, same, same_cars, sync
+from ..helpers import IDS, bits, unwrapped
 
 FUSION = "sideslip/YawFusion-v0"
 UNEVEN = "sideslip/YawVisionUneven-v0"

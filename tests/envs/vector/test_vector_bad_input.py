@@ -9,7 +9,7 @@ import pytest
 
 from sideslip.envs import FAILURES, StabilityVectorEnv
 
-from .batches import batch, plain
+from ..batches import batch, plain
 
 pytestmark = pytest.mark.plain
 

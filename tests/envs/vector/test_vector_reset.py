@@ -8,8 +8,8 @@ from gymnasium.error import ResetNeeded
 
 from sideslip.envs import COMS
 
-from .batches import MODES, SHORT, batch, drive, pair, plain, same, same_cars
-from .helpers import bits
+from ..batches import MODES, SHORT, batch, drive, pair, plain, same, same_cars
+from ..helpers import bits
 
 FUSION = "sideslip/YawFusion-v0"
 UNEVEN = "sideslip/YawVisionUneven-v0"

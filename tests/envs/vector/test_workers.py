@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from .helpers import IDS
+from ..helpers import IDS
 
 SPAWN = """
 import multiprocessing, pickle, sys

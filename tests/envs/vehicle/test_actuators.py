@@ -9,12 +9,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sideslip.envs import COMS, PASSENGER_CAR, StabilityEnv
-from sideslip.envs.actuators import Lag, distribute, lag_of, lagged, yaw_moment
-from sideslip.envs.linear import bicycle
-from sideslip.envs.record import FAST, TICK
-from sideslip.envs.template import car_of
+from sideslip.envs.engine.packing import car_of
+from sideslip.envs.record import FAST
+from sideslip.envs.ticks import TICK
+from sideslip.envs.vehicle.actuators import Lag, distribute, lag_of, lagged, yaw_moment
+from sideslip.envs.vehicle.linear import bicycle
 
-from .helpers import FULL, LINEAR, fast_rows, play
+from ..helpers import FULL, LINEAR, fast_rows, play
 
 pytestmark = pytest.mark.plain
 

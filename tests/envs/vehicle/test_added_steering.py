@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from sideslip.envs import COMS, FAILURES, StabilityEnv
-from sideslip.envs.linear import bicycle
-from sideslip.envs.record import FAST, TICK, concatenate
+from sideslip.envs.record import FAST, concatenate
+from sideslip.envs.ticks import TICK
+from sideslip.envs.vehicle.linear import bicycle
 
-from .helpers import FULL, IDS, LINEAR, bits, fast_rows, play
+from ..helpers import FULL, IDS, LINEAR, bits, fast_rows, play
 
 pytestmark = pytest.mark.plain
 

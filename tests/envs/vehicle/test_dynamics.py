@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sideslip.envs import COMS, PASSENGER_CAR
-from sideslip.envs.dynamics import Car, Motion, Push, Road, derivative, frame_of, rk4
-from sideslip.envs.template import car_of
-from sideslip.envs.tyres import FIALA, LINEAR, Inputs, load_of
+from sideslip.envs.engine.packing import car_of
+from sideslip.envs.vehicle.dynamics import Car, Motion, Push, Road, derivative, frame_of, rk4
+from sideslip.envs.vehicle.tyres import FIALA, LINEAR, Inputs, load_of
 
 pytestmark = pytest.mark.plain
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from sideslip.envs import COMS, StabilityEnv, Vehicle
-from sideslip.envs.dynamics import Motion, Push, Road, derivative, frame_of, rk4
-from sideslip.envs.linear import bicycle
-from sideslip.envs.template import car_of
-from sideslip.envs.tyres import LINEAR, Inputs, load_of
+from sideslip.envs.engine.packing import car_of
+from sideslip.envs.vehicle.dynamics import Motion, Push, Road, derivative, frame_of, rk4
+from sideslip.envs.vehicle.linear import bicycle
+from sideslip.envs.vehicle.tyres import LINEAR, Inputs, load_of
 
-from . import helpers
+from .. import helpers
 
 pytestmark = pytest.mark.plain
 

@@ -9,8 +9,13 @@ import pytest
 from scipy.signal import cont2discrete
 
 from sideslip.envs import COMS, PASSENGER_CAR, Vehicle, critical_speed
-from sideslip.envs.dynamics import Motion, Push, Road, derivative, frame_of
-from sideslip.envs.linear import (
+from sideslip.envs.engine.packing import car_of
+from sideslip.envs.sensors.camera import camera_sample
+from sideslip.envs.sensors.gps import gps_sample
+from sideslip.envs.sensors.noise import Noise
+from sideslip.envs.task.reference import target_of
+from sideslip.envs.vehicle.dynamics import Motion, Push, Road, derivative, frame_of
+from sideslip.envs.vehicle.linear import (
     LinearModel,
     bicycle,
     course,
@@ -19,10 +24,7 @@ from sideslip.envs.linear import (
     velocity_and_roll,
     vision,
 )
-from sideslip.envs.reference import target_of
-from sideslip.envs.sensors import Noise, camera_sample, gps_sample
-from sideslip.envs.template import car_of
-from sideslip.envs.tyres import LINEAR, Inputs, load_of
+from sideslip.envs.vehicle.tyres import LINEAR, Inputs, load_of
 
 pytestmark = pytest.mark.plain
 

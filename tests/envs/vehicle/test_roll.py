@@ -9,7 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sideslip.envs import COMS, PASSENGER_CAR, StabilityEnv
-from sideslip.envs.dynamics import (
+from sideslip.envs.engine.layout import P
+from sideslip.envs.engine.packing import car_of
+from sideslip.envs.record import FAST
+from sideslip.envs.vehicle.dynamics import (
     Car,
     Motion,
     Push,
@@ -19,14 +22,11 @@ from sideslip.envs.dynamics import (
     gravity_at,
     rk4,
 )
-from sideslip.envs.layout import P
-from sideslip.envs.record import FAST
-from sideslip.envs.template import car_of
-from sideslip.envs.tyres import FIALA, LINEAR, Inputs, load_of, load_transfer, tyre_forces
-from sideslip.envs.vehicle import GRAVITY
+from sideslip.envs.vehicle.tyres import FIALA, LINEAR, Inputs, load_of, load_transfer, tyre_forces
+from sideslip.envs.vehicle.vehicle import GRAVITY
 
-from .helpers import FULL, fast_rows, play, unwrapped
-from .helpers import LINEAR as PAPER
+from ..helpers import FULL, fast_rows, play, unwrapped
+from ..helpers import LINEAR as PAPER
 
 pytestmark = pytest.mark.plain
 

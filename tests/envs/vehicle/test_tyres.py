@@ -8,10 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sideslip.envs import COMS, PASSENGER_CAR
-from sideslip.envs.dynamics import Car, Motion, sideslip_angle
-from sideslip.envs.template import car_of
-from sideslip.envs.tyres import FIALA, LINEAR, SLOW, Inputs, lateral_force, load_of, slips
-from sideslip.envs.vehicle import GRAVITY
+from sideslip.envs.engine.packing import car_of
+from sideslip.envs.vehicle.dynamics import Car, Motion, sideslip_angle
+from sideslip.envs.vehicle.tyres import FIALA, LINEAR, SLOW, Inputs, lateral_force, load_of, slips
+from sideslip.envs.vehicle.vehicle import GRAVITY
 
 pytestmark = pytest.mark.plain
 

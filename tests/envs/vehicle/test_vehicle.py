@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from sideslip.envs import COMS, PASSENGER_CAR, VEHICLES, Vehicle, critical_speed, vehicle_from
-from sideslip.envs.vehicle import vehicle_from_file_values
+from sideslip.envs.vehicle.vehicle import vehicle_from_file_values
 
 pytestmark = pytest.mark.plain
 

@@ -7,7 +7,7 @@ import pytest
 
 from sideslip.envs.record import SlowSensor
 from sideslip.estimators import make_estimator
-from sideslip.estimators.bound import bound, riccati
+from sideslip.estimators.analysis.bound import bound, riccati
 from tests.estimators.simulation import CAMERA, FIG7, GPS, error, simulate
 
 SETS = {

@@ -8,8 +8,8 @@ import pytest
 
 from sideslip.envs.record import PACKET, Log, Record, SlowSensor
 from sideslip.estimators import make_estimator, smooth
+from tests.estimators.core.test_conditioning import CASES
 from tests.estimators.simulation import CAMERA, FIG7, GPS, Drive, simulate
-from tests.estimators.test_conditioning import CASES
 
 pytestmark = pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning")
 

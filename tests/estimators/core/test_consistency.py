@@ -13,12 +13,12 @@ import pytest
 from scipy.stats import chi2, kstest
 
 from sideslip.envs import Log
-from sideslip.envs.manoeuvres import scenario_from
 from sideslip.envs.record import PACKET
+from sideslip.envs.scenarios.manoeuvres import scenario_from
 from sideslip.estimators import Estimator, make_estimator
-from sideslip.estimators.bound import riccati_variances
-from sideslip.estimators.models import ROWS, states_for
-from sideslip.estimators.options import DISTURBANCE, NOISE
+from sideslip.estimators.analysis.bound import riccati_variances
+from sideslip.estimators.design.models import ROWS, states_for
+from sideslip.estimators.design.options import DISTURBANCE, NOISE
 from tests.estimators.drives import Drives, told
 
 RUNS = 128

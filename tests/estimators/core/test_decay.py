@@ -13,7 +13,7 @@ import pytest
 
 from sideslip.envs.record import FAST_WIDTH, PACKET_WIDTH, SLOW_NAMES, SlowSensor
 from sideslip.estimators import FILTERS, Estimator, UnobservableWarning, make_estimator
-from sideslip.estimators.stability import MARGINAL
+from sideslip.estimators.design.error_map import MARGINAL
 from tests.estimators.simulation import CAMERA, GPS
 
 quietly = pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning")

@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.envs.linear import vision
 from sideslip.envs.record import FAST, PACKET, Record, SlowSensor
-from sideslip.envs.vehicle import COMS
+from sideslip.envs.vehicle.linear import vision
+from sideslip.envs.vehicle.vehicle import COMS
 from sideslip.estimators import FILTERS, make_estimator
-from sideslip.estimators.papers import Filter
+from sideslip.estimators.filters import Filter
 from tests.estimators.simulation import CAMERA, FIG7, Drive, simulate
 
 V = FIG7.speed

@@ -8,7 +8,7 @@ import pytest
 
 from sideslip.envs.record import PACKET, SLOW_NAMES, Record, SlowSensor
 from sideslip.estimators import make_estimator
-from tests.estimators.fuzz import KINDS, good_packets, mixed, record_of
+from tests.estimators.core.fuzz import KINDS, good_packets, mixed, record_of
 
 pytestmark = pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning")
 

@@ -7,7 +7,7 @@ import pytest
 
 from sideslip.envs.record import FAST, FAST_WIDTH, PACKET, PACKET_WIDTH, Record, SlowSensor
 from sideslip.estimators import make_estimator
-from sideslip.estimators.memory import EVERY, RECENT, WINDOW
+from sideslip.estimators.core.memory import EVERY, RECENT, WINDOW
 from tests.estimators.simulation import CAMERA, FIG7
 
 V = FIG7.speed

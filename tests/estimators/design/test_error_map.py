@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from sideslip.envs.record import FAST, FAST_WIDTH, PACKET_WIDTH, SlowSensor
-from sideslip.envs.vehicle import COMS
+from sideslip.envs.vehicle.vehicle import COMS
 from sideslip.estimators import UnobservableWarning, make_estimator
-from sideslip.estimators.periodic import design
-from sideslip.estimators.stability import error_map, spectral_radius
+from sideslip.estimators.design.error_map import error_map, spectral_radius
+from sideslip.estimators.design.periodic import design
 from tests.estimators.simulation import CAMERA, FIG6, GPS, Drive, simulate
 
 ALL = [

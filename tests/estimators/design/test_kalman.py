@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.estimators import kalman
+from sideslip.estimators.design import kalman
 
 pytestmark = [pytest.mark.smoke, pytest.mark.plain]
 

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from sideslip.envs.linear import course, velocity_and_roll, vision
 from sideslip.envs.record import SlowSensor
-from sideslip.envs.vehicle import COMS, PASSENGER_CAR
+from sideslip.envs.vehicle.linear import course, velocity_and_roll, vision
+from sideslip.envs.vehicle.vehicle import COMS, PASSENGER_CAR
 from sideslip.estimators import make_estimator
-from sideslip.estimators.transition import build, discretise
+from sideslip.estimators.core.transition import build, discretise
 from tests.estimators.simulation import CAMERA, GPS
 
 STEPS = (0.001, 0.01, 0.033, 0.1, 0.2)

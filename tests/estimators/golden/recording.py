@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from sideslip.envs import Log, StabilityEnv
-from sideslip.envs.manoeuvres import scenario_from
 from sideslip.envs.record import PACKET, Fast, concatenate
-from sideslip.envs.vehicle import Vehicle
+from sideslip.envs.scenarios.manoeuvres import scenario_from
+from sideslip.envs.vehicle.vehicle import Vehicle
 from sideslip.estimators import FILTERS, UnobservableWarning, make_estimator
 
 FOLDER = Path(__file__).parent

@@ -7,9 +7,19 @@ import pytest
 from scipy.signal import place_poles
 
 from sideslip.envs.record import FAST, PACKET
-from sideslip.envs.vehicle import COMS
+from sideslip.envs.vehicle.vehicle import COMS
 from sideslip.estimators import make_estimator
-from tests.estimators.literal import COURSE, T, car, correct, due, excited, inputs, pushed, zoh
+from tests.estimators.papers.literal import (
+    COURSE,
+    T,
+    car,
+    correct,
+    due,
+    excited,
+    inputs,
+    pushed,
+    zoh,
+)
 from tests.estimators.simulation import FIG6, GPS, simulate
 
 pytestmark = pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning")

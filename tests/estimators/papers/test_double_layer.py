@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from sideslip.envs.record import FAST, FAST_WIDTH, PACKET, PACKET_WIDTH, SlowSensor
-from sideslip.envs.vehicle import COMS, GRAVITY
+from sideslip.envs.vehicle.vehicle import COMS, GRAVITY
 from sideslip.estimators import make_estimator
-from sideslip.estimators.periodic import design
-from sideslip.estimators.schedule import NO_SENSOR
-from tests.estimators.literal import (
+from sideslip.estimators.design.periodic import design
+from sideslip.estimators.design.schedule import NO_SENSOR
+from tests.estimators.papers.literal import (
     COURSE,
     T,
     car,

@@ -7,7 +7,17 @@ import pytest
 
 from sideslip.envs.record import FAST, PACKET, SlowSensor
 from sideslip.estimators import make_estimator
-from tests.estimators.literal import T, car, correct, due, excited, gain, inputs, settled, zoh
+from tests.estimators.papers.literal import (
+    T,
+    car,
+    correct,
+    due,
+    excited,
+    gain,
+    inputs,
+    settled,
+    zoh,
+)
 from tests.estimators.simulation import CAMERA, FIG7, simulate
 
 V = FIG7.speed

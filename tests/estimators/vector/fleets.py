@@ -9,10 +9,10 @@ import numpy as np
 from gymnasium.vector import SyncVectorEnv
 
 import sideslip  # noqa: F401  registers the environments
-from sideslip.envs.sensor_sets import CAMERA_33_30, GPS_5_HZ
+from sideslip.envs.sensors.sets import CAMERA_33_30, GPS_5_HZ
 from sideslip.estimators import FILTERS, make_estimator
-from sideslip.estimators.vector import EstimateObservation
-from sideslip.estimators.wrappers import EstimateObservation as Single
+from sideslip.estimators.vector.estimate import EstimateObservation
+from sideslip.estimators.wrappers.estimate import EstimateObservation as Single
 from tests.envs.helpers import bits
 
 VISION, UNEVEN, GPS = (f"sideslip/Yaw{kind}-v0" for kind in ("Vision", "VisionUneven", "Gps"))

@@ -11,8 +11,8 @@ import pytest
 from sideslip.envs import COMS, Log, SlowSensor
 from sideslip.envs.record import FAST, FAST_WIDTH, PACKET, PACKET_WIDTH
 from sideslip.estimators import FILTERS, make_estimator
-from sideslip.estimators.batch import BatchEstimator, make_batch
-from sideslip.estimators.designs import Told
+from sideslip.estimators.vector.batch import BatchEstimator, make_batch
+from sideslip.estimators.vector.designs import Told
 from tests.estimators.simulation import CAMERA, FIG7, GPS, KMH, simulate
 
 pytestmark = pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning")

@@ -13,9 +13,9 @@ from gymnasium.vector.utils import batch_space
 
 from sideslip.envs import COMS
 from sideslip.estimators import FILTERS
-from sideslip.estimators.vector import EstimateObservation
-from sideslip.estimators.wrappers import EstimateObservation as Single
-from tests.estimators.fleets import (
+from sideslip.estimators.vector.estimate import EstimateObservation
+from sideslip.estimators.wrappers.estimate import EstimateObservation as Single
+from tests.estimators.vector.fleets import (
     MODES,
     UNEVEN,
     VISION,

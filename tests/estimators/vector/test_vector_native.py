@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 
 from sideslip.estimators import FILTERS
-from sideslip.estimators.vector import EstimateObservation, TruthObservation
-from sideslip.estimators.wrappers import EstimateObservation as Single
+from sideslip.estimators.vector.estimate import EstimateObservation
+from sideslip.estimators.vector.truth import TruthObservation
+from sideslip.estimators.wrappers.estimate import EstimateObservation as Single
 from tests.envs.batches import MODES, pair
 from tests.envs.helpers import IDS
-from tests.estimators.fleets import BAD, VISION, home, outputs, same_bits
+from tests.estimators.vector.fleets import BAD, VISION, home, outputs, same_bits
 
 pytestmark = pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning")
 

@@ -9,8 +9,8 @@ from gymnasium.envs.classic_control import CartPoleEnv
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import SyncVectorEnv
 
-from sideslip.estimators.vector import EstimateObservation
-from tests.estimators.fleets import BAD, VISION, fleet
+from sideslip.estimators.vector.estimate import EstimateObservation
+from tests.estimators.vector.fleets import BAD, VISION, fleet
 
 pytestmark = pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning")
 

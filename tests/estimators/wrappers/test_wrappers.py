@@ -13,7 +13,8 @@ from gymnasium.utils.env_checker import check_env
 import sideslip  # noqa: F401  registers the environments
 from sideslip.agents.rollout import rollout
 from sideslip.envs import COMS
-from sideslip.estimators import EstimateObservation, make_estimator, vector
+from sideslip.estimators import EstimateObservation, make_estimator
+from sideslip.estimators.vector import estimate as vector
 
 pytestmark = pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning")
 

@@ -1,0 +1,1 @@
+"""Controllers: one file each, around the compiled law of `base.Controller`."""

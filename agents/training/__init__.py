@@ -1,0 +1,1 @@
+"""Training with stable-baselines3, and the export of what it learned; needs the extra `train`."""

@@ -1,0 +1,1 @@
+"""What claims are measured with: simulations, filters, controllers, plots, the verdicts' rule."""

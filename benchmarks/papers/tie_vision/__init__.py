@@ -1,0 +1,1 @@
+"""tie-vision's claims: estimation, control with Table II and its margins, convergence, appendix."""

@@ -1,0 +1,1 @@
+"""Replay of recorded drives: estimators on a log, scored where the log knows the truth."""

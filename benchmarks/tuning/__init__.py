@@ -1,0 +1,1 @@
+"""The search for a filter's noise levels with Optuna."""

@@ -1,0 +1,44 @@
+"""The text of a compiled function, rebuilt for another kind of numbers."""
+
+import types
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from numba.core.dispatcher import Dispatcher
+
+from .arrays import fixed_tuple
+from .decorators import F
+from .primitives import minimum
+
+_TABLED = {fixed_tuple.__module__, minimum.__module__}  # what a table may replace
+
+
+def plain(function: F, table: Mapping[str, Callable[..., Any]] | None = None) -> F:
+    """The same text without the compiler.
+
+    Parameters: `function`, compiled by `jit` or not; `table`, primitives by name that replace
+    ours (`ARRAYS` for NumPy arrays, None for Python floats).
+    Returns: a function built from the same code object, its callees replaced likewise.
+    """
+    rebuilt: F = _rebuild(function, dict(table or {}), {})
+    return rebuilt
+
+
+def _rebuild(function: Any, table: dict[str, Any], done: dict[Any, Any]) -> Any:
+    source = function.py_func if isinstance(function, Dispatcher) else function
+    if source.__name__ in table and source.__module__ in _TABLED:
+        return table[source.__name__]
+    if source in done:
+        return done[source]
+    names: dict[str, Any] = dict(source.__globals__)
+    rebuilt = types.FunctionType(source.__code__, names, source.__name__, source.__defaults__)
+    done[source] = rebuilt
+    for name in source.__code__.co_names:
+        callee = names.get(name)
+        ours = isinstance(callee, types.FunctionType) and (callee.__module__ or "").startswith(
+            __name__.rpartition(".envs")[0]
+        )
+        if isinstance(callee, Dispatcher) or ours:
+            names[name] = _rebuild(callee, table, done)
+    del names["__name__"]  # by which torch.compile would look the names up in the module itself
+    return rebuilt

@@ -1,0 +1,87 @@
+"""Random draws of an episode: ranges, the numbers drawn from them, and unstable cars redrawn."""
+
+from typing import Any, NamedTuple
+
+from ..backend.arrays import fixed_tuple
+from ..backend.decorators import jit
+from ..backend.primitives import select
+from ..backend.random import CHANNELS, uniforms
+
+_ATTEMPTS = 64
+
+
+class Draws(NamedTuple):
+    """The quantities a scenario gives as a number or a range."""
+
+    speed: Any  # m/s
+    friction: Any
+    front_stiffness: Any  # factor on the vehicle's
+    rear_stiffness: Any
+    onset: Any  # s
+    amplitude: Any  # rad
+    amplitude_2: Any  # rad, of the second pair of a random steering
+    frequency: Any  # Hz
+    frequency_2: Any
+    frequency_3: Any
+    frequency_4: Any
+    hold: Any  # s, of a step, a dwell, a ramp, a sweep; from one lane change to the next
+    wind_force: Any  # N
+    wind_arm: Any  # m, ahead of the centre of gravity
+    wind_start: Any  # s
+    wind_length: Any  # s
+    side: Any  # uniform in (0, 1): below a half the steering is mirrored
+    wind_side: Any
+    curvature: Any  # 1/m, of the road
+    path_speed: Any  # m/s at which a track has its standard's lengths; 0 always
+    friction_right: Any  # 0 as on the left
+    tyre_change_time: Any  # s; 0 never
+    front_change: Any  # factors on the stiffness from then on
+    rear_change: Any
+
+
+DRAWS_WIDTH = len(Draws._fields)
+
+
+@jit
+def draw(low: Any, high: Any, key_low: int, key_high: int, attempt: int, drawn: Any) -> None:
+    """Fill `drawn` (len(Draws)) with numbers in [low, high]; fixed ones keep their bits."""
+    u = uniforms(key_low, key_high, attempt, CHANNELS.scenario, 0)
+    for i in range(len(drawn)):
+        if i % 4 == 0:
+            u = uniforms(key_low, key_high, attempt, CHANNELS.scenario, i // 4)
+        drawn[i] = low[i] + (high[i] - low[i]) * u[i % 4]
+
+
+@jit
+def stable(d: Any, car: Any) -> Any:
+    """Whether the drawn linear vehicle is stable at the drawn speed (with 5 % to spare), before
+    its tyres change and after."""
+    C_f, C_r = car.C_f * d.front_stiffness, car.C_r * d.rear_stiffness
+    changes = d.tyre_change_time > 0.0
+    later_f = C_f * select(changes, d.front_change, 1.0)
+    later_r = C_r * select(changes, d.rear_change, 1.0)
+    return _holds(C_f, C_r, d.speed, car) & _holds(later_f, later_r, d.speed, car)
+
+
+@jit
+def _holds(C_f: Any, C_r: Any, speed: Any, car: Any) -> Any:
+    excess = C_f * car.l_f - C_r * car.l_r
+    l, v = car.l_f + car.l_r, 1.05 * speed  # noqa: E741
+    return car.m * v * v * excess < 2.0 * C_f * C_r * l * l
+
+
+@jit
+def realise(low: Any, high: Any, key_low: int, key_high: int, car: Any, drawn: Any) -> Any:
+    """Draw until the vehicle is stable; returns (the draws, how many unstable ones were lost)."""
+    attempt = 0
+    draw(low, high, key_low, key_high, attempt, drawn)
+    while attempt + 1 < _ATTEMPTS and not stable(Draws(*fixed_tuple(drawn, DRAWS_WIDTH)), car):
+        attempt += 1
+        draw(low, high, key_low, key_high, attempt, drawn)
+    return Draws(*fixed_tuple(drawn, DRAWS_WIDTH)), attempt
+
+
+Range = float | tuple[float, float]
+"""A number, or the (low, high) that the seed draws from uniformly."""
+
+KMH = 1.0 / 3.6

@@ -1,0 +1,19 @@
+"""The camera: heading relative to the road and lateral offset at the preview point."""
+
+from typing import Any
+
+from ..backend.decorators import jit
+from ..backend.elementary import wrap
+from ..vehicle.dynamics import curvature_at
+
+
+@jit
+def camera_sample(motion: Any, road: Any, l_pre: Any, noise: Any, n: Any) -> Any:
+    """(psi, y_l): heading relative to the road, and offset at the preview point.
+
+    y_l = y_cg + l_pre psi - kappa l_pre^2 / 2, tie-vision (4) with curvature.
+    """
+    psi = motion.psi - motion.theta
+    bend = 0.5 * curvature_at(road, motion.s) * l_pre * l_pre
+    y_l = motion.y + l_pre * psi - bend
+    return wrap(psi + noise.camera_psi * n[0]), y_l + noise.camera_y * n[1]

@@ -1,0 +1,65 @@
+"""The GPS: course, speed and position of the antenna, HDOP and satellites."""
+
+from typing import Any, NamedTuple
+
+from ..backend.decorators import jit
+from ..backend.elementary import sincos, wrap
+from ..backend.primitives import floor, maximum, minimum, select, sqrt
+from ..vehicle.dynamics import sideslip_angle
+from ..vehicle.tyres import SLOW
+
+COURSE_SPEED = 1.0  # m/s; below it a course has quality 0
+HDOP_LAWS = {"constant": 0.0, "half": 0.5, "table": 1.0}
+"""How much of the GPS's noise follows HDOP: its standard deviations are (1 + w (HDOP - 1)) times
+those of `Noise`, which are those at HDOP 1."""
+OUTAGE_JUMP = 3.0  # of the spread of log HDOP, upwards where an outage ends
+
+
+class Sky(NamedTuple):
+    """What the GPS sees of the satellites: log HDOP is an Ornstein-Uhlenbeck process."""
+
+    median: Any  # log of the median HDOP
+    spread: Any  # standard deviation of log HDOP
+    keep: Any  # what is left of a deviation after one period of the GPS
+    fresh: Any  # sqrt(1 - keep^2)
+    weight: Any  # of HDOP in the noise, HDOP_LAWS
+
+
+@jit
+def sky_deviation(before: Any, sky: Any, link: Any, tick: Any, n: Any) -> Any:
+    """The deviation of log HDOP at a capture, from that at the one before."""
+    back = (link.outage_end > link.outage_start) & (tick >= link.outage_end)
+    back = back & (tick - link.period < link.outage_end)
+    jump = select(back, OUTAGE_JUMP * sky.spread, 0.0)
+    return sky.keep * before + sky.fresh * sky.spread * n[0] + jump
+
+
+@jit
+def satellites_at(hdop: Any) -> Any:
+    """How many satellites a receiver sees at an HDOP: 12 at 1, 4 up to 5, fewer above."""
+    return floor(2.0 + minimum(10.0 / hdop, 28.0))
+
+
+@jit
+def gps_sample(
+    motion: Any, ahead: Any, left: Any, hdop: Any, weight: Any, noise: Any, n: Any, small_angle: int
+) -> Any:
+    """(course, speed, X, Y, hdop, satellites, quality) of an antenna at (ahead, left).
+
+    course = psi + beta, dakf-stability (3), where beta, as all else, is the antenna's.
+    """
+    v_x, v_y = motion.v_x - motion.gamma * left, motion.v_y + motion.gamma * ahead
+    s, c = sincos(motion.psi)
+    size = 1.0 + weight * (hdop - 1.0)
+    v = sqrt(v_x * v_x + v_y * v_y)
+    angle = motion.psi + sideslip_angle(v_x, v_y, small_angle)
+    course = wrap(angle + noise.course * size / maximum(v, SLOW) * n[0])
+    return (
+        course,
+        v + noise.gps_speed * size * n[1],
+        motion.X + (ahead * c - left * s) + noise.gps_position * size * n[2],
+        motion.Y + (ahead * s + left * c) + noise.gps_position * size * n[3],
+        hdop,
+        satellites_at(hdop),
+        select(v < COURSE_SPEED, 0.0, 1.0),
+    )

@@ -1,0 +1,1 @@
+"""The task: references, cost, failures, and what observation and info contain."""
