@@ -70,26 +70,26 @@ class Card:
         **rest: Any,
     ) -> "Card":
         """A card with the observation of this env and estimator; rest: the other fields."""
-        told: JsonMap = {
+        options: JsonMap = {
             "env_id": env_id,
             "env_options": dict(env_options or {}),
             "estimator": estimator,
             "estimator_options": dict(estimator_options or {}),
         }
-        env: gym.Env[Any, Any] = gym.make(env_id, **told["env_options"])
+        env: gym.Env[Any, Any] = gym.make(env_id, **options["env_options"])
         if estimator:
-            env = EstimateObservation(env, estimator, **told["estimator_options"])
+            env = EstimateObservation(env, estimator, **options["estimator_options"])
         seen = given(env)
         env.close()
         entries = tuple((entry.name, entry.unit) for entry in seen.layout)
-        told |= {"control_period": int(seen.control_period), "reference": seen.reference}
-        return cls(observation=entries, **told, **rest)
+        options |= {"control_period": int(seen.control_period), "reference": seen.reference}
+        return cls(observation=entries, **options, **rest)
 
     @classmethod
-    def from_mapping(cls, told: Any) -> "Card":
+    def from_mapping(cls, content: Any) -> "Card":
         """A card from its JSON object; ValueError for a field that is missing or unknown."""
-        if not isinstance(told, dict):
-            raise ValueError(f"a card is a JSON object, got {type(told).__name__}")
+        if not isinstance(content, dict):
+            raise ValueError(f"a card is a JSON object, got {type(content).__name__}")
         known = {each.name: each for each in fields(cls)}
         needed = {
             name
@@ -97,12 +97,12 @@ class Card:
             if each.default is MISSING and each.default_factory is MISSING
         }
         for what, names in (
-            ("lacks", needed - told.keys()),
-            ("has unknown fields:", told.keys() - known),
+            ("lacks", needed - content.keys()),
+            ("has unknown fields:", content.keys() - known),
         ):
             if names:
                 raise ValueError(f"the card {what} {', '.join(sorted(names))}")
-        return cls(**told)
+        return cls(**content)
 
     def to_json(self, **more: Any) -> str:
         """The card as a JSON object, with further fields."""

@@ -103,9 +103,9 @@ def load_policy(path: str | Path) -> Policy:
     except (SafetensorError, OSError, TypeError) as error:
         raise ValueError(f"{found} is no safetensors file, or is cut short: {error}") from None
     try:
-        told = _told(metadata)
-        network = _network(told.pop("network", None), told.get("observation"), tensors)
-        return Policy(found.stem, network, Card.from_mapping(told))
+        fields = _card_fields(metadata)
+        network = _network(fields.pop("network", None), fields.get("observation"), tensors)
+        return Policy(found.stem, network, Card.from_mapping(fields))
     except ValueError as error:
         raise ValueError(f"{found}: {error}") from None
 
@@ -114,15 +114,15 @@ def _found(path: str | Path) -> Path:
     name = str(path)
     if name in shipped():
         return FOLDER / f"{name}{ENDING}"
-    given = Path(path)
-    if not given.is_file():
-        what = "is a folder" if given.is_dir() else "does not exist"
+    file = Path(path)
+    if not file.is_file():
+        what = "is a folder" if file.is_dir() else "does not exist"
         names = ", ".join(shipped()) or "none"
         raise FileNotFoundError(f"policy {name} {what}; shipped policies: {names}")
-    return given
+    return file
 
 
-def _told(metadata: dict[str, str]) -> dict[str, Any]:
+def _card_fields(metadata: dict[str, str]) -> dict[str, Any]:
     """The card's JSON object with the architecture, checked as far as the format goes."""
     if not {"format", "card"} <= metadata.keys():
         raise ValueError("safetensors without a card: this is not a policy of sideslip")
@@ -132,24 +132,24 @@ def _told(metadata: dict[str, str]) -> dict[str, Any]:
             "a newer sideslip made it"
         )
     try:
-        told = json.loads(metadata["card"])
+        fields = json.loads(metadata["card"])
     except json.JSONDecodeError as error:
         raise ValueError(f"the card is no JSON: {error}") from None
-    if not isinstance(told, dict):
-        raise ValueError(f"a card is a JSON object, got {type(told).__name__}")
-    return told
+    if not isinstance(fields, dict):
+        raise ValueError(f"a card is a JSON object, got {type(fields).__name__}")
+    return fields
 
 
-def _network(told: Any, observation: Any, tensors: dict[str, npt.NDArray[Any]]) -> Network:
+def _network(fields: Any, observation: Any, tensors: dict[str, npt.NDArray[Any]]) -> Network:
     """The network that the card describes, from tensors of the shapes that it says."""
-    if not isinstance(told, dict) or set(told) != set(_ARCHITECTURE):
-        raise ValueError(f"the card's network holds {', '.join(_ARCHITECTURE)}, got {told!r}")
+    if not isinstance(fields, dict) or set(fields) != set(_ARCHITECTURE):
+        raise ValueError(f"the card's network holds {', '.join(_ARCHITECTURE)}, got {fields!r}")
     if not isinstance(observation, list):
         raise ValueError(f"the card's observation is a list, got {observation!r}")
-    hidden, clip = told["hidden"], told["clip"]
-    sizes = [*hidden, told["action_width"]] if isinstance(hidden, list) else []
+    hidden, clip = fields["hidden"], fields["clip"]
+    sizes = [*hidden, fields["action_width"]] if isinstance(hidden, list) else []
     if not sizes or not all(type(size) is int and size > 0 for size in sizes):
-        raise ValueError(f"the card's layer sizes are positive integers, got {told!r}")
+        raise ValueError(f"the card's layer sizes are positive integers, got {fields!r}")
     if not (clip is None or type(clip) in (int, float)):
         raise ValueError(f"clip is above zero or None, got {clip!r}")
     _check_tensors(tensors, len(observation), sizes)
@@ -158,8 +158,8 @@ def _network(told: Any, observation: Any, tensors: dict[str, npt.NDArray[Any]]) 
         tensors["scale"],
         [tensors[f"weight_{i}"] for i in range(len(sizes))],
         [tensors[f"bias_{i}"] for i in range(len(sizes))],
-        str(told["activation"]),
-        str(told["output"]),
+        str(fields["activation"]),
+        str(fields["output"]),
         clip,
     )
 

@@ -44,8 +44,8 @@ class Network:
             object.__setattr__(self, name, tuple(each.astype(np.float64) for each in single))
         for name, known in (("activation", ACTIVATIONS), ("output", OUTPUTS)):
             if getattr(self, name) not in known:
-                told = getattr(self, name)
-                raise ValueError(f"unknown {name} {told!r}; known: {', '.join(known)}")
+                value = getattr(self, name)
+                raise ValueError(f"unknown {name} {value!r}; known: {', '.join(known)}")
         if self.clip is not None and not self.clip > 0.0:
             raise ValueError(f"clip is above zero or None, got {self.clip!r}")
         self._check_shapes()

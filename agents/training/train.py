@@ -127,9 +127,9 @@ def train(
         raise ValueError(f"steps is at least 1, got {steps}")
     torch.set_num_threads(1)  # on small matrices threads only wait for each other
     place = Path(folder)
-    told = _start(task, place, resume)
-    keeper = _Keeper(task, place, told, report, command)
-    model = keeper.build(told)
+    checkpoint = _start(task, place, resume)
+    keeper = _Keeper(task, place, checkpoint, report, command)
+    model = keeper.build(checkpoint)
     done = model.num_timesteps
     if done < steps:
         model.learn(steps - done, callback=keeper, reset_num_timesteps=done == 0)
@@ -137,8 +137,8 @@ def train(
     return Trained(model, tuple(keeper.evaluations))
 
 
-def task_in(folder: str | Path, **given: Any) -> Task:
-    """The task of a folder's checkpoint; ValueError where something given is another.
+def task_in(folder: str | Path, **arguments: Any) -> Task:
+    """The task of a folder's checkpoint; ValueError where an argument differs from it.
 
     Raises FileNotFoundError where there is no checkpoint.
     """
@@ -147,7 +147,7 @@ def task_in(folder: str | Path, **given: Any) -> Task:
         raise FileNotFoundError(f"{folder} holds no training to go on with: no {CHECKPOINT}")
     saved = read_told(path)["task"]
     task = Task(**{each.name: saved[each.name] for each in fields(Task)})
-    for name, value in given.items():
+    for name, value in arguments.items():
         if value != getattr(task, name):
             raise ValueError(
                 f"{path} is of {name} {getattr(task, name)!r}, not {value!r}: train that in "
@@ -176,7 +176,7 @@ class _Keeper(BaseCallback):
         self,
         task: Task,
         folder: Path,
-        told: Mapping[str, Any] | None,
+        checkpoint: Mapping[str, Any] | None,
         report: Callable[[Progress], None] | None,
         command: str,
     ) -> None:
@@ -186,14 +186,14 @@ class _Keeper(BaseCallback):
         self.tested = task.vector_env(EPISODES)
         base: Any = self.tested.unwrapped
         self.period: float = base.control_period * base.dt  # s
-        saved = {} if told is None else told
+        saved = {} if checkpoint is None else checkpoint
         self.evaluations = [Evaluation(*each) for each in saved.get("evaluations", [])]
         self.none: float = saved.get("none") or self._cost(NoControl(self.tested))
         self.scaling: Any = saved.get("scaling")
         self.spent = self.evaluations[-1].cpu_seconds if self.evaluations else 0.0
         self.since = time.process_time()
 
-    def build(self, told: Mapping[str, Any] | None) -> BaseAlgorithm:
+    def build(self, checkpoint: Mapping[str, Any] | None) -> BaseAlgorithm:
         """The model, new or of the checkpoint, with the environments it is trained on."""
         task, algorithm = self.task, algorithm_of(self.task.algo)
         if self.scaling is None:
@@ -207,10 +207,10 @@ class _Keeper(BaseCallback):
             env_kwargs=task.env_options,
         )
         period = self.period
-        steps = 0 if told is None else int(told["steps"])
+        steps = 0 if checkpoint is None else int(checkpoint["steps"])
         seed = (task.seed + steps) % 2**32
         model = algorithm.make(PerSecond(env, period), period, self.scaling, seed)
-        if told is not None:
+        if checkpoint is not None:
             load_parameters(self.folder / CHECKPOINT, model)
         model.num_timesteps = steps
         env.seed(_TRAINING + task.seed * _ROOM + steps)
@@ -244,7 +244,7 @@ class _Keeper(BaseCallback):
         if all(cost < each.cost for each in self.evaluations):
             self._keep_best(now)
         self.evaluations.append(now)
-        told = {
+        checkpoint = {
             "sideslip": __version__,
             "task": asdict(self.task),
             "steps": self.model.num_timesteps,
@@ -252,7 +252,7 @@ class _Keeper(BaseCallback):
             "scaling": self.scaling,
             "evaluations": self.evaluations,
         }
-        save_checkpoint(self.folder / CHECKPOINT, self.model, told)
+        save_checkpoint(self.folder / CHECKPOINT, self.model, checkpoint)
         lines = "".join(json.dumps(each._asdict()) + "\n" for each in self.evaluations)
         write_whole(self.folder / CURVE, lines.encode())
         self.since = time.process_time()
@@ -276,6 +276,8 @@ class _Keeper(BaseCallback):
         part.replace(self.folder / BEST)
 
 
-def with_defaults(**given: Any) -> Task:
-    """A task of what is given, None standing for the default."""
-    return replace(Task(), **{name: value for name, value in given.items() if value is not None})
+def with_defaults(**arguments: Any) -> Task:
+    """A task with these arguments, None standing for the default."""
+    return replace(
+        Task(), **{name: value for name, value in arguments.items() if value is not None}
+    )

@@ -109,19 +109,19 @@ class NativeVecEnv(VecEnv):
         actions, self._actions = self._actions, None
         obs, rewards, terminated, truncated, infos = self.vector_env.step(actions)
         dones = terminated | truncated
-        told: list[dict[str, Any]] = [NOTHING] * self.num_envs
+        each: list[dict[str, Any]] = [NOTHING] * self.num_envs
         if "final_obs" in infos:
             ended = np.flatnonzero(dones).tolist()
             finals = _rows_of(infos["final_info"], ended)
             for i, info in zip(ended, finals, strict=True):
                 info["TimeLimit.truncated"] = bool(truncated[i] and not terminated[i])
                 info["terminal_observation"] = infos["final_obs"][i]
-                told[i] = info
+                each[i] = info
             self._keep(ended, infos)
-        return obs, rewards.astype(np.float32), dones, told
+        return obs, rewards.astype(np.float32), dones, each
 
     def _keep(self, rows: Sequence[int], infos: Mapping[str, Any]) -> None:
-        """Remember what the resets of these rows told."""
+        """Remember the infos that the resets of these rows returned."""
         more = {key: each for key, each in infos.items() if "final_" not in key}
         for i, info in zip(rows, _rows_of(more, rows), strict=True):
             self.reset_infos[i] = info_of(self._base.reports[i])[0] | info
@@ -195,24 +195,24 @@ def make_native_env(
             f"{env_id} has no native vector env of this package; for single environments there is "
             "stable_baselines3.common.env_util.make_vec_env"
         )
-    told: dict[str, Any] = {"autoreset_mode": "SameStep", "info": "ends", **(env_kwargs or {})}
-    env: VectorEnv[Any, Any, Any] = gym.make_vec(env_id, num_envs=num_envs, **told)
+    arguments: dict[str, Any] = {"autoreset_mode": "SameStep", "info": "ends", **(env_kwargs or {})}
+    env: VectorEnv[Any, Any, Any] = gym.make_vec(env_id, num_envs=num_envs, **arguments)
     if estimator is None:
         return env
-    wish = {"estimator": estimator} if isinstance(estimator, str) else dict(estimator)
-    return EstimateObservation(env, **wish)
+    how = {"estimator": estimator} if isinstance(estimator, str) else dict(estimator)
+    return EstimateObservation(env, **how)
 
 
 def _rows_of(infos: Mapping[str, Any], rows: Sequence[int]) -> list[dict[str, Any]]:
-    """What a vector env's infos tell of some rows, as the single env's infos."""
-    told: list[dict[str, Any]] = [{} for _ in rows]
+    """A vector env's infos of some rows, as the single env's infos."""
+    singles: list[dict[str, Any]] = [{} for _ in rows]
     for key, column in infos.items():
         if not key.startswith("_"):
             values, there = column[rows].tolist(), infos[f"_{key}"][rows].tolist()
-            for info, value, known in zip(told, values, there, strict=True):
+            for info, value, known in zip(singles, values, there, strict=True):
                 if known:
                     info[key] = value
-    return told
+    return singles
 
 
 def _merged(options: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:

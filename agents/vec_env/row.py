@@ -29,7 +29,7 @@ _TWINS: dict[type, type] = {
 
 
 class Row:
-    """Row i of a vector env: what it tells are attributes of the single env of the same name.
+    """Row i of a vector env: its attributes are those of the single env of the same name.
 
     Attributes: those of `_OWN`, `_SHARED` and `_SPACES`, the methods, and what was set here.
     """
@@ -58,8 +58,8 @@ class Row:
                 if there in vars(layer) or hasattr(type(layer), there):
                     value = getattr(layer, there)
                     return self._own(name, value) if name in _OWN else value
-        told = (*_OWN, *_SHARED, *_SPACES, *_METHODS, *self._set)
-        raise AttributeError(f"a row of a vector env tells {', '.join(told)}; not {name!r}")
+        known = (*_OWN, *_SHARED, *_SPACES, *_METHODS, *self._set)
+        raise AttributeError(f"a row of a vector env has {', '.join(known)}; not {name!r}")
 
     def _own(self, name: str, value: Any) -> Any:
         return Motion(*value[self._i].tolist()) if name == "motion" else value[self._i]
@@ -87,8 +87,8 @@ class Row:
         """Start a new episode in this row alone; its observation (k,) and info."""
         mask = np.arange(self._env.num_envs) == self._i
         seeds: Any = [seed if mine else None for mine in mask]
-        told = {name: [value] * len(mask) for name, value in (options or {}).items()}
-        obs, _ = self._env.reset(seed=seeds, options={**told, "reset_mask": mask})
+        more = {name: [value] * len(mask) for name, value in (options or {}).items()}
+        obs, _ = self._env.reset(seed=seeds, options={**more, "reset_mask": mask})
         base: Any = self._env.unwrapped
         return obs[self._i], info_of(base.reports[self._i])[0]
 

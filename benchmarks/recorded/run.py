@@ -1,4 +1,4 @@
-"""Estimators over one recorded drive: what they are told, and how far they are from the truth."""
+"""Estimators over one recorded drive: their settings, and how far they are from the truth."""
 
 import dataclasses
 import math
@@ -29,7 +29,7 @@ ESTIMATORS: dict[str, tuple[str, ...]] = {
 """The estimators of a replay and the slow sensors that serve them, the better one first."""
 
 SETTLED = 2.0  # s: errors count from here on
-LEAST_NOISE = 0.01  # deg, of the course, that estimators are told
+LEAST_NOISE = 0.01  # deg, of the course, the least that estimators assume
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,9 +37,9 @@ class Settings(Emulation):
     """How a drive is replayed, on top of `Emulation`.
 
     estimators: names in `ESTIMATORS`; None: all. The gyro-only one always runs along.
-    q_beta, q_gamma, q_psi: process noise told to every estimator in rad2/s, (rad/s)2/s, rad2/s; the
-    course noise they are told is `course_noise_deg`. seeds: how many noises of the emulated course,
-    from `seed` on. stiffness_factor: of both tyre stiffnesses the estimators are told. figures:
+    q_beta, q_gamma, q_psi: process noise of every estimator in rad2/s, (rad/s)2/s, rad2/s; the
+    course noise they assume is `course_noise_deg`. seeds: how many noises of the emulated course,
+    from `seed` on. stiffness_factor: of both tyre stiffnesses of the estimators. figures:
     whether to draw.
 
     Raises ValueError for a value out of range and an unknown estimator.
@@ -118,7 +118,7 @@ def drives_of(log: Log, how: Settings) -> list[Log]:
     return [how.with_course(log, how.seed + i) for i in range(how.seeds)]
 
 
-def run_estimators(drives: Sequence[Log], told: Vehicle, how: Settings) -> Result:
+def run_estimators(drives: Sequence[Log], vehicle: Vehicle, how: Settings) -> Result:
     """Every wanted estimator that the drives' slow sensors serve, over every drive."""
     log, result = drives[0], Result()
     counts = log.time >= log.time[0] + SETTLED - 1e-9
@@ -135,7 +135,7 @@ def run_estimators(drives: Sequence[Log], told: Vehicle, how: Settings) -> Resul
             result.remarks[name] = f"left out: needs {' or '.join(serves)}"
             continue
         try:
-            estimator = _estimator(name, slow, log, told, how)
+            estimator = _estimator(name, slow, log, vehicle, how)
         except ValueError as error:
             if name == GYRO_ONLY:
                 raise
@@ -158,13 +158,13 @@ def run_estimators(drives: Sequence[Log], told: Vehicle, how: Settings) -> Resul
     return result
 
 
-def _estimator(name: str, slow: str | None, log: Log, told: Vehicle, how: Settings) -> Any:
+def _estimator(name: str, slow: str | None, log: Log, vehicle: Vehicle, how: Settings) -> Any:
     sensors: dict[str, SlowSensor] = {} if slow is None else {slow: log.slow[slow]}
     options: dict[str, Any] = {"q_beta": how.q_beta, "q_gamma": how.q_gamma}
     if slow is not None:
         options |= {"slow": slow, "q_psi": how.q_psi}
     if slow == "gps":
         options["course_noise"] = math.radians(max(how.course_noise_deg, LEAST_NOISE))
-    with warnings.catch_warnings():  # the result says it
+    with warnings.catch_warnings():  # the result names them
         warnings.simplefilter("ignore", UnobservableWarning)
-        return make_estimator(name, vehicle=told, sensors=sensors, dt=log.record.dt, **options)
+        return make_estimator(name, vehicle=vehicle, sensors=sensors, dt=log.record.dt, **options)

@@ -29,12 +29,12 @@ HIDDEN = "Names that are pale in the legend are hidden; a click shows them."
 
 
 def replay(log: Log, vehicle: Vehicle, **settings: Any) -> Suite:
-    """Run the estimators over a recorded drive, told this vehicle, and score them.
+    """Run the estimators over a recorded drive, designed from this vehicle, and score them.
 
     settings: of `Settings` (course_rate, course_noise_deg, delay, bias_deg, gyro_bias_degps,
     estimators, q_beta, q_gamma, q_psi, seeds, seed, stiffness_factor, figures). A log that carries
     slow sensors is replayed with those; else a GPS course is emulated where the log knows the true
-    sideslip; else estimators that need a slow sensor are left out, and the table says so. Without
+    sideslip; else estimators that need a slow sensor are left out, and the table notes it. Without
     truth nothing is scored, but drawn.
 
     Rows: rmse (rad, from 2 s on), ratio (over gyro-only) and us_per_tick; value is the median, low
@@ -43,19 +43,19 @@ def replay(log: Log, vehicle: Vehicle, **settings: Any) -> Suite:
     Raises TypeError for an unknown setting, ValueError for a bad one and for a drive under 2 s.
     """
     how = Settings(**settings)
-    told = vehicle.scaled(how.stiffness_factor)
+    car = vehicle.scaled(how.stiffness_factor)
     drives = drives_of(log, how)
-    result = run_estimators(drives, told, how)
-    suite = Suite("replay", f"A recorded drive: {log.name}", _text(log, drives, told, how))
-    suite.rows = _rows(result, log.name, told, how)
-    suite.tables = [_table(result, log.name, told, len(drives))]
+    result = run_estimators(drives, car, how)
+    suite = Suite("replay", f"A recorded drive: {log.name}", _text(log, drives, car, how))
+    suite.rows = _rows(result, log.name, car, how)
+    suite.tables = [_table(result, log.name, car, len(drives))]
     if how.figures:
         suite.figures = _figures(result, log)
     return suite
 
 
 def corners(log: Log, vehicle: Vehicle, **settings: Any) -> Suite:
-    """`replay` told the four corners of a vehicle: front and rear stiffness x 0.7 and x 1.3.
+    """`replay` with the four corners of a vehicle: front and rear stiffness x 0.7 and x 1.3.
 
     settings: of `replay`. One table, the rows of every corner, no figures. Raises what `replay`
     does, and ValueError for a log without truth.
@@ -67,12 +67,12 @@ def corners(log: Log, vehicle: Vehicle, **settings: Any) -> Suite:
     suite = Suite("replay", f"A recorded drive: {log.name}", "")
     results = {}
     for front, rear in CORNERS:
-        told = vehicle.scaled(how.stiffness_factor).scaled(front, rear)
-        result = results[f"{front} / {rear}"] = run_estimators(drives, told, how)
+        car = vehicle.scaled(how.stiffness_factor).scaled(front, rear)
+        result = results[f"{front} / {rear}"] = run_estimators(drives, car, how)
         scenario = f"{log.name}: {vehicle.name}, front x {front}, rear x {rear}"
-        suite.rows += _rows(result, scenario, told, how)
+        suite.rows += _rows(result, scenario, car, how)
     names = [name for name in ESTIMATORS if any(name in r.squares for r in results.values())]
-    title = f"{log.name}, told {vehicle.name} with front / rear stiffness x ...: RMSE / deg"
+    title = f"{log.name}, {vehicle.name} with front / rear stiffness x ...: RMSE / deg"
     cells = [[name, *(_error(result, name) for result in results.values())] for name in names]
     note = "The same process noise in all corners; medians over the noises."
     suite.tables = [Table(title, ("estimator", *results), cells, note)]
@@ -89,22 +89,22 @@ def replay_file(
     """Read a drive and its vehicle, replay it, and where it has truth the vehicle's corners too.
 
     vehicle: a TOML or JSON file, or the name of one that comes with the package. None: the Ferrari
-    250 LM of the Stanford log, told the fitted tyres x 0.7, and the corners of the nominal one.
+    250 LM of the Stanford log, with the fitted tyres x 0.7, and the corners of the nominal one.
     mapping: texts such as "steer_rad=Delta". settings: of `replay`. Raises what `read_log`,
     `read_vehicle` and `replay` do.
     """
     drive = read_log(log, parse_mapping(mapping or ()))
     if vehicle is None:
-        told, nominal = read_vehicle(FITTED), read_vehicle(NOMINAL)
-        suite = replay(drive, told, **{"stiffness_factor": FACTOR} | settings)
+        fitted, nominal = read_vehicle(FITTED), read_vehicle(NOMINAL)
+        suite = replay(drive, fitted, **{"stiffness_factor": FACTOR} | settings)
         suite.text += (
-            "\n\nNo vehicle was named, so the estimators were told the Ferrari 250 LM of the "
+            "\n\nNo vehicle was named, so the estimators assume the Ferrari 250 LM of the "
             f"Stanford log, fitted tyres x {FACTOR}. For another car name its file: "
             "`--vehicle FILE`."
         )
     else:
-        told = nominal = read_vehicle(vehicle)
-        suite = replay(drive, told, **settings)
+        nominal = read_vehicle(vehicle)
+        suite = replay(drive, nominal, **settings)
     if "beta" in drive.truth:
         wrong = corners(drive, nominal, **settings)
         suite.rows += wrong.rows
@@ -112,9 +112,9 @@ def replay_file(
     return suite
 
 
-def _text(log: Log, drives: Sequence[Log], told: Vehicle, how: Settings) -> str:
+def _text(log: Log, drives: Sequence[Log], car: Vehicle, how: Settings) -> str:
     lasts, rate = log.time[-1] - log.time[0], 1.0 / log.record.dt
-    text = [f"{lasts:.0f} s at {rate:.4g} Hz. The estimators are told the vehicle {told.name!r}"]
+    text = [f"{lasts:.0f} s at {rate:.4g} Hz. The estimators are designed from {car.name!r}"]
     if how.stiffness_factor != 1.0:
         text.append(f"with both tyre stiffnesses x {how.stiffness_factor:g}")
     text.append(
@@ -141,9 +141,9 @@ def _text(log: Log, drives: Sequence[Log], told: Vehicle, how: Settings) -> str:
     return " ".join(text)
 
 
-def _rows(result: Result, scenario: str, told: Vehicle, how: Settings) -> list[Row]:
+def _rows(result: Result, scenario: str, car: Vehicle, how: Settings) -> list[Row]:
     """Every number of a result."""
-    spec = json.dumps({"vehicle": told.to_dict(), "settings": how.as_dict()})
+    spec = json.dumps({"vehicle": car.to_dict(), "settings": how.as_dict()})
     rows = []
     for name, cost in result.cost.items():
         measured: dict[str, tuple[float, ...]] = {"us_per_tick": (cost,)}
@@ -175,13 +175,13 @@ def _error(result: Result, name: str) -> str:
     return f"{DEGREES * result.rmse(name)[0]:.2f}" if name in result.squares else "-"
 
 
-def _table(result: Result, name: str, told: Vehicle, noises: int) -> Table:
+def _table(result: Result, name: str, car: Vehicle, noises: int) -> Table:
     """The estimators, best first; remarks in the note."""
     note = "; ".join(f"`{label}` {remark}" for label, remark in result.remarks.items())
     if not result.squares:
         cells = [[label, f"{cost:.3f}"] for label, cost in result.cost.items()]
         header: tuple[str, ...] = ("estimator", "us per tick")
-        return Table(f"{name}, told {told.name}: no truth, no score", header, cells, note)
+        return Table(f"{name}, designed from {car.name}: no truth, no score", header, cells, note)
     header = ("estimator", "RMSE / deg", "least .. most", "of gyro only", "us per tick")
     cells = []
     for label in sorted(result.squares, key=lambda label: result.rmse(label)[0]):
@@ -189,7 +189,7 @@ def _table(result: Result, name: str, told: Vehicle, noises: int) -> Table:
         ratio, cost = result.ratio(label)[0], result.cost[label]
         among = f"{low:.3f} .. {high:.3f}"
         cells.append([label, f"{value:.3f}", among, f"{ratio:.2f}", f"{cost:.3f}"])
-    title = f"{name}, told {told.name}: error of the sideslip angle (median of {noises} noises)"
+    title = f"{name}, {car.name}: error of the sideslip angle (median of {noises} noises)"
     return Table(title, header, cells, note)
 
 

@@ -47,8 +47,8 @@ def c_plant(block: int) -> Any:
     """
     with TemporaryDirectory() as folder:
         library = Path(folder) / "plant.so"
-        told = [*FLAGS, *VECTORS, f"-DBLOCK={block}", "-shared", "-fPIC"]
-        command = [compiler(), *told, "-x", "c", "-", "-o", str(library)]
+        flags = [*FLAGS, *VECTORS, f"-DBLOCK={block}", "-shared", "-fPIC"]
+        command = [compiler(), *flags, "-x", "c", "-", "-o", str(library)]
         run = subprocess.run(command, input=source(), capture_output=True, text=True)
         if run.returncode:
             last = (run.stderr.strip().splitlines() or ["it gave no reason"])[-1]

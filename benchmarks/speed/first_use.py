@@ -1,6 +1,6 @@
 """What the first use costs, by processes of their own: imports, the first step, compilation.
 
-Kernels are compiled once and kept on disk; a cold one is compiled in a temporary folder.
+Kernels are compiled once and cached on disk; a cold one is compiled in a temporary folder.
 """
 
 import json
@@ -55,27 +55,27 @@ _COLD = """
 import gymnasium as gym, numpy as np
 from sideslip.estimators import EstimateObservation
 from sideslip.estimators.vector import EstimateObservation as EstimateObservations
-told = {"estimator": "exact-kf", "options": {"gains": "covariance"}}
+how = {"estimator": "exact-kf", "options": {"gains": "covariance"}}
 def run(env, shape):
     env.reset(seed=0)
     env.step(np.zeros(shape, np.float32))
 id = "sideslip/YawFusion-v0"
 run(gym.make(id), 1)
 run(gym.make_vec(id, num_envs=8), (8, 1))
-run(EstimateObservation(gym.make(id), **told), 1)
-run(EstimateObservations(gym.make_vec(id, num_envs=8), **told), (8, 1))
+run(EstimateObservation(gym.make(id), **how), 1)
+run(EstimateObservations(gym.make_vec(id, num_envs=8), **how), (8, 1))
 """
 
 
 def warm() -> dict[str, float]:
     """CPU seconds of each thing a fresh process does up to its first step.
 
-    Raises AbsentError where that takes minutes, because no kernels are kept on disk.
+    Raises AbsentError where that takes minutes, because no kernels are cached on disk.
     """
     try:
         marks: list[tuple[str, float]] = json.loads(_python(_WARM, limit=LIMIT))
     except subprocess.TimeoutExpired:
-        raise AbsentError("no kernels are kept on disk here") from None
+        raise AbsentError("no kernels are cached on disk here") from None
     before = [0.0, *(at for _, at in marks)]
     return {name: at - before[i] for i, (name, at) in enumerate(marks)}
 
@@ -85,15 +85,15 @@ def cold(code: str = _COLD) -> list[tuple[str, float]]:
     those of kernels that it calls as they stand."""
     with TemporaryDirectory() as folder:
         here = {"XDG_CACHE_HOME": folder, "NUMBA_CACHE_DIR": ""}
-        said = _python(f"{_WATCH}\n{code}\nprint(json.dumps(taken))", here)
-    return [(str(name), float(seconds)) for name, seconds in json.loads(said)]
+        printed = _python(f"{_WATCH}\n{code}\nprint(json.dumps(taken))", here)
+    return [(str(name), float(seconds)) for name, seconds in json.loads(printed)]
 
 
 def _python(code: str, variables: dict[str, str] | None = None, limit: float | None = None) -> str:
     """What code prints in an interpreter of its own that finds the same packages."""
-    told = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)} | (variables or {})
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)} | (variables or {})
     command = [sys.executable, "-c", code]
-    run = subprocess.run(command, env=told, capture_output=True, text=True, timeout=limit)
+    run = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=limit)
     if run.returncode:
         raise RuntimeError(f"a fresh process failed:\n{run.stderr}")
     return run.stdout.splitlines()[-1]

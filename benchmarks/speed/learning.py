@@ -37,9 +37,9 @@ def _learner(env: Any, steps: int, **settings: Any) -> Contestant:
 def _ours() -> Contestant:
     from ...agents.vec_env.env import make_vec_env
 
-    told = _settings()
+    settings = _settings()
     env = make_vec_env("sideslip/YawFusion-v0", COUNT, seed=0)
-    return _learner(env, COUNT * told["n_steps"], **told)
+    return _learner(env, COUNT * settings["n_steps"], **settings)
 
 
 def _settings() -> dict[str, Any]:

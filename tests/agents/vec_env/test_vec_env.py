@@ -137,7 +137,7 @@ def test_a_row_tells_what_a_single_environment_tells() -> None:
     assert ours.env_method("get_wrapper_attr", "dt", indices=[0, 2]) == [0.001, 0.001]
     assert ours.env_method("has_wrapper_attr", "speed") == [False] * 3
     assert ours.has_attr("layout") and not ours.has_attr("envs")
-    with pytest.raises(AttributeError, match=r"a row of a vector env tells vehicle.*not 'speed'"):
+    with pytest.raises(AttributeError, match=r"a row of a vector env has vehicle.*not 'speed'"):
         ours.get_attr("speed")
 
 

@@ -190,7 +190,7 @@ def test_where_no_kernels_are_kept_the_first_step_is_absent(
     measured = Suite("speed", "", "")
     seconds, absent = first_use.add(measured, 1, compiling=False)
     assert seconds == {} and measured.rows == []
-    assert absent[first_use.FIRST] == "no kernels are kept on disk here"
+    assert absent[first_use.FIRST] == "no kernels are cached on disk here"
 
 
 def test_ratios_are_taken_round_by_round() -> None:
