@@ -51,7 +51,7 @@ def levels_of(scenario: Scenario) -> dict[str, Any]:
     """
     noise = dict(scenario.noise)
     share = HDOP_LAWS[scenario.hdop_law]
-    more = 1.0 if scenario.linear_tyres else TYRES
+    more = 1.0 if scenario.tyres == "linear" else TYRES
     told = {
         "force_sd": more * scenario.disturbance_force,
         "moment_sd": more * scenario.disturbance_moment,

@@ -20,7 +20,7 @@ from ..task.reference import REFERENCES, target_of
 from ..ticks import FOREVER, TICK, ticks
 from ..vehicle.actuators import lag_of
 from ..vehicle.dynamics import Car, Road
-from ..vehicle.tyres import FIALA, LINEAR
+from ..vehicle.tyres import TYRE_LAWS
 from ..vehicle.vehicle import GRAVITY, Vehicle
 from .layout import Change, Disturbance, P, Switches, Task
 
@@ -179,7 +179,7 @@ def template_of(
     low, high = scenario.draws()
     switches = Switches(
         int(scenario.small_angle),
-        LINEAR if scenario.linear_tyres else FIALA,
+        TYRE_LAWS.index(scenario.tyres),
         REFERENCES.index(reference),
         STEERING_KINDS.index(scenario.steering),
         int(all_samples),

@@ -14,7 +14,7 @@ _OURS = (
     "bank",
     "grade",
     "small_angle",
-    "linear_tyres",
+    "tyres",
     "vehicle",
     "friction_right",
     "tyre_change_time",

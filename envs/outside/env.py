@@ -51,7 +51,7 @@ class OutsideEnv(StabilityEnv):
     the mean that the record tells. The multi-body model always rolls, the others never do.
 
     Raises ValueError for an unknown model, a scenario with a road or a plant that the model has
-    not (curvature, bank, grade, small_angle, linear_tyres, vehicle, friction_right,
+    not (curvature, bank, grade, small_angle, tyres, vehicle, friction_right,
     tyre_change_time; wind_height but for the multi-body model), one that has the multi-body model
     below 1 m/s or without roll, the reset option "vehicle" or a start off the road's own frame.
     """

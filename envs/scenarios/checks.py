@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 
 from ..sensors.gps import HDOP_LAWS
 from ..sensors.noise import Noise
+from ..vehicle.tyres import TYRE_LAWS
 from .draws import Draws
 from .steering import STEERING_KINDS
 from .tracks import PATHS
@@ -79,6 +80,7 @@ def _check_names(scenario: "Scenario") -> None:
         (scenario.steering, STEERING_KINDS, "steering"),
         (scenario.path, PATHS, "path"),
         (scenario.hdop_law, HDOP_LAWS, "hdop_law"),
+        (scenario.tyres, TYRE_LAWS, "tyres"),
     ):
         if value not in known:
             _refuse(scenario, f"unknown {what} {value!r}; known: {', '.join(known)}")

@@ -19,7 +19,7 @@ def _tyres(stiffness: float) -> dict[str, float]:
 
 _SIMULATED: dict[str, Any] = {  # the plant of the papers' own equations
     "small_angle": True,
-    "linear_tyres": True,
+    "tyres": "linear",
     "lags": False,
     "roll": False,
     "hdop": 1.0,

@@ -36,8 +36,8 @@ class Scenario:
     Car: front_stiffness and rear_stiffness are factors on the vehicle's; draws that make the car
     unstable at the drawn speed are drawn again and counted. From tyre_change_time (s, None: never,
     and then they are 1) on front_change and rear_change are further factors. vehicle and nominal:
-    parameters that
-    replace those of the env. small_angle, linear_tyres, lags, roll: the plant.
+    parameters that replace those of the env. tyres: a law of `TYRE_LAWS`. small_angle, lags, roll:
+    the rest of the plant.
 
     Surroundings: friction is the road's and replaces the vehicle's; friction_right, if given, is
     that under the right wheels. curvature, bank (rad, left side up) and grade (rad, uphill) come
@@ -112,7 +112,7 @@ class Scenario:
     hdop_time: float = 20.0
     hdop_law: str = "half"
     small_angle: bool = False
-    linear_tyres: bool = False
+    tyres: str = "fiala"
     lags: bool = True
     roll: bool = True
     scored: bool = True

@@ -1,6 +1,7 @@
-"""Tyres: what the driver and the motors ask of them, and what they give.
+"""Tyres: normal load, friction circle, slip and lateral force.
 
-Scalar functions over tuples, without branches on values, as in `dynamics`.
+Scalar functions over tuples, without branches on values, as in `dynamics`. A law of the lateral
+force has its name in `TYRE_LAWS` and its equation in `lateral_forces`, and is written nowhere else.
 """
 
 from typing import Any, NamedTuple
@@ -10,12 +11,15 @@ from ..backend.elementary import atan, sincos
 from ..backend.primitives import absolute, maximum, minimum, sqrt
 from .vehicle import GRAVITY
 
-LINEAR, FIALA = 0, 1
+TYRE_LAWS = ("linear", "fiala", "dugoff")
+"""The laws by the names that `Scenario.tyres` takes; a law's code is its place."""
+LINEAR, FIALA, DUGOFF = range(len(TYRE_LAWS))
+
 SLOW = 0.5  # m/s: below it slip is computed as at this speed, and beta is zero
 
 
 class Inputs(NamedTuple):
-    """What the actuators do at one instant."""
+    """Steering angle and motor torques at one instant."""
 
     delta_f: Any  # rad, front steering angle
     T_l: Any  # N m, left motor
@@ -23,7 +27,10 @@ class Inputs(NamedTuple):
 
 
 class Load(NamedTuple):
-    """What one instant's inputs mean for the tyres; computed once, used by several stages."""
+    """Steering, drive forces and lateral capacities of the tyres under one instant's Inputs.
+
+    Computed once, used by several Runge-Kutta stages.
+    """
 
     sin_d: Any  # of the front steering angle
     cos_d: Any
@@ -38,7 +45,7 @@ class Load(NamedTuple):
     slope_r: Any
     rear_l: Any  # N, capacity of the left and the right rear tyre in all directions, standing
     rear_r: Any
-    F_l: Any  # N, what the left and the right motor ask for
+    F_l: Any  # N, drive force that the left and the right motor command
     F_r: Any
 
 
@@ -51,18 +58,18 @@ def _squared_capacity(limit: Any, drive: Any) -> Any:
 
 @jit
 def shifts(small_angle: int, law: int, roll: int) -> int:
-    """1 where roll moves load from side to side: the rear tyres' limits are then those of the
-    motion and not of the inputs alone."""
-    return int(small_angle == 0 and law == FIALA and roll == 1)
+    """1 where roll moves load from side to side: the tyres' limits are then those of the motion
+    and not of the inputs alone. Tyres without a limit feel nothing of it."""
+    return int(small_angle == 0 and law != LINEAR and roll == 1)
 
 
 @jit
 def load_of(inputs: Any, car: Any, small_angle: int, shifting: int = 0) -> Any:
     """The Load of the Inputs of one instant.
 
-    The road may grip less on one side: each rear tyre has its own, which its motor feels; the
-    front tyres share the mean. shifting: what `shifts` says; with 1 the rear tyres' limits and
-    slopes, drive force and moment are those of the inputs without any friction.
+    The road may grip less on one side: each rear tyre has its own friction, which limits its
+    motor's force; the front tyres share the mean. shifting: of `shifts`; with 1 the rear tyres'
+    limits and slopes, drive force and moment are those of the inputs without any friction.
     """
     weight = car.m * GRAVITY / (2.0 * (car.l_f + car.l_r))
     front = 0.5 * (car.mu + car.mu_r) * weight * car.l_r
@@ -95,18 +102,54 @@ def load_of(inputs: Any, car: Any, small_angle: int, shifting: int = 0) -> Any:
     )
 
 
-@jit
-def lateral_force(tangent: Any, limit: Any, slope: Any, law: int) -> Any:
-    """Lateral force of one tyre in N from the tangent of its slip angle (linear: the angle).
+class Tyre(NamedTuple):
+    """One tyre at one instant."""
 
-    Fiala: z = clip(C t / 3 F_max, -1, 1), F_y = F_max z (3 - 3 |z| + z^2), which needs neither
-    branch nor arctangent.
+    tangent: Any  # of its slip angle t; of the small-angle plant the angle itself
+    limit: Any  # N, F_max: mu F_z, less what the friction circle leaves to the drive force
+    slope: Any  # C / 3 F_max
+
+
+@jit
+def _linear(tyre: Any, small_angle: int) -> Any:
+    """F_y = C atan t, without a limit."""
+    angle = tyre.tangent if small_angle else atan(tyre.tangent)
+    return 3.0 * tyre.limit * (tyre.slope * angle)
+
+
+@jit
+def _fiala(tyre: Any) -> Any:
+    """z = clip(C t / 3 F_max, -1, 1), F_y = F_max z (3 - 3 |z| + z^2), which needs neither branch
+    nor arctangent (Pacejka, Tire and Vehicle Dynamics, 3)."""
+    z = minimum(maximum(tyre.slope * tyre.tangent, -1.0), 1.0)
+    return tyre.limit * z * (3.0 - 3.0 * absolute(z) + z * z)
+
+
+@jit
+def _dugoff(tyre: Any) -> Any:
+    """F_y = C t q (2 - q), q = min(1, F_max / 2 C |t|) (Dugoff, Fancher, Segel, SAE 700377, 1970).
+
+    With u = C t / F_max that is F_max u up to |u| = 1/2 and F_max (1 - 1 / 4 |u|) from there on,
+    which comes close to the limit and never passes it.
     """
-    z = slope * tangent
+    u = 3.0 * (tyre.slope * tyre.tangent)
+    size = absolute(u)
+    share = minimum(size, 0.5) + (0.5 - 0.25 / maximum(size, 0.5))
+    return tyre.limit * minimum(maximum(u, 0.0 - share), share)
+
+
+@inlined
+def lateral_forces(a: Any, b: Any, c: Any, d: Any, law: int, small_angle: int) -> Any:
+    """Lateral forces in N of the four Tyres, front left and right, rear left and right.
+
+    All at once: the law is chosen once for the four of them.
+    """
     if law == LINEAR:
-        return 3.0 * limit * z
-    z = minimum(maximum(z, -1.0), 1.0)
-    return limit * z * (3.0 - 3.0 * absolute(z) + z * z)
+        s = small_angle
+        return _linear(a, s), _linear(b, s), _linear(c, s), _linear(d, s)
+    if law == DUGOFF:
+        return _dugoff(a), _dugoff(b), _dugoff(c), _dugoff(d)
+    return _fiala(a), _fiala(b), _fiala(c), _fiala(d)
 
 
 @jit
@@ -124,13 +167,10 @@ def _slip_ratios(motion: Any, load: Any, car: Any, small_angle: int) -> Any:
 
 
 @jit
-def slips(motion: Any, load: Any, car: Any, small_angle: int, law: int) -> Any:
-    """Tangents of the front and rear slip angle (the angles themselves for linear tyres)."""
+def slips(motion: Any, load: Any, car: Any, small_angle: int) -> Any:
+    """Tangents of the front and rear slip angle (the small-angle plant's angles themselves)."""
     across_f, along_f, across_r, along_r = _slip_ratios(motion, load, car, small_angle)
-    t_f, t_r = across_f / along_f, across_r / along_r
-    if law == LINEAR and not small_angle:
-        return atan(t_f), atan(t_r)
-    return t_f, t_r
+    return across_f / along_f, across_r / along_r
 
 
 @inlined
@@ -156,22 +196,22 @@ def tyre_forces(
 ) -> Any:
     """(F_yf, F_yr, F_x, N_z): lateral forces of the axles, drive force, moment of the motors.
 
-    g_y: m/s2, what the car feels of the road's bank. Roll moves load from side to side, which
-    matters to Fiala tyres only, and is left out of the small-angle plant.
+    g_y: m/s2, the road's bank as the car feels it. Roll moves load from side to side, which
+    matters to tyres with a limit only, and is left out of the small-angle plant.
     """
     if shifts(small_angle, law, roll):
-        return _shifted_forces(motion, load, car, g_y)
-    t_f, t_r = slips(motion, load, car, small_angle, law)
-    F_yf = 2.0 * lateral_force(t_f, load.limit_f, load.slope_f, law)
-    F_yr = lateral_force(t_r, load.limit_l, load.slope_l, law) + lateral_force(
-        t_r, load.limit_r, load.slope_r, law
-    )
-    return F_yf, F_yr, load.F_x, load.N_z
+        return _shifted_forces(motion, load, car, g_y, law)
+    t_f, t_r = slips(motion, load, car, small_angle)
+    front = Tyre(t_f, load.limit_f, load.slope_f)
+    left = Tyre(t_r, load.limit_l, load.slope_l)
+    right = Tyre(t_r, load.limit_r, load.slope_r)
+    F_fl, F_fr, F_rl, F_rr = lateral_forces(front, front, left, right, law, small_angle)
+    return F_fl + F_fr, F_rl + F_rr, load.F_x, load.N_z
 
 
 @inlined
-def _shifted_forces(motion: Any, load: Any, car: Any, g_y: Any) -> Any:
-    """`tyre_forces` of Fiala tyres whose load roll moves from side to side.
+def _shifted_forces(motion: Any, load: Any, car: Any, g_y: Any, law: int) -> Any:
+    """`tyre_forces` of tyres whose load roll moves from side to side.
 
     A quotient costs ten products: the slips' and the slopes' are all taken from one.
     """
@@ -187,10 +227,12 @@ def _shifted_forces(motion: Any, load: Any, car: Any, g_y: Any) -> Any:
     per = 1.0 / (along_f * along_r * (sides * squares))
     front = load.slope_f * (along_r * squares * per)  # C_f / 3 F_max of the standing tyre, 1/along
     rear = car.C_r * (1.0 / 3.0) * (along_f * sides * per)
-    F_yf = lateral_force(across_f, load.limit_f * narrow, front * wide, FIALA) + lateral_force(
-        across_f, load.limit_f * wide, front * narrow, FIALA
+    F_fl, F_fr, F_rl, F_rr = lateral_forces(
+        Tyre(across_f, load.limit_f * narrow, front * wide),
+        Tyre(across_f, load.limit_f * wide, front * narrow),
+        Tyre(across_r, left, rear * square_r * left),
+        Tyre(across_r, right, rear * square_l * right),
+        law,
+        0,
     )
-    F_yr = lateral_force(across_r, left, rear * square_r * left, FIALA) + lateral_force(
-        across_r, right, rear * square_l * right, FIALA
-    )
-    return F_yf, F_yr, F_l + F_r, 0.5 * car.d_r * (F_r - F_l)
+    return F_fl + F_fr, F_rl + F_rr, F_l + F_r, 0.5 * car.d_r * (F_r - F_l)

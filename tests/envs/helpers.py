@@ -32,7 +32,7 @@ LINEAR: dict[str, Any] = {
     "disturbance_force": 0.0,
     "disturbance_moment": 0.0,
     "small_angle": True,
-    "linear_tyres": True,
+    "tyres": "linear",
     "lags": False,
     "roll": False,
     "hdop": 1.0,
@@ -41,7 +41,7 @@ LINEAR: dict[str, Any] = {
 }
 """The papers' plant: nothing drawn, nothing disturbed, sensors without noise."""
 
-FULL: dict[str, Any] = LINEAR | {"small_angle": False, "linear_tyres": False}
+FULL: dict[str, Any] = LINEAR | {"small_angle": False, "tyres": "fiala"}
 """The same with the full equations and Fiala tyres."""
 
 

@@ -67,8 +67,9 @@ def test_a_symbolic_tick_is_the_envs(scenario: str, small_angle: bool, lags: boo
         {"base": "stiffness-step", "tyre_change_time": 0.1},
         {"base": "random-steering", "friction_right": 0.3, "friction": 0.8},
         {"base": "double-lane-change", "onset": 0.05},
+        {"base": "random-steering", "friction": 0.3, "tyres": "dugoff"},
     ],
-    ids=["changing tyres", "split friction", "driver"],
+    ids=["changing tyres", "split friction", "driver", "Dugoff tyres"],
 )
 def test_a_symbolic_tick_is_the_envs_where_the_road_the_tyres_or_the_driver_act(
     changes: dict[str, Any],

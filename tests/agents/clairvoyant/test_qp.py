@@ -17,7 +17,7 @@ assert sideslip.__version__
 LINEAR: dict[str, Any] = {
     "base": "random-steering",
     "small_angle": True,
-    "linear_tyres": True,
+    "tyres": "linear",
     "roll": False,
     "speed": 25.0 / 3.6,
     "onset": 0.0,

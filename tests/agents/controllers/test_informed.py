@@ -21,7 +21,7 @@ from sideslip.estimators.wrappers.truth import TruthObservation
 from tests.envs.helpers import bits
 
 FUSION = "sideslip/YawFusion-v0"
-LINEAR = {"base": "random-steering", "linear_tyres": True}
+LINEAR = {"base": "random-steering", "tyres": "linear"}
 OPTIONS: dict[str, Any] = {"outputs": OUTPUTS, "std": False, "vehicle": "truth"}
 
 
@@ -139,7 +139,7 @@ def test_knowing_the_car_pays() -> None:
 @pytest.mark.long
 def test_told_the_truth_the_filter_knows_its_error() -> None:
     """Small angles and linear tyres, car and speed drawn: the squared errors are those of P."""
-    plain = {"small_angle": True, "linear_tyres": True, "roll": False, "lags": False}
+    plain = {"small_angle": True, "tyres": "linear", "roll": False, "lags": False}
     env, agent = make_informed(FUSION, scenario={"base": "random-steering", **plain})
     means = []
     for seed in range(16):
@@ -156,12 +156,12 @@ def test_told_the_truth_the_filter_knows_its_error() -> None:
 
 def test_levels_are_the_scenarios() -> None:
     scenario = SCENARIOS["straight"].replace(
-        linear_tyres=True, disturbance_force=7.0, noise={"gyro": 0.1}, hdop_law="table"
+        tyres="linear", disturbance_force=7.0, noise={"gyro": 0.1}, hdop_law="table"
     )
     levels = levels_of(scenario)
     assert levels["force_sd"] == 7.0 and levels["gyro_noise"] == 0.1
     assert levels["hdop_table"] == [(1.0, 1.0), (101.0, 101.0)]
-    assert levels_of(scenario.replace(linear_tyres=False))["force_sd"] > 7.0
+    assert levels_of(scenario.replace(tyres="fiala"))["force_sd"] > 7.0
 
 
 def test_bad_input() -> None:

@@ -28,7 +28,7 @@ SCENARIO = {
     "duration": STEPS * PERIOD * TICK,
     "speed": V,
     "small_angle": True,
-    "linear_tyres": True,
+    "tyres": "linear",
     "roll": False,
     "disturbance_force": LEVELS["force_sd"],
     "disturbance_moment": LEVELS["moment_sd"],

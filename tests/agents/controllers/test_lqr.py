@@ -24,7 +24,7 @@ from sideslip.estimators import EstimateObservation
 SMALL = {
     "base": "straight",
     "small_angle": True,
-    "linear_tyres": True,
+    "tyres": "linear",
     "roll": False,
     "mirror": False,
     "speed": 7.0,

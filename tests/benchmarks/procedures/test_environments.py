@@ -14,7 +14,7 @@ from sideslip.envs.ticks import TICK
 from sideslip.envs.vehicle.vehicle import GRAVITY
 
 EACH = pytest.mark.parametrize("name", CARS)
-LINEAR = {"small_angle": True, "linear_tyres": True, "lags": False, "roll": False}
+LINEAR = {"small_angle": True, "tyres": "linear", "lags": False, "roll": False}
 
 
 def linear(name: str) -> Drive:

@@ -18,7 +18,7 @@ from sideslip.envs.scenarios import steering as programme
 from sideslip.envs.ticks import FOREVER
 from sideslip.envs.vehicle import dynamics, tyres
 from sideslip.envs.vehicle.dynamics import Motion, Push, Road
-from sideslip.envs.vehicle.tyres import Inputs
+from sideslip.envs.vehicle.tyres import TYRE_LAWS, Inputs
 
 from ..helpers import FULL, IDS, LINEAR, bits, play, unwrapped
 
@@ -28,7 +28,8 @@ RNG = np.random.default_rng(7)
 N = 60
 CARS = {"coms": car_of(COMS), "passenger-car": car_of(PASSENGER_CAR)}
 ROAD, PUSH = Road(0.01, -5.0, 20.0, 0.5, -0.3), Push(50.0, -20.0, 30.0)
-PLANTS = [(a, law, roll) for a in (0, 1) for law in (0, 1) for roll in (0, 1)]
+LAWS = range(len(TYRE_LAWS))
+PLANTS = [(a, law, roll) for a in (0, 1) for law in LAWS for roll in (0, 1)]
 SPREAD = np.array([9.0, 2.0, 1.0, 2.0, 50.0, 50.0, 20.0, 3.0, 2.0, 0.3, 1.0])
 
 

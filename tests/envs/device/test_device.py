@@ -83,6 +83,7 @@ ARGUMENTS: list[dict[str, Any]] = [
     {"vehicle": {"base": "coms", "steering_lag": 0.0}},
     {"camera": {"phase": None, "loss": 0.3, "duplicate": 0.3, "jitter": 0.05}},
     {"gps": {"phase": None}},
+    {"scenario": {"base": "sine-with-dwell", "tyres": "dugoff"}},
     {"gps": {"period": 0.1, "delays": (0.2, 0.05, 0.15, 0.1), "duplicate": 1.0}},
     {"yaw_first": False, "steering": True, "on_bad_action": "fail"},
 ]  # fmt: skip
@@ -102,7 +103,7 @@ FAILING: list[tuple[dict[str, Any], dict[str, Any], int]] = [
     (  # a car of a gram that rolls backwards on linear tyres: the numbers overflow in nine ticks
         {
             "vehicle": {"base": "coms", "mass": 1e-3, "yaw_inertia": 1e-3},
-            "scenario": FULL | {"linear_tyres": True, "small_angle": True, "half_width": 1e200},
+            "scenario": FULL | {"tyres": "linear", "small_angle": True, "half_width": 1e200},
         },
         {"state": {"v_x": -5.0, "gamma": 0.1}},
         3,

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from sideslip.envs import FAILURES, SCENARIOS, StabilityEnv, vehicle_from
 from sideslip.envs.engine.layout import P, Task
+from sideslip.envs.vehicle.tyres import TYRE_LAWS
 
 from ..helpers import FULL, Moment, fast_rows, play
 
@@ -79,7 +80,8 @@ TYPICAL = {
     state=st.fixed_dictionaries(
         {name: st.floats(-50.0, 50.0) for name in ("v_x", "v_y", "gamma", "psi", "theta", "s")}
     ),
-    plant=st.tuples(st.booleans(), st.booleans(), st.booleans(), st.booleans()),
+    plant=st.tuples(st.booleans(), st.booleans(), st.booleans()),
+    tyres=st.sampled_from(TYRE_LAWS),
     slope=st.tuples(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5)),
     kappa=st.floats(-1.0, 1.0),
 )
@@ -87,11 +89,12 @@ def test_vehicles_that_nobody_builds(
     vehicle: dict[str, float],
     state: dict[str, float],
     plant: tuple[bool, ...],
+    tyres: str,
     slope: tuple[float, float],
     kappa: float,
 ) -> None:
     """Also where 1 ms is far too long a step for the integrator."""
-    small_angle, linear_tyres, lags, roll = plant
+    small_angle, lags, roll = plant
     try:
         vehicle_from({"base": "coms", **vehicle}).check_roll()
     except ValueError:
@@ -102,7 +105,7 @@ def test_vehicles_that_nobody_builds(
         "curvature": kappa,
         "curve_start": 0.0,
         "small_angle": small_angle,
-        "linear_tyres": linear_tyres,
+        "tyres": tyres,
         "lags": lags,
         "roll": roll,
         "bank": slope[0],
@@ -122,7 +125,7 @@ def test_vehicles_that_nobody_builds(
 def test_a_state_that_overflows_ends_the_episode() -> None:
     """A car of a gram on linear tyres: the integrator makes it a thousand times faster a tick."""
     light = {"base": "coms", "mass": 1e-3, "yaw_inertia": 1e-3}
-    scenario = FULL | {"linear_tyres": True, "small_angle": True}
+    scenario = FULL | {"tyres": "linear", "small_angle": True}
     env = StabilityEnv(vehicle=light, scenario=scenario, reference="model")
     start = env.reset(seed=0, options={"state": {"gamma": 0.1}})
     env.set_state(without_limits(env))

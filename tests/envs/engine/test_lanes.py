@@ -128,9 +128,10 @@ KINDS: list[dict[str, Any]] = [
     {"base": "curved-road-driver"},
     {"base": "stiffness-step", "tyre_change_time": 0.1},
     {"base": "split-friction", "roll": False},
-    {"base": "gust", "linear_tyres": True},
-    {"base": "step-steer", "small_angle": True, "linear_tyres": True},
+    {"base": "gust", "tyres": "linear"},
+    {"base": "step-steer", "small_angle": True, "tyres": "linear"},
     {"base": "random-steering", "bank": 0.05, "grade": -0.03},
+    {"base": "random-steering", "tyres": "dugoff"},
 ]
 
 

@@ -178,7 +178,7 @@ def test_a_wheel_at_rest_in_a_spin_makes_the_state_no_number() -> None:
         ("bank", 0.05),
         ("grade", 0.05),
         ("small_angle", True),
-        ("linear_tyres", True),
+        ("tyres", "linear"),
         ("vehicle", {"mass": 1500.0}),
         ("friction_right", 0.3),
         ("tyre_change_time", 1.0),

@@ -118,7 +118,7 @@ def test_papers_simulations_are_as_PAPERS_gives_them(name: str) -> None:
     rolls = "double-layer" in name
     assert scenario.speed == 25.0 / 3.6
     assert scenario.held_speed == (None if rolls else 25.0 / 3.6)
-    assert (scenario.small_angle, scenario.linear_tyres, scenario.roll) == (True, True, rolls)
+    assert (scenario.small_angle, scenario.tyres, scenario.roll) == (True, "linear", rolls)
     assert scenario.lags == fields.get("lags", False)
     assert (scenario.hdop, scenario.hdop_spread, scenario.hdop_law) == (1.0, 0.0, "constant")
     assert (scenario.disturbance_force, scenario.disturbance_moment, scenario.disturbance_time) == (

@@ -162,6 +162,7 @@ def test_round_trip_through_json(name: str) -> None:
         ({"acceleration": math.nan}, "acceleration nan is not finite"),
         ({"half_width": 0.0}, "half_width"),
         ({"half_width": math.nan}, "half_width nan is not finite"),
+        ({"tyres": "magic"}, "unknown tyres 'magic'; known: linear, fiala, dugoff"),
         ({"hdop_law": "squared"}, "unknown hdop_law 'squared'; known: constant, half, table"),
         ({"hdop": 0.0}, "hdop must be positive, got 0.0"),
         ({"hdop_spread": 2.0}, "hdop_spread is 0 to 1, got 2.0"),

@@ -11,14 +11,22 @@ from hypothesis import strategies as st
 from sideslip.envs import COMS, PASSENGER_CAR
 from sideslip.envs.engine.packing import car_of
 from sideslip.envs.vehicle.dynamics import Car, Motion, Push, Road, derivative, frame_of, rk4
-from sideslip.envs.vehicle.tyres import FIALA, LINEAR, Inputs, load_of
+from sideslip.envs.vehicle.tyres import (
+    FIALA,
+    LINEAR,
+    TYRE_LAWS,
+    Inputs,
+    Tyre,
+    lateral_forces,
+    load_of,
+)
 
 pytestmark = pytest.mark.plain
 
 CAR = car_of(COMS)
 STRAIGHT, CIRCLE = Road(0.0, 0.0, 1.0), Road(0.02, -1e6, 1.0)
 CALM = Push(0.0, 0.0)
-PLANTS = [(0, LINEAR), (0, FIALA), (1, LINEAR), (1, FIALA)]
+PLANTS = [(small_angle, law) for small_angle in (0, 1) for law in range(len(TYRE_LAWS))]
 speeds = st.floats(-3.0, 3.0)
 
 
@@ -62,10 +70,14 @@ def forces(state: Motion, steer: float, T: Any, small: int, law: int) -> list[fl
         left = limit if small else math.sqrt(limit**2 - F_x**2)
         if law == LINEAR:
             found.append(C * angle)
-        else:
-            t = angle if small else math.tan(angle)
+            continue
+        t = angle if small else math.tan(angle)
+        if law == FIALA:
             z = min(max(C * t / (3.0 * left), -1.0), 1.0)
             found.append(left * (3.0 * z - 3.0 * z * abs(z) + z**3))
+        else:
+            tyre = Tyre(t, left, C / (3.0 * left))
+            found.append(lateral_forces(tyre, tyre, tyre, tyre, law, small)[0])
     return [2.0 * found[0], *found[1:], *along[1:]]
 
 

@@ -22,7 +22,16 @@ from sideslip.envs.vehicle.dynamics import (
     gravity_at,
     rk4,
 )
-from sideslip.envs.vehicle.tyres import FIALA, LINEAR, Inputs, load_of, load_transfer, tyre_forces
+from sideslip.envs.vehicle.tyres import (
+    DUGOFF,
+    FIALA,
+    LINEAR,
+    TYRE_LAWS,
+    Inputs,
+    load_of,
+    load_transfer,
+    tyre_forces,
+)
 from sideslip.envs.vehicle.vehicle import GRAVITY
 
 from ..helpers import FULL, fast_rows, play, unwrapped
@@ -36,7 +45,7 @@ FLAT = Road(0.0, 0.0, 1.0)
 BANKED = Road(0.0, -1e6, 1.0, 9.81 * math.sin(0.2), 9.81 * math.sin(-0.1))
 CALM = Push(0.0, 0.0)
 small = st.floats(-0.3, 0.3)
-PLANTS = [(0, LINEAR), (0, FIALA), (1, LINEAR), (1, FIALA)]
+PLANTS = [(small_angle, law) for small_angle in (0, 1) for law in range(len(TYRE_LAWS))]
 
 
 def slope(state: Motion, push: Push = CALM, car: Car = CAR, road: Road = FLAT, **how: Any) -> Any:
@@ -191,7 +200,7 @@ def test_loads_move_by_the_moment_and_keep_their_sum(
     assert max(abs(front), abs(rear)) <= 0.9
 
 
-def test_load_transfer_costs_fiala_tyres_grip_and_nothing_else() -> None:
+def test_load_transfer_costs_tyres_with_a_limit_grip_and_nothing_else() -> None:
     upright = Motion(8.0, -0.8, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     leaning = upright._replace(phi=0.15)
     for small_angle, law in PLANTS:
@@ -200,7 +209,7 @@ def test_load_transfer_costs_fiala_tyres_grip_and_nothing_else() -> None:
         held = tyre_forces(upright, load, CAR, 0.0, small_angle, law, 1)
         lost = tyre_forces(leaning, load, CAR, 0.0, small_angle, law, 1)
         np.testing.assert_allclose(held, flat, rtol=1e-14, atol=0.0)
-        if law == FIALA and not small_angle:
+        if law != LINEAR and not small_angle:
             assert 0.0 < lost[0] < 0.99 * flat[0]
             assert 0.0 < lost[1] < 0.99 * flat[1]
             mirror = tyre_forces(leaning._replace(phi=-0.15), load, CAR, 0.0, 0, law, 1)
@@ -209,13 +218,14 @@ def test_load_transfer_costs_fiala_tyres_grip_and_nothing_else() -> None:
             assert lost == flat
 
 
+@pytest.mark.parametrize("law", [FIALA, DUGOFF])
 @given(st.floats(-500.0, 500.0), st.floats(-500.0, 500.0), st.floats(-0.2, 0.2), small)
 def test_rear_tyres_stay_within_the_friction_circle_of_their_own_load(
-    T_l: float, T_r: float, phi: float, v_y: float
+    law: int, T_l: float, T_r: float, phi: float, v_y: float
 ) -> None:
     state = Motion(8.0, 10.0 * v_y, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, phi)
     load = load_of(Inputs(0.0, T_l, T_r), CAR, 0)
-    _, F_yr, F_x, N_z = tyre_forces(state, load, CAR, 0.0, 0, FIALA, 1)
+    _, F_yr, F_x, N_z = tyre_forces(state, load, CAR, 0.0, 0, law, 1)
     share = load_transfer(state, CAR, 0.0)[1]
     left, right = load.rear_l * (1.0 - share), load.rear_r * (1.0 + share)
     F_l, F_r = 0.5 * F_x - N_z / CAR.d_r, 0.5 * F_x + N_z / CAR.d_r
@@ -264,7 +274,7 @@ def test_the_roll_gyro_and_the_accelerometer_sense_the_body() -> None:
 def test_accelerometers_on_a_slope_feel_gravity(small_angle: bool) -> None:
     """The driver holds speed and line against it: what is felt is the road's reaction."""
     slope = {"bank": 0.1, "grade": 0.05, "curve_start": -1e3, "lags": False, "friction": 5.0}
-    plant = {"small_angle": small_angle, "linear_tyres": True, "acceleration": 0.0}
+    plant = {"small_angle": small_angle, "tyres": "linear", "acceleration": 0.0}
     env = StabilityEnv(scenario=PAPER | plant | slope | {"duration": 1.0})
     env.reset(seed=0)
     start = env.record.fast[0]
