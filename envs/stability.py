@@ -11,7 +11,7 @@ from gymnasium.error import ResetNeeded
 
 from .arguments import action_of
 from .engine.config import Setting
-from .engine.layout import P, Z
+from .engine.layout import PARAMS_WIDTH, STATE_WIDTH, Z
 from .engine.reset import reset_vehicle
 from .engine.step import step_vehicle
 from .engine.views import motion_in, record_in, slow_in, vehicle_in
@@ -135,7 +135,7 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
         self._entries, self._width = len(self.layout), self.setting.action_width
         self._fails = on_bad_action == "fail"
         self.action_space = gym.spaces.Box(-1.0, 1.0, (self._width,), np.float32)
-        self._params, self._state = np.zeros(P.end), np.zeros(Z.end)
+        self._params, self._state = np.zeros(PARAMS_WIDTH), np.zeros(STATE_WIDTH)
         self._scratch = scratch_of(self.control_period)
         self.rows = np.zeros((self.control_period, FAST_WIDTH))
         self.packets = np.zeros((self.setting.room, PACKET_WIDTH))
@@ -265,7 +265,7 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
     @property
     def redraws(self) -> int:
         """Unstable draws thrown away at this reset."""
-        return int(self._state[Z.clock + 4])
+        return int(self._state[Z.clock.redraws])
 
     def annotate(self, **values: float) -> None:
         """Numbers to draw beside the truth, from wrappers (beta_hat, ...)."""

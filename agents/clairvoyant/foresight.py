@@ -6,18 +6,19 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from ...envs.backend.arrays import read
 from ...envs.backend.rebuild import plain
-from ...envs.engine.layout import Change, Drive, P, Switches, Task, Z
+from ...envs.engine.layout import Drive, P, Switches, Task, Z
 from ...envs.engine.step import step_vehicle
 from ...envs.engine.window import scratch_of
 from ...envs.scenarios.speed import Pace, acceleration_command
-from ...envs.scenarios.steering import DRIVER, STEERING_WIDTH, steering_at
-from ...envs.scenarios.wind import Wind, wind_at
+from ...envs.scenarios.steering import DRIVER, steering_at
+from ...envs.scenarios.wind import wind_at
 from ...envs.task.info import REPORT
 from ...envs.task.reference import Target
 from ...envs.ticks import FOREVER, TICK
 from ...envs.vehicle.actuators import Lag, lag_of, lagged
-from ...envs.vehicle.dynamics import Car, Motion, Road
+from ...envs.vehicle.dynamics import Car, Road
 
 Array = npt.NDArray[np.float64]
 
@@ -113,7 +114,7 @@ def foresee(base: Any, steps: int = 1, actions: Array | None = None) -> Foreseen
         raise ValueError(f"{steps} steps do not divide a control period of {n} ticks")
     snapshot = base.get_state()
     p, z = snapshot["params"], snapshot["state"]
-    if z[Z.clock + 2] != 0.0:
+    if z[Z.clock.tick] != 0.0:
         raise ValueError("an episode is foreseen from its start: call reset() first")
     start = state_of(z)
     fixed = _fixed(base, p, snapshot["template"].switches, n // steps, steps)
@@ -121,7 +122,7 @@ def foresee(base: Any, steps: int = 1, actions: Array | None = None) -> Foreseen
     if actions is None:
         actions = np.zeros((fixed.periods, fixed.width))
     drive, driver = _driven(base, snapshot, actions, n)
-    programme = tuple(p[P.steering : P.steering + STEERING_WIDTH].tolist())
+    programme = read(p, P.programme)
     reacts = fixed.switches.steering == DRIVER
     every = range(ticks + 1)
     command = driver if reacts else np.array([steering_at(float(k), programme) for k in every])
@@ -131,30 +132,23 @@ def foresee(base: Any, steps: int = 1, actions: Array | None = None) -> Foreseen
 
 def state_of(z: Array) -> State:
     """The State in a packed state vector of the env."""
-    motion = z[Z.motion : Z.motion + len(Motion._fields)].tolist()
-    drive = Drive(*z[Z.drive : Z.drive + len(Drive._fields)].tolist())
+    motion, drive = read(z, Z.motion), read(z, Z.drive)
     return State._make((*motion, drive.T_l, drive.T_r, drive.integral, drive.slewing, drive.added))
-
-
-def _part(kind: Any, p: Array, at: int) -> Any:
-    return kind(*p[at : at + len(kind._fields)].tolist())
 
 
 def _fixed(base: Any, p: Array, switches: Any, ticks: int, steps: int) -> Fixed:
     vehicle, lags = base.vehicle, base.scenario.lags
     motor, steering = (vehicle.motor_lag, vehicle.steering_lag) if lags else (0.0, 0.0)
-    task = _part(Task, p, P.task)
+    task = read(p, P.task)
     return Fixed(
-        _part(Car, p, P.car)._replace(C_f=0.0, C_r=0.0, mu=0.0, mu_r=0.0),
-        _part(Road, p, P.road),
-        _part(Pace, p, P.pace)._replace(
-            speed=0.0, acceleration=0.0, start=0.0, end=FOREVER, surge=0.0
-        ),
+        read(p, P.car)._replace(C_f=0.0, C_r=0.0, mu=0.0, mu_r=0.0),
+        read(p, P.road),
+        read(p, P.pace)._replace(speed=0.0, acceleration=0.0, start=0.0, end=FOREVER, surge=0.0),
         lag_of(motor, ticks * TICK),
         lag_of(steering, ticks * TICK),
         lag_of(motor, TICK),
         lag_of(steering, TICK),
-        _part(Target, p, P.target),
+        read(p, P.target),
         task,
         Switches(*np.asarray(switches).tolist()),
         base.action_space.shape[0],
@@ -178,7 +172,7 @@ def _driven(base: Any, snapshot: Any, actions: Array, n: int) -> tuple[Array, Ar
     ticks = n * len(actions)
     drive, driver = np.empty((ticks + 1, len(Drive._fields))), np.empty(ticks + 1)
     for tick in range(ticks + 1):
-        drive[tick] = z[Z.drive : Z.drive + drive.shape[1]]
+        drive[tick] = read(z, Z.drive)
         driver[tick] = z[Z.driver]
         told = (bounds, obs, rows, packets, report, scratch)
         step_vehicle(p, z, switches, taken[tick], 1, *told)
@@ -197,14 +191,14 @@ def _known(p: Array, fixed: Fixed, drive: Array, command: Array) -> Array:
         return np.asarray(plain(lagged)(command[ticks], angle[ticks], rest))
 
     lag, middle = fixed.steering_tick, at + q // 2
-    wind = _part(Wind, p, P.wind)
+    wind = read(p, P.wind)
     blown = np.array([wind_at(float(tick), wind) for tick in range(last)])
     forces = np.column_stack(
         [drive[:last, names.index("F_d")], drive[:last, names.index("N_d")], np.zeros(last)]
     )
     push = (forces + blown).reshape(-1, q, 3).mean(axis=1)
-    pace = np.array([_wish(float(tick), _part(Pace, p, P.pace)) for tick in at])
-    car, change = _part(Car, p, P.car), _part(Change, p, P.change)
+    pace = np.array([_wish(float(tick), read(p, P.pace)) for tick in at])
+    car, change = read(p, P.car), read(p, P.change)
     worn = at >= change.tick
     tyres = [
         np.where(worn, factor * stiffness, stiffness)

@@ -211,7 +211,7 @@ def actions_of(env: gym.Env[Any, Any], agent: Any, seed: int) -> Actions:
     """(K, width): what an agent does in an episode; zeros after a failure."""
     base: Any = env.unwrapped
     obs, _ = env.reset(seed=seed)
-    periods = -int(-base.get_state()["params"][P.task] // base.control_period)
+    periods = -int(-base.get_state()["params"][P.task.duration] // base.control_period)
     taken = np.zeros((periods, *base.action_space.shape), np.float32)
     state, first = None, np.ones(1, bool)
     for k in range(periods):

@@ -16,7 +16,7 @@ from rich.console import Console
 
 from ...envs.backend.on_torch import torch
 from ...envs.device.env import DeviceVectorEnv
-from ...envs.engine.layout import P
+from ...envs.engine.layout import PARAMS_WIDTH
 from ..harness.results import check_writable, write_text
 
 COUNTS = (1024, 16384, 65536, 262144, 1048576)
@@ -55,7 +55,7 @@ def bytes_of(env: DeviceVectorEnv) -> float:
     """The least that a step of one row moves: its parameters and its state are read, the state,
     the observation and the record are written."""
     held, brought = env.tensors()
-    read = sum(each.nbytes for each in held) + env.num_envs * P.end * env.dtype.itemsize
+    read = sum(each.nbytes for each in held) + env.num_envs * PARAMS_WIDTH * env.dtype.itemsize
     written = sum(each.nbytes for each in (*held, *brought))
     return (read + written) / env.num_envs
 

@@ -11,7 +11,7 @@ import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 
-from ...envs.backend.arrays import fixed_tuple, put
+from ...envs.backend.arrays import offsets, read, write
 from ...envs.backend.decorators import inlined, jit
 from ...envs.backend.simd import LANES
 from ...envs.engine.layout import P, Z
@@ -32,7 +32,9 @@ OURS = "plant"
 C = "plant in C"
 SINGLE_TRACK = "single track, CommonRoad"
 
-_CAR, _ROAD, _MOTION = len(Car._fields), len(Road._fields), len(Motion._fields)
+_CAR, _ROAD, _MOTION, _PUSH, _INPUTS = (
+    offsets(kind)[0] for kind in (Car, Road, Motion, Push, Inputs)
+)
 
 
 class Cars(NamedTuple):
@@ -68,18 +70,18 @@ def cars_of(count: int, seed: int = 0) -> Cars:
     env: Any = gym.make_vec("sideslip/YawFusion-v0", num_envs=count)
     env.reset(seed=seed)
     p, z, rng = env.params, env.states, np.random.default_rng(seed)
-    lags = p[0, P.steer + 1 : P.steer + 3], p[0, P.motor + 1 : P.motor + 3]
+    lags = [p[0, [lag.middle, lag.end]] for lag in (P.steering, P.motor)]
 
     def blocks(rows: Array) -> Array:
         return np.ascontiguousarray(rows.reshape(-1, LANES, rows.shape[1]).transpose(0, 2, 1))
 
     return Cars(
         np.concatenate(lags),
-        blocks(p[:, P.car : P.car + _CAR]),
-        blocks(p[:, P.road : P.road + _ROAD]),
+        blocks(p[:, P.car]),
+        blocks(p[:, P.road]),
         blocks(rng.normal(0.0, 1.0, (count, 3)) * [50.0, 20.0, 0.0]),
         blocks(rng.uniform(-1.0, 1.0, (count, 3)) * [0.05, 20.0, 20.0]),
-        blocks(z[:, Z.motion : Z.motion + _MOTION]),
+        blocks(z[:, Z.motion]),
         blocks(np.zeros((count, 3))),
     )
 
@@ -124,19 +126,14 @@ def advance(
 ) -> None:
     """Ticks of every car, a block at a time; the arrays of `Cars`."""
     for b in range(len(cars)):
-        car, road = Car(*fixed_tuple(cars[b], _CAR)), Road(*fixed_tuple(roads[b], _ROAD))
-        push, command = Push(*fixed_tuple(pushes[b], 3)), Inputs(*fixed_tuple(commands[b], 3))
-        motion, now = (
-            Motion(*fixed_tuple(motions[b], _MOTION)),
-            Inputs(*fixed_tuple(acting[b], 3)),
-        )
+        car, road = read(cars[b], _CAR), read(roads[b], _ROAD)
+        push, command = read(pushes[b], _PUSH), read(commands[b], _INPUTS)
+        motion, now = read(motions[b], _MOTION), read(acting[b], _INPUTS)
         load = load_of(now, car, 0, shifts(0, FIALA, 1))
         for _ in range(ticks):
             load, motion, now = tick(load, motion, now, command, push, car, road, left)
-        for k in range(_MOTION):
-            put(motions[b], motion[k], k)
-        for k in range(3):
-            put(acting[b], now[k], k)
+        write(motions[b], motion, _MOTION)
+        write(acting[b], now, _INPUTS)
 
 
 def ours(cars: Cars, ticks: int) -> None:

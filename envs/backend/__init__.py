@@ -7,12 +7,12 @@ sideslip is imported here, and every other room may import this one.
 
 from .arrays import abreast as abreast
 from .arrays import at as at
-from .arrays import fixed_tuple as fixed_tuple
-from .arrays import of_lane as of_lane
+from .arrays import offsets as offsets
 from .arrays import put as put
-from .arrays import put_all as put_all
 from .arrays import put_along as put_along
 from .arrays import ramp as ramp
+from .arrays import read as read
+from .arrays import write as write
 from .cache import source_stamp as source_stamp
 from .decorators import apart as apart
 from .decorators import config as config

@@ -1,13 +1,13 @@
 # numba's own types say too little about itself:
 # mypy: disable-error-code="no-untyped-call,no-untyped-def,misc,untyped-decorator"
-"""Numbers and tuples of them in packed arrays, for single cars and for cars abreast.
+"""Packed arrays: where the numbers of NamedTuples lie in them, and how they are read and written.
 
-A single car's numbers lie in a vector or matrix; those of cars abreast have one axis more, the
-last, and the same functions read and write lanes there. The compiler is taught them as plain loads
-and stores.
+A single car's numbers lie in a vector or matrix; those of several cars in SIMD lanes have one axis
+more, the last, and the same functions read and write lanes there. The compiler is taught them as
+plain loads and stores.
 """
 
-from typing import Any
+from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 
 from llvmlite import ir
 from numba.core import cgutils, types
@@ -17,10 +17,49 @@ from numba.np.arrayobj import load_item, make_array, store_item
 
 from .simd import FLOATS, INTS, LANES, splat
 
+T = TypeVar("T")
 
-def fixed_tuple(vector: Any, length: int) -> tuple[Any, ...]:
-    """The first `length` entries of a vector as a tuple of numbers; `length` is a literal."""
-    return tuple(vector[:length].tolist())
+
+def offsets(kind: type[T], start: int = 0) -> tuple[T, int]:
+    """Where the numbers of a NamedTuple lie in a packed vector: (its indices, the end).
+
+    Its parts lie one behind the other from `start` on, and each is its own index, so that
+    `vector[offsets.part.field]` is a number by name. A field is a number, another NamedTuple,
+    `Annotated[tuple[part, ...], count]`, so many parts alike, or `Annotated[Any, count]`, so many
+    numbers of which the first one's index is enough.
+    """
+    if hasattr(kind, "_fields"):
+        parts = list(get_type_hints(kind, include_extras=True).values())
+        make: Any = kind._make  # type: ignore[attr-defined]
+    elif get_origin(kind) is Annotated:
+        (alike, count), make = get_args(kind), tuple
+        if get_origin(alike) is not tuple:
+            return start, start + count  # type: ignore[return-value]
+        parts = [get_args(alike)[0]] * count
+    else:
+        return start, start + 1  # type: ignore[return-value]
+    where = []
+    for part in parts:
+        found, start = offsets(part, start)
+        where.append(found)
+    return make(where), start
+
+
+def read(array: Any, where: T, *index: int) -> T:
+    """The numbers of a part of a packed array as a tuple like `where`, its offsets.
+
+    They lie along the first axis, next to each other; `index` is their place on the others.
+    """
+    first, numbers = where[0], len(where)  # type: ignore[index,arg-type]
+    found = array[(slice(first, first + numbers), *index)].tolist()
+    make: Any = getattr(where, "_make", tuple)
+    return make(found)  # type: ignore[no-any-return]
+
+
+def write(array: Any, values: Any, where: Any, *index: int) -> None:
+    """Write a tuple of numbers to offsets `where`; the rest as in `read`."""
+    for place, value in zip(where, values, strict=True):
+        array[(place, *index)] = value
 
 
 def at(array: Any, *index: int) -> Any:
@@ -28,20 +67,9 @@ def at(array: Any, *index: int) -> Any:
     return float(array[index])
 
 
-def of_lane(array: Any, lane: int, *index: int) -> Any:
-    """The number of one of the cars abreast; of a single car there is but the first."""
-    return float(array[index])
-
-
 def put(array: Any, value: Any, *index: int) -> None:
     """Write a number."""
     array[index] = value
-
-
-def put_all(array: Any, values: Any, axis: int, *index: int) -> None:
-    """Write a tuple of numbers from an index on along an axis, which is a literal."""
-    for k, value in enumerate(values):
-        array[tuple(i + k * (a == axis) for a, i in enumerate(index))] = value
 
 
 def abreast() -> int:
@@ -102,23 +130,22 @@ def _whole(index):
     return [types.intp] * len(index)
 
 
-@infer_global(fixed_tuple)
-class _FixedTuple(AbstractTemplate):
-    prefer_literal = True
-
+@infer_global(read)
+class _Read(AbstractTemplate):
     def generic(self, args, kws):
-        vector, length = args
-        kind = _kind_of(vector, 1)
-        if kind is None or not isinstance(length, types.IntegerLiteral):
-            return None  # without the literal numba asks again
-        return signature(types.UniTuple(kind, length.literal_value), vector, length)
+        array, where, *index = args
+        kind = _kind_of(array, 1 + len(index))
+        if kind is None or not isinstance(where, types.BaseTuple):
+            return None
+        numbers = [kind] * len(where)
+        made = types.BaseTuple.from_types(numbers, getattr(where, "instance_class", None))
+        return signature(made, array, where, *_whole(index))
 
 
-@lower_builtin(fixed_tuple, types.Array, types.IntegerLiteral)
-def _lower_fixed_tuple(context, builder, sig, args):
-    """As many loads. numba's `to_fixed_tuple` is a loop over copies of the tuple."""
-    index = [context.get_constant(types.intp, i) for i in range(sig.return_type.count)]
-    entries = [_read(context, builder, sig.args[0], args[0], [i]) for i in index]
+@lower_builtin(read, types.Array, types.BaseTuple, types.VarArg(types.Any))
+def _lower_read(context, builder, sig, args):
+    places = cgutils.unpack_tuple(builder, args[1])
+    entries = [_read(context, builder, sig.args[0], args[0], [i, *args[2:]]) for i in places]
     return context.make_tuple(builder, sig.return_type, entries)
 
 
@@ -133,21 +160,6 @@ class _At(AbstractTemplate):
 @lower_builtin(at, types.Array, types.VarArg(types.Any))
 def _lower_at(context, builder, sig, args):
     return _read(context, builder, sig.args[0], args[0], args[1:])
-
-
-@infer_global(of_lane)
-class _OfLane(AbstractTemplate):
-    def generic(self, args, kws):
-        array, _, *index = args
-        kind = _kind_of(array, len(index))
-        return kind and signature(array.dtype, array, types.intp, *_whole(index))
-
-
-@lower_builtin(of_lane, types.Array, types.Any, types.VarArg(types.Any))
-def _lower_of_lane(context, builder, sig, args):
-    kind, (array, lane, *index) = sig.args[0], args
-    index = [*index, lane][: kind.ndim]
-    return load_item(context, builder, kind, _place(context, builder, kind, array, index))
 
 
 @infer_global(put)
@@ -165,25 +177,22 @@ def _lower_put(context, builder, sig, args):
     return context.get_dummy_value()
 
 
-@infer_global(put_all)
-class _PutAll(AbstractTemplate):
-    prefer_literal = True
-
+@infer_global(write)
+class _Write(AbstractTemplate):
     def generic(self, args, kws):
-        array, values, axis, *index = args
-        known = isinstance(values, types.BaseTuple) and isinstance(axis, types.IntegerLiteral)
-        if not known or _kind_of(array, len(index)) is None:
+        array, values, where, *index = args
+        tuples = isinstance(values, types.BaseTuple) and isinstance(where, types.BaseTuple)
+        if not tuples or len(values) != len(where) or _kind_of(array, 1 + len(index)) is None:
             return None
-        return signature(types.none, array, values, axis, *_whole(index))
+        return signature(types.none, array, values, where, *_whole(index))
 
 
-@lower_builtin(put_all, types.Array, types.BaseTuple, types.IntegerLiteral, types.VarArg(types.Any))
-def _lower_put_all(context, builder, sig, args):
-    kind, values, axis = sig.args[0], sig.args[1], sig.args[2].literal_value
-    for k, value in enumerate(cgutils.unpack_tuple(builder, args[1])):
-        index = list(args[3:])
-        index[axis] = builder.add(index[axis], context.get_constant(types.intp, k))
-        _write(context, builder, kind, args[0], index, value, values[k])
+@lower_builtin(write, types.Array, types.BaseTuple, types.BaseTuple, types.VarArg(types.Any))
+def _lower_write(context, builder, sig, args):
+    kind, of = sig.args[0], sig.args[1]
+    values, places = (cgutils.unpack_tuple(builder, each) for each in args[1:3])
+    for k, (i, value) in enumerate(zip(places, values, strict=True)):
+        _write(context, builder, kind, args[0], [i, *args[3:]], value, of[k])
     return context.get_dummy_value()
 
 

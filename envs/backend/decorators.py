@@ -9,7 +9,6 @@ from typing import Any, TypeVar
 
 import numba
 
-from .arrays import put_all
 from .cache import _LAYERS, _kept_folder
 from .compiler import Kernel
 
@@ -67,9 +66,3 @@ def copied(source: Any, target: Any) -> None:
     """Copy a vector's numbers into another one; a slice's assignment would allocate."""
     for i in range(len(source)):
         target[i] = source[i]
-
-
-@jit
-def store(vector: Any, start: int, values: Any) -> None:
-    """Write a tuple into a vector from `start` on."""
-    put_all(vector, values, 0, start)

@@ -38,6 +38,9 @@ def numbers(dtype: torch.dtype) -> dict[str, Callable[..., Any]]:
     def to_float(a: Any) -> Any:
         return a.to(dtype) if isinstance(a, torch.Tensor) else a * 1.0
 
+    def read(array: Any, where: Any) -> Any:
+        return getattr(where, "_make", tuple)(array[where[0] : where[-1] + 1].unbind(0))
+
     return {
         "minimum": lambda a, b: select(a < b, a, b),
         "maximum": lambda a, b: select(a > b, a, b),
@@ -48,7 +51,7 @@ def numbers(dtype: torch.dtype) -> dict[str, Callable[..., Any]]:
         "to_float": to_float,
         "whole": lambda a: a.to(torch.int64) if isinstance(a, torch.Tensor) else int(a),
         "anywhere": lambda condition: isinstance(condition, torch.Tensor) or condition,
-        "fixed_tuple": lambda vector, length: vector[:length].unbind(0),
+        "read": read,
         "at": lambda array, *index: array[index],
     }
 

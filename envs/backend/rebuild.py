@@ -6,11 +6,11 @@ from typing import Any
 
 from numba.core.dispatcher import Dispatcher
 
-from .arrays import fixed_tuple
+from .arrays import read
 from .decorators import F
 from .primitives import minimum
 
-_TABLED = {fixed_tuple.__module__, minimum.__module__}  # what a table may replace
+_TABLED = {read.__module__, minimum.__module__}  # what a table may replace
 
 
 def plain(function: F, table: Mapping[str, Callable[..., Any]] | None = None) -> F:

@@ -9,12 +9,13 @@ from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, VectorEnv
 
 from ..arguments import count_of, mask_of, mode_of, named
+from ..backend.arrays import read
 from ..backend.on_torch import torch
-from ..engine.layout import P, Switches
+from ..engine.layout import FLAGS, P
 from ..engine.packing import Template
 from ..engine.step import kind_of
 from ..engine.tick import Kind
-from ..record import CAMERA, SLOW_NAMES
+from ..record import SLOW_NAMES
 from ..sensors.link import Link
 from ..task.failures import RUNNING
 from ..task.info import REPORT, Report
@@ -27,7 +28,6 @@ from .transfer import Rows
 
 Tensor = torch.Tensor
 Infos = dict[str, Any]
-_ALL = Switches._fields.index("all_samples")
 
 
 class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
@@ -117,15 +117,14 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
                 )
         for template in told:
             for sensor, links in self._links.items():
-                at = P.camera if sensor == CAMERA else P.gps
-                links.add(Link(*template.params[at : at + len(Link._fields)].tolist()))
+                links.add(read(template.params, P.slow[sensor]))
         n = self.control_period
         return {sensor: most_of(list(links), n) for sensor, links in self._links.items()}
 
     def _build(self, most: dict[int, Most]) -> None:
         """The step with this room, and all rows on the device."""
         host = self._host
-        all_samples = bool(host.setting.base.switches[_ALL])
+        all_samples = bool(host.setting.base.switches[FLAGS.all_samples])
         step = Step(
             self._kind,
             self.control_period,

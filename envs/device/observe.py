@@ -5,7 +5,7 @@ from typing import Any
 from ..backend.elementary import clip
 from ..backend.on_torch import on_tensors, torch
 from ..backend.primitives import select
-from ..engine.layout import Slow
+from ..engine.layout import SLOW
 from ..record import CAMERA, FAST, PACKET, VALUES
 from ..task.cost import rest_of_cost
 from ..task.failures import BAD_ACTION, RUNNING
@@ -16,8 +16,6 @@ from .packets import Delivered
 from .ticks import Now, Told
 
 Tensor = torch.Tensor
-_CAPTURED, _ARRIVED = Slow._fields.index("captured"), Slow._fields.index("arrived")
-_VALUES = _CAPTURED + 1
 
 
 class Telling:
@@ -36,7 +34,7 @@ class Telling:
     ) -> Tensor:
         """The summary (N, k), float32.
 
-        rows: (n, FAST_WIDTH, N), of which the first `done` (N,) count. slow: (2, len(Slow), N).
+        rows: (n, FAST_WIDTH, N), of which the first `done` (N,) count. slow: as in `Under`.
         """
         entries: list[Tensor] = []
         sampled = rows[:, :SAMPLED]
@@ -60,14 +58,14 @@ class Telling:
         self, sensor: int, tick: Tensor, slow: Tensor, delivered: Delivered
     ) -> list[Tensor]:
         """Values, age and freshness of one sensor's newest sample."""
-        captured = slow[_CAPTURED]
+        captured = slow[SLOW.captured]
         age = self._select(captured != NEVER, (tick - captured) * TICK, AGE_CAP)
         packets = delivered.packets
         place = torch.arange(len(packets), device=tick.device)[:, None]
-        newest = packets[:, PACKET.arrived] == slow[_ARRIVED]  # neither late nor a duplicate
+        newest = packets[:, PACKET.arrived] == slow[SLOW.arrived]  # neither late nor a duplicate
         fresh = (place < delivered.number) & (packets[:, PACKET.sensor] == sensor) & newest
-        width = 2 if sensor == CAMERA else VALUES
-        values = slow[_VALUES : _VALUES + width].unbind(0)
+        first, width = SLOW.values[0], 2 if sensor == CAMERA else VALUES
+        values = slow[first : first + width].unbind(0)
         return [*values, age, fresh.any(0).to(tick.dtype)]
 
     def report(self, now: Now, duration: Tensor, count: Tensor) -> Tensor:

@@ -8,39 +8,28 @@ off the front what has arrived.
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+from ..backend.arrays import read
 from ..backend.elementary import exp
 from ..backend.on_torch import on_tensors, torch
 from ..backend.primitives import select
 from ..backend.random import CHANNELS, normals
-from ..engine.layout import P, Slow, Z
+from ..engine.layout import SLOW, SLOW_WIDTH, P, Z
 from ..engine.packets import FAR
 from ..record import CAMERA, PACKET, PACKET_WIDTH, VALUES
 from ..sensors.camera import camera_sample
-from ..sensors.gps import Sky, gps_sample, sky_deviation
+from ..sensors.gps import gps_sample, sky_deviation
 from ..sensors.link import Link, arrivals, most_under_way
-from ..sensors.noise import Noise
 from ..ticks import NEVER
-from ..vehicle.dynamics import Motion, Road
+from ..vehicle.dynamics import Motion
 
 Tensor = torch.Tensor
-_NEWEST = Slow._fields.index("captured")
 _LATE = 1 << 62  # the place of what never arrives
-_AT = {
-    name: (start, start + len(part._fields))
-    for name, start, part in (
-        ("road", P.road, Road),
-        ("noise", P.noise, Noise),
-        ("camera", P.camera, Link),
-        ("gps", P.gps, Link),
-        ("sky", P.sky, Sky),
-    )
-}
 
 
 class Under(NamedTuple):
     """The slow sensors' part of the rows' state."""
 
-    slow: Tensor  # (2, len(Slow), N)
+    slow: Tensor  # (sensors, SLOW_WIDTH, N)
     sky: Tensor  # (N,)
     queue: Tensor  # (room, PACKET_WIDTH, N), by arrival
 
@@ -87,6 +76,7 @@ class SlowSensors:
             dtype, normals, arrivals, camera_sample, gps_sample
         )
         self._sky, self._exp, self._select = on_tensors(dtype, sky_deviation, exp, select)
+        (self._read,) = on_tensors(dtype, read)
 
     def __call__(
         self, p: Tensor, keys: Tensor, under: Under, window: Window
@@ -114,31 +104,30 @@ class SlowSensors:
         """The next frame of a sensor where it falls into the window: (the sensor's and the sky's
         state then, its packets, of which those that are none never arrive)."""
         pick = self._select
-        frame, tick = slow[0], slow[1]
+        frame, tick = slow[SLOW.frames], slow[SLOW.next_capture]
         active = window.running & (tick > window.first) & (tick <= window.last)
         when = tick.to(torch.int64)
         j = (when - window.first.to(torch.int64) - 1).clamp(0, len(window.track) - 1)
         width = window.track.shape[1]
         place = j.expand(1, width, -1)
         motion = Motion(*window.track.gather(0, place)[0].unbind(0))
-        noise = Noise(*p[slice(*_AT["noise"])].unbind(0))
+        noise = self._read(p, P.noise)
+        link = self._read(p, P.slow[sensor])
         zero, one = torch.zeros_like(tick), torch.ones_like(tick)
         if sensor == CAMERA:
-            link = Link(*p[slice(*_AT["camera"])].unbind(0))
-            road = Road(*p[slice(*_AT["road"])].unbind(0))
+            road = self._read(p, P.road)
             n = self._normals(keys[0], keys[1], when, CHANNELS.camera)
-            psi, y_l = self._camera(motion, road, p[P.car + 11], noise, n)
+            psi, y_l = self._camera(motion, road, p[P.car.l_pre], noise, n)
             values, quality = (psi, y_l, zero, zero, zero, zero), one
         else:
-            link = Link(*p[slice(*_AT["gps"])].unbind(0))
-            law = Sky(*p[slice(*_AT["sky"])].unbind(0))
+            law = self._read(p, P.sky)
             n = self._normals(keys[0], keys[1], when, CHANNELS.gps)
             seen = self._normals(keys[0], keys[1], when, CHANNELS.sky)
             sky = pick(active, self._sky(sky, law, link, tick, seen), sky)
             *values, quality = self._gps(
                 motion,
-                p[P.car + 17],
-                p[P.car + 18],
+                p[P.car.ahead],
+                p[P.car.left],
                 self._exp(law.median + sky),
                 law.weight,
                 noise,
@@ -157,20 +146,20 @@ class SlowSensors:
         return (*following, *slow[2:]), sky, packets
 
     def _newest(self, sensors: list[Any], queue: Tensor, due: Tensor) -> Tensor:
-        """The sensors' state (2, len(Slow), N) once the due packets were looked at in order."""
+        """The sensors' state, as in `Under`, once the due packets were looked at in order."""
         pick = self._select
         for i in range(len(queue)):
             packet = queue[i].unbind(0)
             for sensor in self.most:
                 slow = sensors[sensor]
                 better = due[i] & (packet[PACKET.sensor] == sensor)
-                better = better & (packet[PACKET.captured] > slow[_NEWEST])
+                better = better & (packet[PACKET.captured] > slow[SLOW.captured])
                 told = (
                     packet[PACKET.captured],
                     *packet[PACKET.value : PACKET.value + VALUES],
                     packet[PACKET.arrived],
                 )
-                for k, value in enumerate(told, _NEWEST):
+                for k, value in enumerate(told, SLOW.captured):
                     slow[k] = pick(better, value, slow[k])
         return torch.stack([torch.stack(tuple(each)) for each in sensors])
 
@@ -202,11 +191,11 @@ def taken_off(queue: Tensor, count: Tensor) -> Tensor:
 
 
 def read_packed(states: Tensor, room: int) -> Under:
-    """The slow sensors' part of packed states (Z.end, N); ValueError where more packets are under
-    way than there is room for."""
+    """The slow sensors' part of packed states (STATE_WIDTH, N); ValueError where they hold more
+    than `room` packets."""
     if bool((states[Z.under_way] > room).any()):
         raise ValueError(f"a state has more than {room} packets under way")
-    slow = states[Z.camera : Z.queue].reshape(2, len(Slow._fields), -1)
+    slow = states[Z.slow[0].frames : Z.queue].reshape(len(Z.slow), SLOW_WIDTH, -1)
     queue = states[Z.queue : Z.sky].reshape(-1, PACKET_WIDTH, states.shape[1])[:room].clone()
     place = torch.arange(room, device=queue.device)[:, None]
     queue[:, PACKET.arrived].masked_fill_(place >= states[Z.under_way], NEVER)
@@ -214,13 +203,13 @@ def read_packed(states: Tensor, room: int) -> Under:
 
 
 def write_packed(under: Under, states: Tensor) -> None:
-    """Write the slow sensors' part into packed states (Z.end, N)."""
+    """Write the slow sensors' part into packed states (STATE_WIDTH, N)."""
     count = states.shape[1]
-    states[Z.camera : Z.queue] = under.slow.reshape(-1, count)
+    states[Z.slow[0].frames : Z.queue] = under.slow.reshape(-1, count)
     states[Z.queue : Z.sky] = 0.0
     flat = under.queue.reshape(-1, count)
     states[Z.queue : Z.queue + len(flat)] = flat
     states[Z.sky] = under.sky
     arrived = under.queue[:, PACKET.arrived]
     states[Z.under_way] = (arrived != NEVER).sum(0).to(states.dtype)
-    states[Z.clock + 5] = torch.where(arrived[0] == NEVER, FAR, arrived[0])
+    states[Z.clock.next_due] = torch.where(arrived[0] == NEVER, FAR, arrived[0])

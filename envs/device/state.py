@@ -11,14 +11,13 @@ import numpy.typing as npt
 
 from ..arguments import actions_of
 from ..backend.on_torch import DTYPES, torch
-from ..engine.layout import Drive, Z
+from ..engine.layout import Z
 from ..record import Array
-from ..vehicle.dynamics import Motion
 from .packets import read_packed, write_packed
 from .step import Held
 
 Tensor = torch.Tensor
-_MOTION, _DRIVE = len(Motion._fields), len(Drive._fields)
+_MOTION, _DRIVE = (slice(part[0], part[-1] + 1) for part in (Z.motion, Z.drive))
 
 
 def device_of(device: Any) -> torch.device:
@@ -95,33 +94,33 @@ def held_of(
     device: torch.device,
     dtype: torch.dtype,
 ) -> tuple[Held, Tensor]:
-    """The state on the device, and the keys (2, N), of packed states (N, Z.end)."""
+    """The state on the device, and the keys (2, N), of packed states (N, STATE_WIDTH)."""
     whole = torch.as_tensor(states.T.copy())
     under = read_packed(whole, room)
     held = Held(
-        whole[Z.motion : Z.motion + _MOTION],
-        whole[Z.drive : Z.drive + _DRIVE],
+        whole[_MOTION],
+        whole[_DRIVE],
         whole[Z.driver],
-        whole[Z.clock + 2],
-        whole[Z.clock + 3],
+        whole[Z.clock.tick],
+        whole[Z.clock.failure],
         *under,
         torch.as_tensor(over.copy()),
         torch.as_tensor(reports.T.copy()),
     )
     moved = [each.to(device, None if each.dtype == torch.bool else dtype) for each in held]
-    return Held(*moved), whole[Z.clock : Z.clock + 2].to(device, torch.int64)
+    return Held(*moved), whole[Z.clock.key_low : Z.clock.key_high + 1].to(device, torch.int64)
 
 
 def write_states(held: Held, states: Array) -> None:
-    """Write the state into packed states (N, Z.end), whose keys and redraws are already there."""
+    """Write the state into packed states (N, STATE_WIDTH), where keys and redraws already are."""
     whole = torch.as_tensor(states.T.copy())
     here = Held(
         *(each.cpu() if each.dtype == torch.bool else each.cpu().to(torch.float64) for each in held)
     )
-    whole[Z.motion : Z.motion + _MOTION] = here.motion
-    whole[Z.drive : Z.drive + _DRIVE] = here.drive
+    whole[_MOTION] = here.motion
+    whole[_DRIVE] = here.drive
     whole[Z.driver] = here.driver
-    whole[Z.clock + 2] = here.tick
-    whole[Z.clock + 3] = here.failure
+    whole[Z.clock.tick] = here.tick
+    whole[Z.clock.failure] = here.failure
     write_packed(here.under, whole)
     states[:] = whole.numpy().T

@@ -83,8 +83,8 @@ class Step:
     ) -> tuple[Held, Brought]:
         """(the state after it, what it brings) of one env-step.
 
-        p: (P.end, N). keys: (2, N), int64. actions: (N, width), of the floats of p; rows whose
-        action is not finite fail. Rows that are over stand still.
+        p: (PARAMS_WIDTH, N). keys: (2, N), int64. actions: (N, width), of the floats of p; rows
+        whose action is not finite fail. Rows that are over stand still.
         """
         finite = torch.isfinite(actions).all(1)
         shares = self._clip(torch.where(finite[:, None], actions, 0.0), -1.0, 1.0)
@@ -108,7 +108,7 @@ class Step:
         running: Tensor,
         refused: Tensor,
     ) -> tuple[Held, Brought]:
-        done, duration = now.tick - held.tick, p[P.task]
+        done, duration = now.tick - held.tick, p[P.task.duration]
         window = Window(held.tick, now.tick, running, track)
         under, came = self._slow(p, keys, held.under, window)
         obs = self._telling.observe(rows, done, now, under.slow, came)

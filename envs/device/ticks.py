@@ -7,6 +7,7 @@ branches on values, so the device never waits for the host.
 
 from typing import Any, NamedTuple
 
+from ..backend.arrays import read
 from ..backend.on_torch import compiled, on_tensors, torch
 from ..backend.primitives import select
 from ..backend.random import CHANNELS, normals
@@ -14,7 +15,7 @@ from ..engine.layout import Drive, P
 from ..engine.step import fixed_of
 from ..engine.tick import Kind, Moving, advance, changed, failure_of
 from ..record import FAST_WIDTH
-from ..scenarios.steering import STEERING_WIDTH, steering_at
+from ..scenarios.steering import steering_at
 from ..sensors.inertial import Chance
 from ..task.failures import RUNNING
 from ..ticks import TICK
@@ -57,7 +58,7 @@ class Ticks:
         self.kind = kind
         self._normals, self._steering_at = on_tensors(dtype, normals, steering_at)
         self._fixed, self._advance, self._changed = on_tensors(dtype, fixed_of, advance, changed)
-        self._failure_of, self._select = on_tensors(dtype, failure_of, select)
+        self._failure_of, self._select, self._read = on_tensors(dtype, failure_of, select, read)
         self._dtype = dtype
         self.tick: Any = compiled(self._tick) if compile else self._tick
         self.foresee: Any = compiled(self._foresee) if compile else self._foresee
@@ -70,7 +71,7 @@ class Ticks:
         wheels = self._normals(keys[0], keys[1], whole, CHANNELS.wheels)
         if self.kind.follows:
             return inertial + wheels, None
-        programme = p[P.steering : P.steering + STEERING_WIDTH].unbind(0)
+        programme = self._read(p, P.programme)
         return inertial + wheels, self._steering_at(ticks.to(self._dtype), programme)
 
     def _tick(
@@ -78,7 +79,7 @@ class Ticks:
     ) -> Now:
         """One tick of the rows that are alive.
 
-        p: (P.end, N). share, turn: (N,), of the yaw moment and the added steering.
+        p: (PARAMS_WIDTH, N). share, turn: (N,), of the yaw moment and the added steering.
         """
         pick = self._select
         fixed = self._fixed(p)

@@ -7,11 +7,10 @@ from ..backend.decorators import copied, jit
 from ..task.failures import REFUSED, RUNNING
 from ..task.info import REPORT
 from .lanes import step_block
-from .layout import Switches
+from .layout import FLAGS
 from .reset import reset_vehicle
 from .step import kind_of, shares_of, step_vehicle
 
-_FAIL_BAD = Switches._fields.index("fail_bad")
 _FEW = 2  # up to so many vehicles are stepped one by one
 
 
@@ -44,7 +43,7 @@ def step_rows(
     together need, a `Block`.
     """
     for i in range(len(over)):
-        if switches[i, _FAIL_BAD] == 0 and not over[i]:
+        if switches[i, FLAGS.fail_bad] == 0 and not over[i]:
             for share in actions[i]:
                 if float(share) - float(share) != 0.0:
                     return REFUSED

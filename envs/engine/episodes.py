@@ -13,12 +13,11 @@ from ..scenarios.draws import DRAWS_WIDTH
 from ..scenarios.scenario import Scenario
 from ..task.info import REPORT
 from ..ticks import TICK
-from ..vehicle.dynamics import Motion
 from ..vehicle.vehicle import Vehicle
 from .batch import reset_rows
 from .config import Setting
 from .lanes import block_of
-from .layout import P, Switches, Z
+from .layout import FLAGS, PARAMS_WIDTH, STATE_WIDTH, P, Z
 from .packing import Template
 from .views import Each, record_in, slow_in, vehicle_in
 from .window import scratch_of
@@ -40,8 +39,8 @@ class Fleet:
         self.setting, self._count, N = setting, count, count
         self.control_period = int(setting.control_period)
         self.layout = setting.layout
-        self.params, self.states = np.zeros((N, P.end)), np.zeros((N, Z.end))
-        self.switches = np.zeros((N, len(Switches._fields)), np.int64)
+        self.params, self.states = np.zeros((N, PARAMS_WIDTH)), np.zeros((N, STATE_WIDTH))
+        self.switches = np.zeros((N, len(FLAGS)), np.int64)
         self.over = np.zeros(N, np.bool_)  # rows whose episode ended and was not reset yet
         self.obs = np.zeros((N, len(self.layout)), np.float32)
         self.reports = np.zeros((N, len(REPORT)))
@@ -115,7 +114,7 @@ class Fleet:
 
     def sort(self) -> None:
         """Put rows whose ticks have the same text next to each other in the block's order."""
-        lags = self.params[:, [P.motor, P.steer]] > 0.0
+        lags = self.params[:, [P.motor.start, P.steering.start]] > 0.0
         kinds = np.hstack([self.switches, lags])
         mixed = (kinds != kinds[0]).any()
         self.block.order[:] = np.lexsort(kinds.T) if mixed else np.arange(self._count)
@@ -136,7 +135,7 @@ class Fleet:
     @property
     def motion(self) -> Array:
         """The true `Motion` of each row now, (N, len(Motion)), in SI units."""
-        return self.states[:, Z.motion : Z.motion + len(Motion._fields)].copy()
+        return self.states[:, Z.motion[0] : Z.motion[-1] + 1].copy()
 
     @property
     def record(self) -> Sequence[Record]:

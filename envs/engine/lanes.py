@@ -10,12 +10,12 @@ from ..backend.decorators import apart
 from ..backend.simd import LANES
 from ..record import FAST_WIDTH, Array
 from ..task.info import REPORT
-from .layout import P, Z
+from .layout import PARAMS_WIDTH, STATE_WIDTH, Z
 from .step import conclude, drive_on, kind_of, shares_of
 from .window import foresee_abreast, scratch_of
 
 _TOLD = len(REPORT)
-_MOVING = Z.camera  # what a tick changes comes first in a state, but for the driver's angle
+_MOVING = Z.slow[0].frames  # what a tick changes comes first in a state, but for the driver's angle
 
 
 class Block(NamedTuple):
@@ -36,8 +36,8 @@ def block_of(count: int, n: int) -> Block:
     return Block(
         np.arange(count),
         np.zeros(LANES, np.int64),
-        np.zeros((P.end, LANES)),
-        np.zeros((Z.end, LANES)),
+        np.zeros((PARAMS_WIDTH, LANES)),
+        np.zeros((STATE_WIDTH, LANES)),
         np.zeros((2, LANES)),
         np.zeros((n, FAST_WIDTH, LANES)),
         np.zeros((_TOLD, LANES)),
@@ -55,7 +55,7 @@ def step_block(count: int, every: Any, n: int, bounds: Any, block: Any) -> bool:
     params, states, switches, actions, obs, rows, packets, reports = every
     for lane in range(abreast()):
         i = block.members[lane if lane < count else 0]  # spare lanes repeat the first
-        for k in range(P.end):
+        for k in range(PARAMS_WIDTH):
             block.params[k, lane] = params[i, k]
         for k in range(_MOVING):
             block.states[k, lane] = states[i, k]
@@ -99,7 +99,6 @@ def step_block(count: int, every: Any, n: int, bounds: Any, block: Any) -> bool:
             rows[i],
             packets[i],
             reports[i],
-            block.scratch,
-            lane,
+            block.scratch[:, :, lane],
         )
     return True

@@ -1,14 +1,14 @@
-"""How a vehicle's numbers lie in its two packed vectors, and what an observation holds.
+"""State by name: where the numbers of an episode lie in its two packed vectors.
 
 `params` is constant within an episode, `state` is everything that changes: a copy of both is a
-complete snapshot. New parts go at the end of `_PARAMS` or `_STATE`; nothing else has to move.
+complete snapshot. `P` and `Z` are `Params` and `State` whose leaves are indices: `p[P.car.mu]` and
+`z[Z.clock.tick]` are numbers, `read(z, Z.motion)` is a Motion.
 """
 
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
-import numpy as np
-
-from ..record import PACKET_WIDTH
+from ..backend.arrays import offsets
+from ..record import PACKET_WIDTH, SLOW_NAMES, VALUES
 from ..scenarios.driver import Driver
 from ..scenarios.speed import Pace
 from ..scenarios.steering import STEERING_WIDTH
@@ -66,7 +66,7 @@ class Drive(NamedTuple):
 
 
 class Clock(NamedTuple):
-    """Integers of an episode, kept as floats."""
+    """Integers of an episode, as floats."""
 
     key_low: Any
     key_high: Any
@@ -82,95 +82,50 @@ class Slow(NamedTuple):
     frames: Any  # captured so far
     next_capture: Any
     captured: Any  # tick of the newest delivered sample, NEVER before the first
-    v_0: Any
-    v_1: Any
-    v_2: Any
-    v_3: Any
-    v_4: Any
-    v_5: Any
+    values: Annotated[tuple[Any, ...], VALUES]
     arrived: Any  # tick of its delivery
 
 
-def _offsets(parts: dict[str, int]) -> dict[str, int]:
-    ends = np.cumsum([0, *parts.values()])
-    return dict(zip([*parts, "end"], map(int, ends), strict=True))
+SLOW, SLOW_WIDTH = offsets(Slow)
 
 
-_PARAMS = _offsets(
-    {
-        "car": len(Car._fields),
-        "road": len(Road._fields),
-        "motor": len(Lag._fields),
-        "steer": len(Lag._fields),
-        "wind": len(Wind._fields),
-        "pace": len(Pace._fields),
-        "noise": len(Noise._fields),
-        "camera": len(Link._fields),
-        "gps": len(Link._fields),
-        "target": len(Target._fields),
-        "disturbance": len(Disturbance._fields),
-        "task": len(Task._fields),
-        "steering": STEERING_WIDTH,
-        "sky": len(Sky._fields),
-        "driver": len(Driver._fields),
-        "path": len(Path._fields),
-        "change": len(Change._fields),
-    }
-)
-_STATE = _offsets(
-    {
-        "motion": len(Motion._fields),
-        "drive": len(Drive._fields),
-        "clock": len(Clock._fields),
-        "camera": len(Slow._fields),
-        "gps": len(Slow._fields),
-        "queue": 2 * IN_FLIGHT * PACKET_WIDTH,
-        "sky": 1,  # deviation of log HDOP from its median
-        "driver": 1,  # rad, the driver's steering command
-        "under_way": 1,  # how many packets are in the queue
-    }
-)
+class Params(NamedTuple):
+    """What is constant within an episode. New parts go at the end."""
+
+    car: Car
+    road: Road
+    motor: Lag
+    steering: Lag
+    wind: Wind
+    pace: Pace
+    noise: Noise
+    slow: Annotated[tuple[Link, ...], len(SLOW_NAMES)]
+    target: Target
+    disturbance: Disturbance
+    task: Task
+    programme: Annotated[tuple[Any, ...], STEERING_WIDTH]
+    sky: Sky
+    driver: Driver
+    path: Path
+    change: Change
 
 
-class ParamsAt(NamedTuple):
-    """Where each part of the packed parameters starts."""
+class State(NamedTuple):
+    """What changes from tick to tick; a new part goes at the end, or, where a tick of the plant
+    changes it, before `slow`."""
 
-    car: int
-    road: int
-    motor: int
-    steer: int
-    wind: int
-    pace: int
-    noise: int
-    camera: int
-    gps: int
-    target: int
-    disturbance: int
-    task: int
-    steering: int
-    sky: int
-    driver: int
-    path: int
-    change: int
-    end: int
+    motion: Motion
+    drive: Drive
+    clock: Clock
+    slow: Annotated[tuple[Slow, ...], len(SLOW_NAMES)]
+    queue: Annotated[Any, 2 * IN_FLIGHT * PACKET_WIDTH]  # packets, columns as in `Packet`
+    sky: Any  # deviation of log HDOP from its median
+    driver: Any  # rad, the driver's steering command
+    under_way: Any  # how many packets are in the queue
 
 
-class StateAt(NamedTuple):
-    """Where each part of the packed state starts."""
-
-    motion: int
-    drive: int
-    clock: int
-    camera: int
-    gps: int
-    queue: int
-    sky: int
-    driver: int
-    under_way: int
-    end: int
-
-
-P, Z = ParamsAt(**_PARAMS), StateAt(**_STATE)
+P, PARAMS_WIDTH = offsets(Params)
+Z, STATE_WIDTH = offsets(State)
 
 
 class Switches(NamedTuple):
@@ -183,3 +138,6 @@ class Switches(NamedTuple):
     all_samples: int  # the observation holds every fast sample
     fail_bad: int  # a non-finite action ends the episode instead of being refused
     roll: int  # the body rolls
+
+
+FLAGS, _ = offsets(Switches)

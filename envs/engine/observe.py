@@ -9,7 +9,7 @@ from ..record import CAMERA, FAST, PACKET, VALUES
 from ..task.info import REPORT
 from ..task.observation import AGE_CAP, SAMPLED
 from ..ticks import NEVER, TICK
-from .layout import P, Z
+from .layout import FLAGS, P, Z
 
 
 @jit
@@ -28,7 +28,7 @@ def observe(
     """Write the float32 summary; every entry clipped at its bounds (layout.observation_layout)."""
     k = 0
     for column in range(SAMPLED):
-        if switches[4]:
+        if switches[FLAGS.all_samples]:
             for j in range(n):
                 obs[k] = clip(rows[j, column], bounds[0, k], bounds[1, k])
                 k += 1
@@ -42,19 +42,19 @@ def observe(
     for i in range(4):
         obs[k] = clip(rows[n - 1, FAST.steer + i], bounds[0, k], bounds[1, k])
         k += 1
-    tick = z[Z.clock + 2]
-    for sensor in range(2):
-        at = Z.camera if sensor == CAMERA else Z.gps
+    tick = z[Z.clock.tick]
+    for sensor in range(len(Z.slow)):
+        at = Z.slow[sensor]
         values = 2 if sensor == CAMERA else VALUES
-        if p[P.camera if sensor == CAMERA else P.gps] > 0.0:
+        if p[P.slow[sensor].period] > 0.0:
             for i in range(values):
-                obs[k] = clip(z[at + 3 + i], bounds[0, k], bounds[1, k])
+                obs[k] = clip(z[at.values[0] + i], bounds[0, k], bounds[1, k])
                 k += 1
-            seen = z[at + 2] != NEVER
-            obs[k] = clip(select(seen, (tick - z[at + 2]) * TICK, AGE_CAP), 0.0, AGE_CAP)
+            age = (tick - z[at.captured]) * TICK
+            obs[k] = clip(select(z[at.captured] != NEVER, age, AGE_CAP), 0.0, AGE_CAP)
             fresh = 0.0
             for i in range(count):
-                newest = packets[i, PACKET.arrived] == z[at + 3 + VALUES]  # not late, no duplicate
+                newest = packets[i, PACKET.arrived] == z[at.arrived]  # not late, no duplicate
                 if packets[i, PACKET.sensor] == sensor and newest:
                     fresh = 1.0
             obs[k + 1] = fresh
@@ -66,7 +66,7 @@ def observe(
 @jit
 def write_report(report: Any, z: Any) -> None:
     """Write what `info` tells of the state; what the step made of it is the caller's."""
-    report[REPORT.t] = z[Z.clock + 2] * TICK
-    report[REPORT.gamma] = z[Z.motion + 2]
-    report[REPORT.psi] = z[Z.motion + 3]
-    report[REPORT.failure] = z[Z.clock + 3]
+    report[REPORT.t] = z[Z.clock.tick] * TICK
+    report[REPORT.gamma] = z[Z.motion.gamma]
+    report[REPORT.psi] = z[Z.motion.psi]
+    report[REPORT.failure] = z[Z.clock.failure]

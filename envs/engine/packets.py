@@ -5,47 +5,50 @@ Packets are delivered in the order (captured tick, sensor); what is under way li
 
 from typing import Any
 
-from ..backend.arrays import fixed_tuple
-from ..backend.decorators import jit, store
+from ..backend.arrays import read
+from ..backend.decorators import jit
 from ..backend.elementary import exp
 from ..backend.primitives import minimum
 from ..backend.random import CHANNELS, normals
 from ..record import CAMERA, GPS, PACKET, PACKET_WIDTH, VALUES
 from ..sensors.camera import camera_sample
-from ..sensors.gps import Sky, gps_sample, sky_deviation
-from ..sensors.link import Link, arrivals
-from ..sensors.noise import Noise
+from ..sensors.gps import gps_sample, sky_deviation
+from ..sensors.link import arrivals
 from ..ticks import NEVER
-from ..vehicle.dynamics import Road
 from .layout import P, Z
 
 FAR = 1e15
-_LINK, _NOISE, _ROAD = len(Link._fields), len(Noise._fields), len(Road._fields)
-_SKY = len(Sky._fields)
 
 
 @jit
 def _push(z: Any, sensor: int, captured: Any, due: Any, quality: Any, frame: Any, v: Any) -> None:
     """Put a captured sample on its way; the arrays' room was checked when the env was built."""
     slot = int(z[Z.under_way])
-    store(z, Z.queue + slot * PACKET_WIDTH, (sensor * 1.0, captured, due, quality, frame))
-    store(z, Z.queue + slot * PACKET_WIDTH + PACKET.value, v)
+    packet = z[Z.queue + slot * PACKET_WIDTH :]
+    packet[PACKET.sensor] = sensor
+    packet[PACKET.captured] = captured
+    packet[PACKET.arrived] = due
+    packet[PACKET.quality] = quality
+    packet[PACKET.sequence] = frame
+    for i in range(VALUES):
+        packet[PACKET.value + i] = v[i]
     z[Z.under_way] = slot + 1.0
-    z[Z.clock + 5] = minimum(z[Z.clock + 5], due)
+    z[Z.clock.next_due] = minimum(z[Z.clock.next_due], due)
 
 
 @jit
-def _capture(z: Any, sensor: int, at: int, link: Any, tick: Any, key: Any, v: Any, q: Any) -> None:
+def _capture(z: Any, sensor: int, link: Any, tick: Any, key: Any, v: Any, q: Any) -> None:
     """A frame of a slow sensor: queue it for its arrivals and set the clock on."""
-    frame = z[at]
+    at = Z.slow[sensor]
+    frame = z[at.frames]
     block = CHANNELS.camera_link if sensor == CAMERA else CHANNELS.gps_link
     first, second = arrivals(link, frame, tick, key[0], key[1], block)
     if first != NEVER:
         _push(z, sensor, tick, first, q, frame, v)
     if second != NEVER:
         _push(z, sensor, tick, second, q, frame, v)
-    z[at] = frame + 1.0
-    z[at + 1] = tick + link.period
+    z[at.frames] = frame + 1.0
+    z[at.next_capture] = tick + link.period
 
 
 @jit
@@ -64,16 +67,16 @@ def _deliver(z: Any, tick: Any, packets: Any, count: int) -> int:
             else:
                 due = minimum(due, arrived)
         if best < 0:
-            z[Z.clock + 5] = due
+            z[Z.clock.next_due] = due
             return count
         for i in range(PACKET_WIDTH):
             packets[count, i] = z[best + i]
-        newest = Z.camera if z[best] == CAMERA else Z.gps
-        if z[best + PACKET.captured] > z[newest + 2]:
-            z[newest + 2] = z[best + PACKET.captured]
+        newest = Z.slow[int(z[best + PACKET.sensor])]
+        if z[best + PACKET.captured] > z[newest.captured]:
+            z[newest.captured] = z[best + PACKET.captured]
             for i in range(VALUES):
-                z[newest + 3 + i] = z[best + PACKET.value + i]
-            z[newest + 3 + VALUES] = tick
+                z[newest.values[0] + i] = z[best + PACKET.value + i]
+            z[newest.arrived] = tick
         last = Z.queue + (under_way - 1) * PACKET_WIDTH  # it takes the free place
         for i in range(PACKET_WIDTH):
             z[best + i] = z[last + i]
@@ -84,8 +87,10 @@ def _deliver(z: Any, tick: Any, packets: Any, count: int) -> int:
 @jit
 def due(z: Any, tick: Any) -> bool:
     """Whether a slow sensor captures or a packet arrives at a tick."""
-    captures = (tick == z[Z.camera + 1]) | (tick == z[Z.gps + 1])
-    return bool(captures | (tick >= z[Z.clock + 5]))
+    for sensor in range(len(Z.slow)):
+        if tick == z[Z.slow[sensor].next_capture]:
+            return True
+    return bool(tick >= z[Z.clock.next_due])
 
 
 @jit
@@ -96,26 +101,23 @@ def sense_slow(
 
     Returns how many packets there are then.
     """
-    noise = Noise(*fixed_tuple(p[P.noise :], _NOISE))
-    key = (int(z[Z.clock]), int(z[Z.clock + 1]))
-    if tick == z[Z.camera + 1]:
-        link = Link(*fixed_tuple(p[P.camera :], _LINK))
-        road = Road(*fixed_tuple(p[P.road :], _ROAD))
+    noise, key = read(p, P.noise), (int(z[Z.clock.key_low]), int(z[Z.clock.key_high]))
+    if tick == z[Z.slow[CAMERA].next_capture]:
+        link, road = read(p, P.slow[CAMERA]), read(p, P.road)
         n = normals(key[0], key[1], int(tick), CHANNELS.camera)
-        psi, y_l = camera_sample(motion, road, p[P.car + 11], noise, n)
-        _capture(z, CAMERA, Z.camera, link, tick, key, (psi, y_l, 0.0, 0.0, 0.0, 0.0), 1.0)
-    if tick == z[Z.gps + 1]:
-        link = Link(*fixed_tuple(p[P.gps :], _LINK))
+        psi, y_l = camera_sample(motion, road, p[P.car.l_pre], noise, n)
+        _capture(z, CAMERA, link, tick, key, (psi, y_l, 0.0, 0.0, 0.0, 0.0), 1.0)
+    if tick == z[Z.slow[GPS].next_capture]:
+        link, sky = read(p, P.slow[GPS]), read(p, P.sky)
         n = normals(key[0], key[1], int(tick), CHANNELS.gps)
-        sky = Sky(*fixed_tuple(p[P.sky :], _SKY))
         seen = normals(key[0], key[1], int(tick), CHANNELS.sky)
         z[Z.sky] = sky_deviation(z[Z.sky], sky, link, tick, seen)
         hdop = exp(sky.median + z[Z.sky])
         course, speed, X, Y, hdop, satellites, quality = gps_sample(
-            motion, p[P.car + 17], p[P.car + 18], hdop, sky.weight, noise, n, small_angle
+            motion, p[P.car.ahead], p[P.car.left], hdop, sky.weight, noise, n, small_angle
         )
         values = (course, speed, X, Y, hdop, satellites)
-        _capture(z, GPS, Z.gps, link, tick, key, values, quality)
-    if tick >= z[Z.clock + 5]:
+        _capture(z, GPS, link, tick, key, values, quality)
+    if tick >= z[Z.clock.next_due]:
         count = _deliver(z, tick, packets, count)
     return count

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -22,7 +23,7 @@ from ..vehicle.actuators import lag_of
 from ..vehicle.dynamics import Car, Road
 from ..vehicle.tyres import TYRE_LAWS
 from ..vehicle.vehicle import GRAVITY, Vehicle
-from .layout import Change, Disturbance, P, Switches, Task
+from .layout import PARAMS_WIDTH, Change, Disturbance, P, Params, Switches, Task
 
 SPIN_ANGLE = 0.5  # rad of sideslip: the car has spun
 
@@ -31,7 +32,7 @@ SPIN_ANGLE = 0.5  # rad of sideslip: the car has spun
 class Template:
     """What a reset starts from.
 
-    params: (P.end,) packed parameters. low, high: (len(Draws),) ranges. switches:
+    params: (PARAMS_WIDTH,) packed parameters. low, high: (len(Draws),) ranges. switches:
     (len(Switches),) int64.
     vehicle, nominal: with the scenario's replacements. held_speed: m/s, where it is one number
     and held exactly. duration: ticks.
@@ -50,38 +51,38 @@ class Template:
     @property
     def duration(self) -> int:
         """Ticks of an episode."""
-        return int(self.params[P.task])
+        return int(self.params[P.task.duration])
 
 
 def car_of(vehicle: Vehicle) -> Car:
     """The plant's parameters of a vehicle."""
     return Car(
-        vehicle.mass,
-        vehicle.yaw_inertia,
-        vehicle.front_arm,
-        vehicle.rear_arm,
-        vehicle.front_stiffness,
-        vehicle.rear_stiffness,
-        vehicle.front_track,
-        vehicle.rear_track,
-        vehicle.wheel_radius,
-        vehicle.motor_torque,
-        vehicle.friction,
-        vehicle.preview,
-        vehicle.roll_moment_arm,
-        vehicle.roll_inertia,
-        vehicle.roll_stiffness,
-        vehicle.roll_damping,
-        vehicle.gravity_height,
-        vehicle.antenna_ahead,
-        vehicle.antenna_left,
-        vehicle.friction,
+        m=vehicle.mass,
+        I=vehicle.yaw_inertia,
+        l_f=vehicle.front_arm,
+        l_r=vehicle.rear_arm,
+        C_f=vehicle.front_stiffness,
+        C_r=vehicle.rear_stiffness,
+        d_f=vehicle.front_track,
+        d_r=vehicle.rear_track,
+        r=vehicle.wheel_radius,
+        T_max=vehicle.motor_torque,
+        mu=vehicle.friction,
+        l_pre=vehicle.preview,
+        S=vehicle.roll_moment_arm,
+        I_x=vehicle.roll_inertia,
+        K_x=vehicle.roll_stiffness,
+        C_x=vehicle.roll_damping,
+        h=vehicle.gravity_height,
+        ahead=vehicle.antenna_ahead,
+        left=vehicle.antenna_left,
+        mu_r=vehicle.friction,
     )
 
 
 def _pace_of(scenario: Scenario) -> Pace:
     """The driver's work along the road; the speed itself is drawn."""
-    pace = Pace(0.0, 1.0, 0.0, 0.0, FOREVER, 2.0, 0.5)
+    pace = Pace(speed=0.0, hold=1.0, acceleration=0.0, start=0.0, end=FOREVER, k_p=2.0, k_i=0.5)
     if scenario.acceleration is not None:
         return pace._replace(hold=0.0, acceleration=scenario.acceleration)
     if scenario.speed_change:
@@ -97,11 +98,11 @@ def _pace_of(scenario: Scenario) -> Pace:
 def _road_of(scenario: Scenario) -> Road:
     """Curvature, bank and grade of the road."""
     return Road(
-        0.0,  # drawn
-        scenario.curve_start,
-        scenario.curve_ramp,
-        GRAVITY * math.sin(scenario.bank),
-        GRAVITY * math.sin(scenario.grade),
+        curvature=0.0,  # drawn
+        start=scenario.curve_start,
+        ramp=scenario.curve_ramp,
+        across=GRAVITY * math.sin(scenario.bank),
+        along=GRAVITY * math.sin(scenario.grade),
     )
 
 
@@ -109,12 +110,19 @@ def _sky_of(scenario: Scenario, link: Link) -> Sky:
     """The satellites of a scenario, at the GPS's own period."""
     keep = math.exp(-link.period * TICK / scenario.hdop_time)
     return Sky(
-        math.log(scenario.hdop),
-        scenario.hdop_spread,
-        keep,
-        math.sqrt(1.0 - keep * keep),
-        HDOP_LAWS[scenario.hdop_law],
+        median=math.log(scenario.hdop),
+        spread=scenario.hdop_spread,
+        keep=keep,
+        fresh=math.sqrt(1.0 - keep * keep),
+        weight=HDOP_LAWS[scenario.hdop_law],
     )
+
+
+def _numbers(part: Any) -> list[float]:
+    """The numbers of nested tuples, in order."""
+    if not isinstance(part, tuple):
+        return [part]
+    return [number for each in part for number in _numbers(each)]
 
 
 def template_of(
@@ -136,56 +144,55 @@ def template_of(
         vehicle.check_roll()
     keep = math.exp(-TICK / scenario.disturbance_time)
     gps = link_of(slow.get("gps"), scenario.gps_outage)
-    parts = (
-        car_of(vehicle),
-        _road_of(scenario),
-        lag_of(vehicle.motor_lag if scenario.lags else 0.0, TICK),
-        lag_of(vehicle.steering_lag if scenario.lags else 0.0, TICK),
-        Wind(0.0, 0.0, 0.0, 0.0, scenario.wind_height),  # the rest is drawn
-        _pace_of(scenario),
-        Noise()._replace(**scenario.noise),
-        link_of(slow.get("camera"), scenario.camera_outage),
-        gps,
-        target_of(nominal),
-        Disturbance(
-            scenario.disturbance_force,
-            scenario.disturbance_moment,
-            keep,
-            math.sqrt(1.0 - keep * keep),
+    params = Params(
+        car=car_of(vehicle),
+        road=_road_of(scenario),
+        motor=lag_of(vehicle.motor_lag if scenario.lags else 0.0, TICK),
+        steering=lag_of(vehicle.steering_lag if scenario.lags else 0.0, TICK),
+        wind=Wind(0.0, 0.0, 0.0, 0.0, scenario.wind_height),  # the rest is drawn
+        pace=_pace_of(scenario),
+        noise=Noise()._replace(**scenario.noise),
+        slow=(link_of(slow.get("camera"), scenario.camera_outage), gps),
+        target=target_of(nominal),
+        disturbance=Disturbance(
+            force=scenario.disturbance_force,
+            moment=scenario.disturbance_moment,
+            keep=keep,
+            fresh=math.sqrt(1.0 - keep * keep),
         ),
-        Task(
-            ticks(scenario.duration),
-            scenario.half_width,
-            vehicle.yaw_moment_limit,
-            float(yaw_first),
-            SPIN_ANGLE,
-            vehicle.steering_authority,
-            vehicle.steering_rate * TICK,
-            vehicle.steering_stop,
+        task=Task(
+            duration=ticks(scenario.duration),
+            half_width=scenario.half_width,
+            yaw_scale=vehicle.yaw_moment_limit,
+            yaw_first=float(yaw_first),
+            spin=SPIN_ANGLE,
+            authority=vehicle.steering_authority,
+            slew=vehicle.steering_rate * TICK,
+            stop=vehicle.steering_stop,
         ),
-        (0.0,) * STEERING_WIDTH,
-        _sky_of(scenario, gps),
-        Driver(
-            scenario.driver_preview,
-            scenario.driver_gain,
-            lag_of(scenario.driver_lag, TICK).end,
-            scenario.driver_rate * TICK,
+        programme=(0.0,) * STEERING_WIDTH,  # drawn
+        sky=_sky_of(scenario, gps),
+        driver=Driver(
+            preview=scenario.driver_preview,
+            gain=scenario.driver_gain,
+            rest=lag_of(scenario.driver_lag, TICK).end,
+            slew=scenario.driver_rate * TICK,
         ),
-        path_of(scenario.path, vehicle.width),
-        Change(FOREVER, 1.0, 1.0),  # drawn
+        path=path_of(scenario.path, vehicle.width),
+        change=Change(FOREVER, 1.0, 1.0),  # drawn
     )
-    params = np.array([value for part in parts for value in part], dtype=np.float64)
-    assert len(params) == P.end
+    packed = np.array(_numbers(params), dtype=np.float64)
+    assert len(packed) == PARAMS_WIDTH
     low, high = scenario.draws()
     switches = Switches(
-        int(scenario.small_angle),
-        TYRE_LAWS.index(scenario.tyres),
-        REFERENCES.index(reference),
-        STEERING_KINDS.index(scenario.steering),
-        int(all_samples),
-        int(fail_bad),
-        int(scenario.roll),
+        small_angle=int(scenario.small_angle),
+        law=TYRE_LAWS.index(scenario.tyres),
+        reference=REFERENCES.index(reference),
+        steering=STEERING_KINDS.index(scenario.steering),
+        all_samples=int(all_samples),
+        fail_bad=int(fail_bad),
+        roll=int(scenario.roll),
     )
-    packed = np.array(switches, dtype=np.int64)
+    flags = np.array(switches, dtype=np.int64)
     held = scenario.held_speed
-    return Template(params, low, high, packed, vehicle, nominal, scenario, slow, held)
+    return Template(packed, low, high, flags, vehicle, nominal, scenario, slow, held)

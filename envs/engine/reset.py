@@ -2,30 +2,25 @@
 
 from typing import Any
 
-from ..backend.arrays import fixed_tuple
-from ..backend.decorators import apart, copied, jit, store
+from ..backend.arrays import read, write
+from ..backend.decorators import apart, copied, jit
 from ..backend.primitives import select
 from ..backend.random import CHANNELS, normals
-from ..record import CAMERA, FAST
+from ..record import FAST
 from ..scenarios.draws import realise
-from ..scenarios.driver import Driver, wanted_angle
-from ..scenarios.steering import DRIVER, STEERING_WIDTH, steering_at, write_steering
-from ..scenarios.tracks import Path, laid
+from ..scenarios.driver import wanted_angle
+from ..scenarios.steering import DRIVER, steering_at, write_steering
+from ..scenarios.tracks import laid
 from ..sensors.inertial import Chance, fast_row
-from ..sensors.link import Link, clock_phase
-from ..sensors.noise import Noise
+from ..sensors.link import clock_phase
 from ..task.info import REPORT
-from ..task.reference import Target, reference
+from ..task.reference import reference
 from ..ticks import FOREVER, NEVER, whole_ticks
-from ..vehicle.dynamics import Car, Motion, Road, gravity_at, sideslip_angle
+from ..vehicle.dynamics import gravity_at, sideslip_angle
 from ..vehicle.vehicle import GRAVITY
-from .layout import P, Z
+from .layout import FLAGS, STATE_WIDTH, P, Z
 from .observe import observe, write_report
 from .packets import FAR, sense_slow
-
-_CAR, _MOTION, _LINK, _TARGET = (len(each._fields) for each in (Car, Motion, Link, Target))
-_ROAD, _DRIVER, _PATH, _NOISE = (len(each._fields) for each in (Road, Driver, Path, Noise))
-_S = Motion._fields.index("s")
 
 
 @jit
@@ -36,18 +31,18 @@ def _write_surroundings(p: Any, d: Any, s: Any, v_x: Any) -> None:
     """
     mirrored = d.side < 0.5
     right = select(d.friction_right > 0.0, d.friction_right, d.friction)
-    p[P.car + 10] = select(mirrored, right, d.friction)
-    p[P.car + 19] = select(mirrored, d.friction, right)
-    p[P.wind] = select(d.wind_side < 0.5, -d.wind_force, d.wind_force)
-    p[P.wind + 1] = d.wind_arm
-    p[P.wind + 2] = whole_ticks(d.wind_start)
-    p[P.wind + 3] = p[P.wind + 2] + whole_ticks(d.wind_length)
-    p[P.road] = select(mirrored, 0.0 - d.curvature, d.curvature)
-    p[P.road + 3] = select(mirrored, 0.0 - p[P.road + 3], p[P.road + 3])
+    p[P.car.mu] = select(mirrored, right, d.friction)
+    p[P.car.mu_r] = select(mirrored, d.friction, right)
+    p[P.wind.force] = select(d.wind_side < 0.5, -d.wind_force, d.wind_force)
+    p[P.wind.arm] = d.wind_arm
+    p[P.wind.start] = whole_ticks(d.wind_start)
+    p[P.wind.end] = p[P.wind.start] + whole_ticks(d.wind_length)
+    p[P.road.curvature] = select(mirrored, 0.0 - d.curvature, d.curvature)
+    p[P.road.across] = select(mirrored, 0.0 - p[P.road.across], p[P.road.across])
     scaled = d.path_speed > 0.0
     scale = select(scaled, d.speed, 1.0) / select(scaled, d.path_speed, 1.0)
-    path = Path(*fixed_tuple(p[P.path :], _PATH))
-    store(p, P.path, laid(path, s + d.onset * v_x, scale, select(mirrored, -1.0, 1.0)))
+    path = laid(read(p, P.path), s + d.onset * v_x, scale, select(mirrored, -1.0, 1.0))
+    write(p, path, P.path)
 
 
 @apart
@@ -73,54 +68,53 @@ def reset_vehicle(
     template: packed parameters with the vehicle and everything the scenario does not draw.
     start: a Motion whose NaN entries are the default (standing on the road at the drawn speed).
     """
-    for i in range(P.end):
-        p[i] = template[i]
-    d, redraws = realise(low, high, key_low, key_high, Car(*fixed_tuple(p, _CAR)), drawn)
-    p[P.car + 4] = p[P.car + 4] * d.front_stiffness
-    p[P.car + 5] = p[P.car + 5] * d.rear_stiffness
+    copied(template, p)
+    d, redraws = realise(low, high, key_low, key_high, read(p, P.car), drawn)
+    p[P.car.C_f] = p[P.car.C_f] * d.front_stiffness
+    p[P.car.C_r] = p[P.car.C_r] * d.rear_stiffness
     change = select(d.tyre_change_time > 0.0, whole_ticks(d.tyre_change_time), FOREVER)
-    store(p, P.change, (change, d.front_change, d.rear_change))
-    write_steering(switches[3], d, p[P.steering :])
-    p[P.pace] = d.speed
-    for i in range(Z.end):
+    write(p, (change, d.front_change, d.rear_change), P.change)
+    write_steering(switches[FLAGS.steering], d, p[P.programme[0] :])
+    p[P.pace.speed] = d.speed
+    for i in range(STATE_WIDTH):
         z[i] = 0.0
-    z[Z.motion] = d.speed
-    for i in range(_MOTION):
+    z[Z.motion.v_x] = d.speed
+    for i in range(len(Z.motion)):
         if start[i] == start[i]:
-            z[Z.motion + i] = start[i]
-    _write_surroundings(p, d, z[Z.motion + _S], z[Z.motion])
-    z[Z.sky] = p[P.sky + 1] * normals(key_low, key_high, 0, CHANNELS.sky)[1]
+            z[Z.motion[i]] = start[i]
+    motion = read(z, Z.motion)
+    _write_surroundings(p, d, motion.s, motion.v_x)
+    z[Z.sky] = p[P.sky.spread] * normals(key_low, key_high, 0, CHANNELS.sky)[1]
     n = normals(key_low, key_high, 0, CHANNELS.initial)
-    road = Road(*fixed_tuple(p[P.road :], _ROAD))
-    motion = Motion(*fixed_tuple(z[Z.motion :], _MOTION))
-    target = Target(*fixed_tuple(p[P.target :], _TARGET))
-    steer = steering_at(0.0, fixed_tuple(p[P.steering :], STEERING_WIDTH))
-    if switches[3] == DRIVER:
-        person = Driver(*fixed_tuple(p[P.driver :], _DRIVER))
-        path = Path(*fixed_tuple(p[P.path :], _PATH))
-        steer = wanted_angle(motion, path, road, target, person, p[P.task + 7])
-    z[Z.drive + 2] = steer
+    road, target = read(p, P.road), read(p, P.target)
+    steer = steering_at(0.0, read(p, P.programme))
+    if switches[FLAGS.steering] == DRIVER:
+        person, path = read(p, P.driver), read(p, P.path)
+        steer = wanted_angle(motion, path, road, target, person, p[P.task.stop])
+    z[Z.drive.delta_f] = steer
     z[Z.driver] = steer
-    z[Z.drive + 4] = p[P.disturbance] * n[0]
-    z[Z.drive + 5] = p[P.disturbance + 1] * n[1]
-    store(z, Z.clock, (key_low * 1.0, key_high * 1.0, 0.0, 0.0, redraws * 1.0, FAR))
-    for sensor in range(2):
-        at = Z.camera if sensor == CAMERA else Z.gps
-        link = Link(*fixed_tuple(p[P.camera if sensor == CAMERA else P.gps :], _LINK))
-        z[at + 1] = select(link.period > 0.0, clock_phase(link, key_low, key_high, sensor), NEVER)
-        z[at + 2] = NEVER
-    beta = sideslip_angle(motion.v_x, motion.v_y, switches[0])
+    z[Z.drive.F_d] = p[P.disturbance.force] * n[0]
+    z[Z.drive.N_d] = p[P.disturbance.moment] * n[1]
+    z[Z.clock.key_low], z[Z.clock.key_high] = key_low, key_high
+    z[Z.clock.redraws], z[Z.clock.next_due] = redraws, FAR
+    for sensor in range(len(Z.slow)):
+        link, at = read(p, P.slow[sensor]), Z.slow[sensor]
+        phase = clock_phase(link, key_low, key_high, sensor)
+        z[at.next_capture] = select(link.period > 0.0, phase, NEVER)
+        z[at.captured] = NEVER
+    small_angle = switches[FLAGS.small_angle]
+    beta = sideslip_angle(motion.v_x, motion.v_y, small_angle)
     fast = normals(key_low, key_high, 0, CHANNELS.inertial)
     wheels = normals(key_low, key_high, 0, CHANNELS.wheels)
     acted = (steer, 0.0, 0.0, steer, 0.0)
-    g_x, g_y = gravity_at(motion, road, switches[0])
+    g_x, g_y = gravity_at(motion, road, small_angle)
     accel = (g_x, g_y + GRAVITY * motion.phi)
-    noise = Noise(*fixed_tuple(p[P.noise :], _NOISE))
-    store(rows[0], 0, fast_row(motion, accel, acted, p[P.car + 6], noise, Chance(fast, wheels)))
-    count = sense_slow(p, z, motion, 0.0, switches[0], packets, 0)
+    chance, noise = Chance(fast, wheels), read(p, P.noise)
+    write(rows[0], fast_row(motion, accel, acted, p[P.car.d_f], noise, chance), FAST)
+    count = sense_slow(p, z, motion, 0.0, small_angle, packets, 0)
     v = 0.5 * (rows[0, FAST.wheel_left] + rows[0, FAST.wheel_right])
-    refs = reference(steer, v, target, switches[2])
-    if switches[4]:  # every sample of the step is asked for: tick 0 stands for all of them
+    refs = reference(steer, v, target, switches[FLAGS.reference])
+    if switches[FLAGS.all_samples]:  # tick 0 stands for all samples of a step
         for j in range(1, len(rows)):
             copied(rows[0], rows[j])
         observe(p, z, switches, rows, len(rows), count, packets, refs, bounds, obs)

@@ -10,66 +10,52 @@ scratch array, `drive_on` moves the car tick by tick, `conclude` handles the slo
 
 from typing import Any
 
-from ..backend.arrays import at, fixed_tuple, put, put_all
+from ..backend.arrays import at, put, read, write
 from ..backend.decorators import apart, copied, jit
 from ..backend.elementary import clip
 from ..backend.primitives import anywhere, select
-from ..scenarios.driver import Driver
-from ..scenarios.speed import Pace
+from ..record import FAST
 from ..scenarios.steering import DRIVER
-from ..scenarios.tracks import Path
-from ..scenarios.wind import Wind
-from ..sensors.noise import Noise
 from ..task.cost import rest_of_cost
 from ..task.failures import BAD_ACTION, REFUSED, RUNNING
 from ..task.info import REPORT
-from ..task.reference import Target
 from ..ticks import TICK
-from ..vehicle.actuators import Lag
-from ..vehicle.dynamics import Car, Motion, Road
 from ..vehicle.tyres import shifts
-from .layout import Change, Disturbance, Drive, P, Switches, Task, Z
+from .layout import FLAGS, P, Z
 from .observe import observe, write_report
 from .packets import due, sense_slow
 from .tick import Fixed, Kind, Moving, advance, changed, failure_of, standing_load
-from .window import AHEAD, TRACK, chance_at, foresee, motion_at
-
-_CAR, _MOTION, _ROAD, _LAG = (len(each._fields) for each in (Car, Motion, Road, Lag))
-_WIND, _PACE, _TARGET = (len(each._fields) for each in (Wind, Pace, Target))
-_OU, _TASK, _DRIVE = (len(each._fields) for each in (Disturbance, Task, Drive))
-_DRIVER, _PATH, _CHANGE = (len(each._fields) for each in (Driver, Path, Change))
-_NOISE = len(Noise._fields)
-_BAD = Switches._fields.index("fail_bad")
+from .window import WINDOW, chance_at, foresee
 
 
 @jit
 def fixed_of(p: Any) -> Fixed:
     """What does not change within an env-step."""
     return Fixed(
-        Car(*fixed_tuple(p, _CAR)),
-        Road(*fixed_tuple(p[P.road :], _ROAD)),
-        Lag(*fixed_tuple(p[P.motor :], _LAG)),
-        Lag(*fixed_tuple(p[P.steer :], _LAG)),
-        Wind(*fixed_tuple(p[P.wind :], _WIND)),
-        Pace(*fixed_tuple(p[P.pace :], _PACE)),
-        Target(*fixed_tuple(p[P.target :], _TARGET)),
-        Disturbance(*fixed_tuple(p[P.disturbance :], _OU)),
-        Task(*fixed_tuple(p[P.task :], _TASK)),
-        Noise(*fixed_tuple(p[P.noise :], _NOISE)),
-        Driver(*fixed_tuple(p[P.driver :], _DRIVER)),
-        Path(*fixed_tuple(p[P.path :], _PATH)),
-        Change(*fixed_tuple(p[P.change :], _CHANGE)),
+        car=read(p, P.car),
+        road=read(p, P.road),
+        motor=read(p, P.motor),
+        steering=read(p, P.steering),
+        wind=read(p, P.wind),
+        pace=read(p, P.pace),
+        target=read(p, P.target),
+        disturbance=read(p, P.disturbance),
+        task=read(p, P.task),
+        noise=read(p, P.noise),
+        person=read(p, P.driver),
+        path=read(p, P.path),
+        change=read(p, P.change),
     )
 
 
 @jit
 def kind_of(p: Any, switches: Any) -> Kind:
     """What chooses the text of one vehicle's ticks."""
-    lag = int(p[P.motor] > 0.0) + int(p[P.steer] > 0.0)
-    follows = int(switches[3] == DRIVER)
-    small_angle, law, roll = switches[0], switches[1], switches[6]
-    shifting = shifts(small_angle, law, roll)
-    return Kind(small_angle, law, switches[2], roll, follows, lag, shifting)
+    flags = read(switches, FLAGS)
+    lag = int(p[P.motor.start] > 0.0) + int(p[P.steering.start] > 0.0)
+    follows = int(flags.steering == DRIVER)
+    shifting = shifts(flags.small_angle, flags.law, flags.roll)
+    return Kind(flags.small_angle, flags.law, flags.reference, flags.roll, follows, lag, shifting)
 
 
 @jit
@@ -93,9 +79,7 @@ def drive_on(
     fails or ends before the others, 0 is returned and z and report are as they were.
     """
     fixed = fixed_of(p)
-    motion = Motion(*fixed_tuple(z[Z.motion :], _MOTION))
-    drive = Drive(*fixed_tuple(z[Z.drive :], _DRIVE))
-    tick = at(z, Z.clock + 2)
+    motion, drive, tick = read(z, Z.motion), read(z, Z.drive), at(z, Z.clock.tick)
     car = changed(fixed.car, fixed.change, tick > fixed.change.tick)
     now = Moving(motion, drive, standing_load(drive, car, kind), at(z, Z.driver), car)
     task = fixed.task
@@ -103,12 +87,12 @@ def drive_on(
     cost = 0.0 * N_z
     for j in range(n):
         before = now.motion
-        chance, ahead = chance_at(scratch, j), at(scratch, AHEAD, j)
+        chance, ahead = chance_at(scratch, j), at(scratch, WINDOW.ahead, j)
         now, seen = advance(fixed, N_z, added, now, tick, chance, ahead, kind)
         tick = tick + 1.0
         cost = cost + seen.cost * TICK
-        put_all(rows, seen.row, 1, j, 0)
-        put_all(scratch, now.motion, 0, TRACK, j)
+        write(rows[j], seen.row, FAST)
+        write(scratch, now.motion, WINDOW.track, j)
         failed = anywhere(seen.lost | seen.spun | seen.off)
         ended = failed | anywhere(tick >= task.duration)
         if ended or j + 1 == n:
@@ -117,12 +101,12 @@ def drive_on(
             motion, beta, refs = now.motion, seen.beta, seen.refs
             if anywhere(seen.lost):  # the last that is fit for `info`
                 motion, beta, refs = before, 0.0 * cost, (0.0 * cost, 0.0 * cost)
-            put_all(z, motion, 0, Z.motion)
-            put_all(z, now.drive, 0, Z.drive)
+            write(z, motion, Z.motion)
+            write(z, now.drive, Z.drive)
             put(z, now.driver, Z.driver)
-            put(z, tick, Z.clock + 2)
+            put(z, tick, Z.clock.tick)
             failure = failure_of(seen)
-            put(z, failure, Z.clock + 3)
+            put(z, failure, Z.clock.failure)
             rest = rest_of_cost(task.duration, tick)
             put(report, cost + select(failure != RUNNING, rest, 0.0), REPORT.cost)
             put(report, beta, REPORT.beta)
@@ -148,17 +132,16 @@ def conclude(
     packets: Any,
     report: Any,
     scratch: Any,
-    lane: int,
 ) -> None:
     """The slow sensors along `done` ticks of one vehicle, its observation and its report."""
-    count, first = 0, z[Z.clock + 2] - done
+    count, first = 0, z[Z.clock.tick] - done
     for j in range(done):
         tick = first + (j + 1)
         if due(z, tick):
-            motion = motion_at(scratch, j, lane)
-            count = sense_slow(p, z, motion, tick, switches[0], packets, count)
+            motion = read(scratch, WINDOW.track, j)
+            count = sense_slow(p, z, motion, tick, switches[FLAGS.small_angle], packets, count)
     refs = (report[REPORT.beta_ref], report[REPORT.gamma_ref])
-    if switches[4] and done < n:  # an early end: the last sample stands for the missing ones
+    if switches[FLAGS.all_samples] and done < n:  # the last one stands for the missing
         for j in range(done, n):
             copied(rows[done - 1], rows[j])
         observe(p, z, switches, rows, n, count, packets, refs, bounds, obs)
@@ -184,11 +167,11 @@ def shares_of(action: Any) -> tuple[float, float]:
 @jit
 def refuse(p: Any, z: Any, switches: Any, report: Any) -> int:
     """What an action that is not finite does: nothing, or the episode's failure (`fail_bad`)."""
-    if switches[_BAD] == 0:
+    if switches[FLAGS.fail_bad] == 0:
         return REFUSED
-    z[Z.clock + 3] = BAD_ACTION
+    z[Z.clock.failure] = BAD_ACTION
     report[REPORT.failure] = BAD_ACTION
-    report[REPORT.cost] = rest_of_cost(p[P.task], z[Z.clock + 2])
+    report[REPORT.cost] = rest_of_cost(p[P.task.duration], z[Z.clock.tick])
     report[REPORT.reward] = -report[REPORT.cost]
     report[REPORT.packets] = 0.0
     return 0
@@ -220,5 +203,5 @@ def step_vehicle(
     kind = kind_of(p, switches)
     foresee(p, z, n, kind.follows, scratch)
     done = drive_on(p, z, kind, share, turn, n, rows, report, scratch, True)
-    conclude(p, z, switches, n, done, bounds, obs, rows, packets, report, scratch, 0)
+    conclude(p, z, switches, n, done, bounds, obs, rows, packets, report, scratch)
     return int(done)

@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from typing import TypeVar, overload
 
+from ..backend.arrays import read
 from ..record import SLOW_NAMES, Array, Record, SlowSensor
 from ..ticks import TICK, ticks
 from ..vehicle.dynamics import Motion
@@ -16,13 +17,14 @@ T = TypeVar("T")
 
 def vehicle_in(template: Template, params: Array, state: Array) -> Vehicle:
     """The true vehicle now, with what the seed drew; friction is the mean of both sides'."""
-    if not params[P.car] > 0.0:  # not reset yet
+    car, change = read(params, P.car), read(params, P.change)
+    if not car.m > 0.0:  # not reset yet
         return template.vehicle
-    changed = state[Z.clock + 2] >= params[P.change]
+    changed = state[Z.clock.tick] >= change.tick
     return template.vehicle.replace(
-        front_stiffness=float(params[P.car + 4] * (params[P.change + 1] if changed else 1.0)),
-        rear_stiffness=float(params[P.car + 5] * (params[P.change + 2] if changed else 1.0)),
-        friction=float(0.5 * (params[P.car + 10] + params[P.car + 19])),
+        front_stiffness=car.C_f * (change.front if changed else 1.0),
+        rear_stiffness=car.C_r * (change.rear if changed else 1.0),
+        friction=0.5 * (car.mu + car.mu_r),
     )
 
 
@@ -31,9 +33,8 @@ def slow_in(template: Template, state: Array) -> dict[str, SlowSensor]:
     told = {}
     for name, sensor in template.slow.items():
         if sensor.phase is None:
-            at = Z.camera if name == SLOW_NAMES[0] else Z.gps
-            frames, upcoming = state[at], state[at + 1]
-            first = upcoming - frames * ticks(sensor.period)
+            at = Z.slow[SLOW_NAMES.index(name)]
+            first = state[at.next_capture] - state[at.frames] * ticks(sensor.period)
             sensor = dataclasses.replace(sensor, phase=first * TICK)
         told[name] = sensor
     return told
@@ -41,12 +42,12 @@ def slow_in(template: Template, state: Array) -> dict[str, SlowSensor]:
 
 def motion_in(state: Array) -> Motion:
     """The true velocities, heading, place and roll now, in SI units."""
-    return Motion(*state[Z.motion : Z.motion + len(Motion._fields)].tolist())
+    return read(state, Z.motion)
 
 
 def record_in(state: Array, rows: Array, packets: Array) -> Record:
     """The record whose fast rows end now (copies)."""
-    return Record(rows.copy(), packets.copy(), int(state[Z.clock + 2]) - len(rows) + 1)
+    return Record(rows.copy(), packets.copy(), int(state[Z.clock.tick]) - len(rows) + 1)
 
 
 class Each(Sequence[T]):

@@ -6,11 +6,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ..backend.decorators import store
+from ..backend.arrays import read, write
 from ..backend.elementary import clip
 from ..backend.primitives import absolute
 from ..backend.random import CHANNELS, normals
-from ..engine.layout import Disturbance, Drive, P, Task, Z
+from ..engine.layout import FLAGS, Disturbance, Drive, P, Task, Z
 from ..engine.observe import observe, write_report
 from ..engine.packets import due, sense_slow
 from ..record import FAST
@@ -18,11 +18,10 @@ from ..scenarios.driver import Driver, steered
 from ..scenarios.manoeuvres import scenario_from
 from ..scenarios.scenario import Scenario
 from ..scenarios.speed import Pace, acceleration_command
-from ..scenarios.steering import DRIVER, STEERING_WIDTH, steering_at
+from ..scenarios.steering import DRIVER, steering_at
 from ..scenarios.tracks import Path, path_offset
 from ..scenarios.wind import Wind, wind_at
 from ..sensors.inertial import Chance, fast_row
-from ..sensors.noise import Noise
 from ..stability import StabilityEnv
 from ..task.cost import cost_rate, rest_of_cost
 from ..task.failures import NOT_FINITE, OFF_ROAD, RUNNING, SPIN
@@ -88,9 +87,9 @@ class OutsideEnv(StabilityEnv):
             asked["state"] = {**state, "s": state.get("X", 0.0), "y": state.get("Y", 0.0)}
         told = super().reset(seed=seed, options=asked)
         p, base = self._params, self._now.vehicle
-        scale = 0.5 * (p[P.car + 4] / base.front_stiffness + p[P.car + 5] / base.rear_stiffness)
-        p[P.car + 4], p[P.car + 5] = scale * base.front_stiffness, scale * base.rear_stiffness
-        self.plant = OUTSIDE_PLANTS[self.model](float(p[P.car + 10]), float(scale))
+        scale = 0.5 * (p[P.car.C_f] / base.front_stiffness + p[P.car.C_r] / base.rear_stiffness)
+        p[P.car.C_f], p[P.car.C_r] = scale * base.front_stiffness, scale * base.rear_stiffness
+        self.plant = OUTSIDE_PLANTS[self.model](float(p[P.car.mu]), float(scale))
         self.plant.start(self.motion)
         return told
 
@@ -111,7 +110,7 @@ class OutsideEnv(StabilityEnv):
         """One control period of the outside plant: the order of `kernel.step_vehicle`."""
         if not np.isfinite(force).all():
             return super()._advance(force, obs)  # refuses or fails before it moves anything
-        told = _Told(*(_part(self._params, kind, at) for kind, at in _TOLD))
+        told = _Told(*(read(self._params, getattr(P, name)) for name in _Told._fields))
         shares = [float(clip(float(share), -1.0, 1.0)) for share in (*force, 0.0)[:2]]
         z, cost, count, failure, done = self._state, 0.0, 0, RUNNING, 0
         beta, refs, moment, steer = 0.0, (0.0, 0.0), 0.0, 0.0
@@ -120,12 +119,12 @@ class OutsideEnv(StabilityEnv):
             acted = self._command(told, before.v_x, shares)
             steer = acted[0]
             motion = self.plant.motion if self.plant.finite else before
-            store(z, Z.motion, motion)
+            write(z, motion, Z.motion)
             count = self._sense(motion, acted[:5], done, count)
             beta = sideslip_angle(motion.v_x, motion.v_y, 0)
             row = self.rows[done]
             v = 0.5 * (row[FAST.wheel_left] + row[FAST.wheel_right])
-            kind = int(self._now.switches[2])
+            kind = int(self._now.switches[FLAGS.reference])
             z[Z.driver] = self._driver(told, motion)
             refs = reference(float(z[Z.driver]), float(v), told.target, kind)
             moment = yaw_moment(acted[1], acted[2], self.plant.car)
@@ -133,9 +132,9 @@ class OutsideEnv(StabilityEnv):
             cost += TICK * cost_rate(beta - refs[0], motion.gamma - refs[1], share, acted[5], kind)
             done += 1
             failure = self._failure(told, motion, beta)
-        z[Z.clock + 3] = failure
+        z[Z.clock.failure] = failure
         if failure != RUNNING:
-            cost += rest_of_cost(told.task.duration, float(z[Z.clock + 2]))
+            cost += rest_of_cost(told.task.duration, float(z[Z.clock.tick]))
         self._tell(done, count, refs, obs)
         write_report(self._report, z)
         self._report[REPORT.beta] = beta
@@ -147,7 +146,7 @@ class OutsideEnv(StabilityEnv):
 
     @property
     def _at_end(self) -> bool:
-        return bool(self._state[Z.clock + 2] >= self._params[P.task])
+        return bool(self._state[Z.clock.tick] >= self._params[P.task.duration])
 
     def _command(
         self, told: "_Told", v_x: float, shares: list[float]
@@ -157,8 +156,8 @@ class OutsideEnv(StabilityEnv):
         Returns what acted, as `Fast` has it from `steer` on, and the added steering.
         """
         z, task, car = self._state, told.task, self.plant.car
-        drive = Drive(*z[Z.drive : Z.drive + len(Drive._fields)].tolist())
-        tick = float(z[Z.clock + 2])
+        drive = read(z, Z.drive)
+        tick = float(z[Z.clock.tick])
         driver = float(z[Z.driver])
         slewing = slewed(drive.slewing, shares[1] * task.authority, task.slew)
         extra = within_stop(slewing, driver, task.stop)
@@ -166,12 +165,12 @@ class OutsideEnv(StabilityEnv):
         a_x, integral = acceleration_command(tick, v_x, drive.integral, told.pace, limit)
         to_l, to_r = distribute(shares[0] * task.yaw_scale, a_x, car, task.yaw_first)
         F_w, N_w, N_x = wind_at(tick, told.wind)
-        mean, end = (told.motor.mean, told.steer.mean), (told.motor.end, told.steer.end)
+        mean, end = (told.motor.mean, told.steering.mean), (told.motor.end, told.steering.end)
         steer = lagged(driver + extra, drive.delta_f, mean[1])
         left, right = lagged(to_l, drive.T_l, mean[0]), lagged(to_r, drive.T_r, mean[0])
         added = lagged(extra, drive.added, mean[1])
         self.plant.step(Acting(steer, left, right, drive.F_d + F_w, drive.N_d + N_w, N_x), TICK)
-        z[Z.clock + 2] = tick + 1.0
+        z[Z.clock.tick] = tick + 1.0
         ou, wheels = told.disturbance, self._normals(CHANNELS.wheels)
         after = Drive(
             lagged(to_l, drive.T_l, end[0]),
@@ -183,28 +182,29 @@ class OutsideEnv(StabilityEnv):
             slewing,
             lagged(extra, drive.added, end[1]),
         )
-        store(z, Z.drive, after)
+        write(z, after, Z.drive)
         return steer, left, right, driver, a_x, added
 
     def _driver(self, told: "_Told", motion: Motion) -> float:
         """The driver's steering command at the tick just reached."""
         z, task = self._state, told.task
-        if self._now.switches[3] == DRIVER:
+        if self._now.switches[FLAGS.steering] == DRIVER:
             angle, person, path = float(z[Z.driver]), told.driver, told.path
             return float(steered(angle, motion, path, _FLAT, told.target, person, task.stop))
-        programme = tuple(self._params[P.steering : P.steering + STEERING_WIDTH].tolist())
-        return float(steering_at(float(z[Z.clock + 2]), programme))
+        programme = read(self._params, P.programme)
+        return float(steering_at(float(z[Z.clock.tick]), programme))
 
     def _normals(self, channel: int) -> tuple[float, ...]:
-        key_low, key_high, tick = self._state[Z.clock : Z.clock + 3].tolist()
-        return tuple(normals(int(key_low), int(key_high), int(tick), channel))
+        clock = read(self._state, Z.clock)
+        keys = int(clock.key_low), int(clock.key_high)
+        return tuple(normals(*keys, int(clock.tick), channel))
 
     def _sense(self, motion: Motion, acted: tuple[float, ...], row: int, count: int) -> int:
         """The sensors at the tick just reached; returns how many packets there are now."""
         force = self.plant.specific_force if self.plant.finite else (0.0, 0.0)
-        p, z, tick = self._params, self._state, float(self._state[Z.clock + 2])
+        p, z, tick = self._params, self._state, float(self._state[Z.clock.tick])
         chance = Chance(self._normals(CHANNELS.inertial), self._normals(CHANNELS.wheels))
-        noise, d_f = _part(p, Noise, P.noise), float(p[P.car + 6])
+        noise, d_f = read(p, P.noise), float(p[P.car.d_f])
         self.rows[row] = fast_row(motion, force, acted, d_f, noise, chance)
         return (
             int(sense_slow(p, z, motion, tick, 0, self.packets, count)) if due(z, tick) else count
@@ -215,7 +215,7 @@ class OutsideEnv(StabilityEnv):
             return NOT_FINITE
         if absolute(beta) > told.task.spin and motion.v_x > 0.0:  # backing up is no spin
             return SPIN
-        follows = self._now.switches[3] == DRIVER
+        follows = self._now.switches[FLAGS.steering] == DRIVER
         way = path_offset(told.path, motion.s) if follows else 0.0
         return OFF_ROAD if absolute(motion.y - way) > told.task.half_width else RUNNING
 
@@ -224,7 +224,7 @@ class OutsideEnv(StabilityEnv):
     ) -> None:
         """The observation; where every sample is asked for, the last stands for missing ones."""
         switches, n = self._now.switches, done
-        if switches[4]:
+        if switches[FLAGS.all_samples]:
             self.rows[done:] = self.rows[done - 1]
             n = self.control_period
         args = (self.rows, n, count, self.packets, refs, self._bounds, obs)
@@ -235,7 +235,7 @@ class _Told(NamedTuple):
     """The parts of the packed parameters that a tick reads."""
 
     motor: Lag
-    steer: Lag
+    steering: Lag
     wind: Wind
     pace: Pace
     target: Target
@@ -245,19 +245,4 @@ class _Told(NamedTuple):
     path: Path
 
 
-_TOLD: tuple[tuple[Any, int], ...] = (
-    (Lag, P.motor),
-    (Lag, P.steer),
-    (Wind, P.wind),
-    (Pace, P.pace),
-    (Target, P.target),
-    (Disturbance, P.disturbance),
-    (Task, P.task),
-    (Driver, P.driver),
-    (Path, P.path),
-)
 _FLAT = Road(0.0, 0.0, 1.0)
-
-
-def _part(p: npt.NDArray[np.float64], kind: Any, at: int) -> Any:
-    return kind(*p[at : at + len(kind._fields)].tolist())

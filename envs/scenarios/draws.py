@@ -2,7 +2,7 @@
 
 from typing import Any, NamedTuple
 
-from ..backend.arrays import fixed_tuple
+from ..backend.arrays import offsets, read
 from ..backend.decorators import jit
 from ..backend.primitives import select
 from ..backend.random import CHANNELS, uniforms
@@ -39,7 +39,7 @@ class Draws(NamedTuple):
     rear_change: Any
 
 
-DRAWS_WIDTH = len(Draws._fields)
+DRAWS, DRAWS_WIDTH = offsets(Draws)
 
 
 @jit
@@ -75,10 +75,10 @@ def realise(low: Any, high: Any, key_low: int, key_high: int, car: Any, drawn: A
     """Draw until the vehicle is stable; returns (the draws, how many unstable ones were lost)."""
     attempt = 0
     draw(low, high, key_low, key_high, attempt, drawn)
-    while attempt + 1 < _ATTEMPTS and not stable(Draws(*fixed_tuple(drawn, DRAWS_WIDTH)), car):
+    while attempt + 1 < _ATTEMPTS and not stable(read(drawn, DRAWS), car):
         attempt += 1
         draw(low, high, key_low, key_high, attempt, drawn)
-    return Draws(*fixed_tuple(drawn, DRAWS_WIDTH)), attempt
+    return read(drawn, DRAWS), attempt
 
 
 Range = float | tuple[float, float]

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import sideslip
+from sideslip.envs.backend.arrays import read
 from sideslip.envs.engine.layout import P, Z
 from sideslip.envs.scenarios.wind import Wind, wind_at
 from sideslip.envs.vehicle.actuators import distribute
@@ -96,10 +97,10 @@ def test_what_is_foreseen_is_what_the_car_meets() -> None:
     foreseen = foresee(env.unwrapped)
     state: Any = env.unwrapped
     snapshot = state.get_state()
-    wind = Wind(*snapshot["params"][P.wind : P.wind + len(Wind._fields)])
+    wind = read(snapshot["params"], P.wind)
     for k in range(500):
         z = state.get_state()["state"]
-        force = z[Z.drive + 4] + wind_at(float(k), wind)[0]
+        force = z[Z.drive.F_d] + wind_at(float(k), wind)[0]
         assert foreseen.known[Known._fields.index("F_d"), k] == force
         env.step(np.array([0.7], np.float32))
 

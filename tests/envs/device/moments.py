@@ -10,7 +10,7 @@ import numpy as np
 
 from sideslip.envs import StabilityVectorEnv
 from sideslip.envs.device.env import DeviceVectorEnv
-from sideslip.envs.engine.layout import Z
+from sideslip.envs.engine.layout import STATE_WIDTH, Z
 from sideslip.envs.record import PACKET, PACKET_WIDTH
 
 from ..batches import batch
@@ -96,7 +96,7 @@ def largest_error(one: dict[str, Any], other: dict[str, Any]) -> float:
     """The largest difference of two snapshots' numbers; what counts must be equal."""
     for name in ("over", "ticks_done", "delivered", "switches"):
         np.testing.assert_array_equal(one[name], other[name], name)
-    outside = np.r_[0 : Z.queue, Z.sky : Z.end]
+    outside = np.r_[0 : Z.queue, Z.sky : STATE_WIDTH]
     pairs = [(one[name], other[name]) for name in ("obs", "params", "reports")]
     pairs += [(one["states"][:, outside], other["states"][:, outside])]
     pairs += list(zip(in_flight(one["states"]), in_flight(other["states"]), strict=True))

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sideslip.envs import FAILURES, SCENARIOS, StabilityEnv, vehicle_from
-from sideslip.envs.engine.layout import P, Task
+from sideslip.envs.engine.layout import P
 from sideslip.envs.vehicle.tyres import TYRE_LAWS
 
 from ..helpers import FULL, Moment, fast_rows, play
@@ -25,8 +25,8 @@ def assert_finite(env: StabilityEnv, start: Any, moments: list[Moment]) -> None:
 def without_limits(env: StabilityEnv) -> dict[str, Any]:
     """The env's snapshot with a car that may spin and go where it likes."""
     snapshot = env.get_state()
-    snapshot["params"][P.task + Task._fields.index("spin")] = math.inf
-    snapshot["params"][P.task + Task._fields.index("half_width")] = math.inf
+    snapshot["params"][P.task.spin] = math.inf
+    snapshot["params"][P.task.half_width] = math.inf
     return snapshot
 
 

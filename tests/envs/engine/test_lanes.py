@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sideslip.envs.backend import random as noise
-from sideslip.envs.backend.arrays import at, put_all
+from sideslip.envs.backend.arrays import at, write
 from sideslip.envs.backend.decorators import jit
 from sideslip.envs.backend.elementary import atan, atan2, exp, sincos, smoothstep, wrap
 from sideslip.envs.backend.primitives import (
@@ -23,6 +23,7 @@ from sideslip.envs.backend.primitives import (
 )
 from sideslip.envs.backend.random import normals, uniforms
 from sideslip.envs.backend.simd import LANES
+from sideslip.envs.engine.layout import FLAGS
 
 from ..batches import SHORT, batch, drive, pair, same, same_cars
 from ..helpers import bits
@@ -89,10 +90,11 @@ def test_lanes_hold_the_bits_of_single_numbers(function: Callable[..., Any]) -> 
     if function is _stepped:
         y[: len(x) // 2] = -1.0
     width = len(function(0.3, 0.7))
+    where = tuple(range(width))
 
     @jit
     def abreast(x: Any, y: Any, out: Any) -> None:
-        put_all(out, function(at(x, 0), at(y, 0)), 0, 0)
+        write(out, function(at(x, 0), at(y, 0)), where)
 
     out = np.empty((width, LANES))
     for start in range(0, len(x), LANES):
@@ -163,7 +165,7 @@ def test_scenarios_of_one_kind_stand_next_to_each_other() -> None:
     count = 6 * LANES
     env = batch(FUSION, count)
     env.reset(seed=0, options={"scenario": ["gust", "curved-road-driver"] * (count // 2)})
-    follows = env.switches[env.block.order][:, 3]
+    follows = env.switches[env.block.order][:, FLAGS.steering]
     assert (np.diff(follows) != 0).sum() == 1  # all drivers together, all programmes together
     assert sorted(env.block.order) == list(range(count))
     snapshot, sorted_order = env.get_state(), env.block.order.copy()

@@ -13,7 +13,7 @@ pytestmark = pytest.mark.plain
 
 
 def key(env: StabilityEnv) -> tuple[int, int]:
-    low, high = env.get_state()["state"][Z.clock : Z.clock + 2]
+    low, high = env.get_state()["state"][[Z.clock.key_low, Z.clock.key_high]]
     return int(low), int(high)
 
 
@@ -80,7 +80,7 @@ def test_neighbouring_seeds_and_episodes_share_nothing() -> None:
     for seed in range(200):
         env.reset(seed=seed)
         keys.add(key(env))
-        speeds.add(env.get_state()["state"][Z.motion])
+        speeds.add(env.get_state()["state"][Z.motion.v_x])
         env.reset()
         keys.add(key(env))
     assert len(keys) == 400
@@ -93,9 +93,9 @@ def test_the_disturbance_starts_and_stays_stationary() -> None:
     samples = []
     for seed in range(400):
         env.reset(seed=seed)
-        start = env.get_state()["state"][Z.drive + 4 : Z.drive + 6]
+        start = env.get_state()["state"][[Z.drive.F_d, Z.drive.N_d]]
         play(env, [0.0])
-        samples.append([*start, *env.get_state()["state"][Z.drive + 4 : Z.drive + 6]])
+        samples.append([*start, *env.get_state()["state"][[Z.drive.F_d, Z.drive.N_d]]])
     values = np.array(samples) / [50.0, 20.0, 50.0, 20.0]
     # the variance of 400 normal numbers: four standard errors; so the correlation's
     assert np.all(np.abs(values.var(axis=0) - 1.0) < 4.0 * np.sqrt(2.0 / 400.0))

@@ -11,7 +11,8 @@ from gymnasium.utils.env_checker import check_env
 from sideslip.agents import make_agent
 from sideslip.agents.rollout import rollout
 from sideslip.envs import FAILURES
-from sideslip.envs.engine.layout import Drive, Z
+from sideslip.envs.backend.arrays import read
+from sideslip.envs.engine.layout import Z
 from sideslip.estimators import EstimateObservation
 
 pytest.importorskip("vehiclemodels")
@@ -39,7 +40,7 @@ def test_sensors_and_disturbances_draw_what_ours_draw(model: str) -> None:
         for _ in range(10):
             each.step([0.0])
         errors.append(each.record.fast[-1, 0] - each.motion.gamma)
-        drive = Drive(*each.get_state()["state"][Z.drive : Z.drive + len(Drive._fields)])
+        drive = read(each.get_state()["state"], Z.drive)
         disturbances.append((drive.F_d, drive.N_d))
         assert each.ticks_done == 10
     assert errors[0] == pytest.approx(errors[1], abs=1e-15)

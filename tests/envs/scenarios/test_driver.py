@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from sideslip.envs import COMS, FAILURES, StabilityEnv
+from sideslip.envs.backend.arrays import read
 from sideslip.envs.backend.primitives import ARRAYS
 from sideslip.envs.backend.rebuild import plain
 from sideslip.envs.engine.layout import P
 from sideslip.envs.scenarios.driver import Driver, steered, wanted_angle
-from sideslip.envs.scenarios.tracks import Path, laid, path_of, path_offset, sections
+from sideslip.envs.scenarios.tracks import laid, path_of, path_offset, sections
 from sideslip.envs.task.reference import target_of
 from sideslip.envs.vehicle.dynamics import Motion, Road
 
@@ -153,7 +154,7 @@ def test_the_car_stays_between_the_cones_of_its_track(side: float) -> None:
     env.reset(seed=0)
     snapshot = env.get_state()
     for i in (0, 3):
-        snapshot["params"][P.path + i] *= side
+        snapshot["params"][P.path[i]] *= side
     env.set_state(snapshot)
     v = 25.0 / 3.6
     lanes = sections("iso-3888-2", COMS.width, 0.5 * v, v / 8.0, side)
@@ -179,7 +180,7 @@ def test_the_track_lies_where_onset_speed_and_side_put_it() -> None:
     sides = set()
     for seed in range(8):
         env.reset(seed=seed)
-        packed = Path(*env.get_state()["params"][P.path : P.path + 6].tolist())
+        packed = read(env.get_state()["params"], P.path)
         own, v = path_of("iso-3888-2", COMS.width), env.motion.v_x
         scale = packed.length_1 / own.length_1
         assert v / 9.0 <= scale <= v / 7.0
@@ -189,12 +190,12 @@ def test_the_track_lies_where_onset_speed_and_side_put_it() -> None:
         assert packed == pytest.approx(laid(own, onset * v, scale, side), rel=1e-12)
         sides.add(side)
         env.reset(seed=seed, options={"state": {"s": 7.0, "v_x": v + 0.5}})
-        started = Path(*env.get_state()["params"][P.path : P.path + 6].tolist())
+        started = read(env.get_state()["params"], P.path)
         begin = 7.0 + onset * (v + 0.5)
         assert started == pytest.approx(laid(own, begin, scale, side), rel=1e-12)
     assert sides == {-1.0, 1.0}
     env.reset(seed=0, options={"scenario": {"base": "double-lane-change", "path_speed": None}})
-    assert env.get_state()["params"][P.path + 2] == own.length_1  # the standard's
+    assert env.get_state()["params"][P.path.length_1] == own.length_1  # the standard's
 
 
 @pytest.mark.plain
@@ -203,7 +204,7 @@ def test_who_leaves_the_path_ends_the_episode_there() -> None:
     scene = {"base": "double-lane-change", "mirror": False, "driver_gain": 1e-9}
     env, moments, places = driven(scene)
     assert FAILURES[moments[-1].info["failure"]] == "off-road"
-    packed = Path(*env.get_state()["params"][P.path : P.path + 6].tolist())
+    packed = read(env.get_state()["params"], P.path)
     off = places[:, 1] - [path_offset(packed, s) for s in places[:, 0]]
     assert abs(off[-1]) > 2.0
     assert np.all(np.abs(off[:-1]) <= 2.0)

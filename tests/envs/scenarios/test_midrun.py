@@ -78,9 +78,9 @@ def test_the_plant_is_another_from_the_tick_of_the_change_on(
     assert states(same, 503) == states(changing, 503)
     # from here on it moves as a car that always had those tyres, in the same state
     snapshot = changing.get_state()
-    snapshot["params"][P.car + 4] *= 0.7
-    snapshot["params"][P.car + 5] *= 1.2
-    snapshot["params"][P.change] = FOREVER
+    snapshot["params"][P.car.C_f] *= 0.7
+    snapshot["params"][P.car.C_r] *= 1.2
+    snapshot["params"][P.change.tick] = FOREVER
     later = states(changing, 60)
     assert later[0] != states(same, 1)[0]
     changing.set_state(snapshot)
@@ -152,7 +152,7 @@ def test_the_seed_draws_the_side_that_slips_and_that_of_the_bend() -> None:
     for seed in range(30):
         env.reset(seed=seed)
         params = env.get_state()["params"]
-        left, right, curvature = params[P.car + 10], params[P.car + 19], params[P.road]
+        left, right, curvature = params[P.car.mu], params[P.car.mu_r], params[P.road.curvature]
         assert 0.01 <= abs(curvature) <= 0.03
         low, high = sorted((left, right))
         assert 0.2 <= low <= 0.3

@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sideslip.envs import COMS, PASSENGER_CAR, StabilityEnv
+from sideslip.envs.backend.arrays import read
 from sideslip.envs.engine.layout import P
 from sideslip.envs.engine.packing import car_of
 from sideslip.envs.record import FAST
@@ -123,7 +124,7 @@ def test_a_mirrored_bend_leans_to_the_other_side() -> None:
     leans = set()
     for seed in range(8):
         env.reset(seed=seed)
-        road = Road(*env.get_state()["params"][P.road : P.road + len(Road._fields)].tolist())
+        road = read(env.get_state()["params"], P.road)
         assert road.across == math.copysign(across, road.curvature)
         assert road.along == GRAVITY * math.sin(0.05)
         leans.add(road.curvature)
