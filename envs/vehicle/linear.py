@@ -1,4 +1,7 @@
-"""The same vehicle as linear systems (A, B, C): what filters and controllers are designed from."""
+"""Linear models of the vehicle (A, B, C), from which filters and controllers are designed.
+
+The matrices are written into arrays by the functions below, here and in compiled filters alike.
+"""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -8,6 +11,7 @@ import numpy.typing as npt
 from scipy.linalg import expm
 
 from ..backend.decorators import jit
+from ..backend.rebuild import plain
 from .vehicle import GRAVITY, Vehicle
 
 if TYPE_CHECKING:
@@ -32,6 +36,45 @@ def bicycle_coefficients(
     a21 = -2.0 * (C_f * l_f - C_r * l_r) / I
     a22 = -2.0 * (C_f * l_f * l_f + C_r * l_r * l_r) / (I * V)
     return a11, a12, a21, a22, 2.0 * C_f / (m * V), 2.0 * C_f * l_f / I, 1.0 / I
+
+
+@jit
+def write_lateral(A: Any, B: Any, car: Any, V: Any, states: int, preview: Any) -> None:
+    """beta and gamma, with more `states` psi and y_l, into A and B (columns delta_f, N_z).
+
+    car: the first six arguments of `bicycle_coefficients`. What is zero is left alone.
+    """
+    a11, a12, a21, a22, b11, b21, b22 = bicycle_coefficients(
+        car[0], car[1], car[2], car[3], car[4], car[5], V
+    )
+    A[0, 0], A[0, 1], A[1, 0], A[1, 1] = a11, a12, a21, a22
+    B[0, 0], B[1, 0], B[1, 1] = b11, b21, b22
+    if states > 2:
+        A[2, 1] = 1.0  # tie-vision (7)
+    if states > 3:
+        A[3, 0], A[3, 1], A[3, 2] = V, preview, V  # tie-vision (6)
+
+
+@jit
+def write_roll(A: Any, B: Any, i: int, column: int, K: Any, C: Any, S: Any) -> None:
+    """phi and phi_dot from the row i on, driven by a_y in a column of B: double-layer-gps (3).
+
+    K, C, S: roll stiffness, damping and M_s h_s, each over the roll inertia.
+    """
+    A[i, i + 1] = 1.0
+    A[i + 1, i], A[i + 1, i + 1] = -K, -C
+    B[i + 1, column] = S
+
+
+@jit
+def write_kinematic(A: Any, B: Any, gamma: Any) -> None:
+    """v_x and v_y, driven by a_x and a_y: double-layer-gps (4)-(5)."""
+    A[0, 1], A[1, 0] = gamma, -gamma
+    B[0, 0], B[1, 1] = 1.0, 1.0
+
+
+_write_lateral, _write_roll = plain(write_lateral), plain(write_roll)
+_write_kinematic = plain(write_kinematic)
 
 
 @dataclass(frozen=True)
@@ -71,25 +114,26 @@ class LinearModel:
         )
 
 
-def _lateral(vehicle: Vehicle, speed: float) -> tuple[Array, Array]:
-    """A and B (columns delta_f, N_z) of beta and gamma."""
+def _lateral(vehicle: Vehicle, speed: float, states: int, inputs: int = 2) -> tuple[Array, Array]:
+    """A (states, states) and B (states, inputs) of `write_lateral`."""
     if not speed > 0.0:
         raise ValueError(f"a linear model needs a positive speed, got {speed!r} m/s")
-    a11, a12, a21, a22, b11, b21, b22 = bicycle_coefficients(
+    car = (
         vehicle.mass,
         vehicle.yaw_inertia,
         vehicle.front_arm,
         vehicle.rear_arm,
         vehicle.front_stiffness,
         vehicle.rear_stiffness,
-        float(speed),
     )
-    return np.array([[a11, a12], [a21, a22]]), np.array([[b11, 0.0], [b21, b22]])
+    A, B = np.zeros((states, states)), np.zeros((states, inputs))
+    _write_lateral(A, B, car, float(speed), states, vehicle.preview)
+    return A, B
 
 
 def bicycle(vehicle: Vehicle, speed: float) -> LinearModel:
     """beta and gamma, from steering and yaw moment: tie-vision (1)-(2). Output: gamma."""
-    A, B = _lateral(vehicle, speed)
+    A, B = _lateral(vehicle, speed, 2)
     return LinearModel(
         A, B, np.array([[0.0, 1.0]]), ("beta", "gamma"), ("delta_f", "N_z"), ("gamma",)
     )
@@ -101,15 +145,8 @@ def vision(vehicle: Vehicle, speed: float) -> LinearModel:
     The road's curvature kappa is the third input: psi' = gamma - V kappa, and
     y_l = y_cg + l_pre psi - kappa l_pre^2 / 2 moves as y_l' = V beta + l_pre psi' + V psi.
     """
-    lateral, steer = _lateral(vehicle, speed)
-    V, l_pre = float(speed), vehicle.preview
-    A = np.zeros((4, 4))
-    A[:2, :2] = lateral
-    A[2, 1] = 1.0  # tie-vision (7)
-    A[3, :3] = V, l_pre, V  # tie-vision (6)
-    B = np.zeros((4, 3))
-    B[:2, :2] = steer
-    B[2, 2], B[3, 2] = -V, -V * l_pre
+    A, B = _lateral(vehicle, speed, 4, 3)
+    B[2, 2], B[3, 2] = -float(speed), -float(speed) * vehicle.preview
     C = np.array([[0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
     states = ("beta", "gamma", "psi", "y_l")
     return LinearModel(A, B, C, states, ("delta_f", "N_z", "kappa"), ("gamma", "psi", "y_l"))
@@ -117,13 +154,15 @@ def vision(vehicle: Vehicle, speed: float) -> LinearModel:
 
 def course(vehicle: Vehicle, speed: float) -> LinearModel:
     """beta, gamma, psi with the course angle psi + beta as output: dakf-stability (1)-(3)."""
-    lateral, steer = _lateral(vehicle, speed)
-    A = np.zeros((3, 3))
-    A[:2, :2] = lateral
-    A[2, 1] = 1.0
-    B = np.vstack([steer, np.zeros(2)])
+    A, B = _lateral(vehicle, speed, 3)
     C = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 1.0]])
     return LinearModel(A, B, C, ("beta", "gamma", "psi"), ("delta_f", "N_z"), ("gamma", "course"))
+
+
+def _roll_shares(vehicle: Vehicle) -> tuple[float, float, float]:
+    """Roll stiffness, damping and M_s h_s over the roll inertia."""
+    I_x = vehicle.roll_inertia
+    return vehicle.roll_stiffness / I_x, vehicle.roll_damping / I_x, vehicle.roll_moment_arm / I_x
 
 
 def roll(vehicle: Vehicle) -> LinearModel:
@@ -131,39 +170,30 @@ def roll(vehicle: Vehicle) -> LinearModel:
 
     The body's weight, M_s g h_s phi, is within a_y.
     """
-    I_x = vehicle.roll_inertia
-    A = np.array([[0.0, 1.0], [-vehicle.roll_stiffness / I_x, -vehicle.roll_damping / I_x]])
-    B = np.array([[0.0], [vehicle.roll_moment_arm / I_x]])
+    A, B = np.zeros((2, 2)), np.zeros((2, 1))
+    _write_roll(A, B, 0, 0, *_roll_shares(vehicle))
     return LinearModel(A, B, np.array([[0.0, 1.0]]), ("phi", "phi_dot"), ("a_y",), ("phi_dot",))
 
 
 def kinematic(gamma: float) -> LinearModel:
     """v_x and v_y from both specific forces at a yaw rate in rad/s: double-layer-gps (4)-(5).
 
-    Without roll or bank. Output: v_x, as the wheels tell it; at zero yaw rate v_y is unobservable.
+    Without roll or bank. Output: v_x, as of the wheels; at zero yaw rate v_y is unobservable.
     """
-    A = np.array([[0.0, gamma], [-gamma, 0.0]])
-    return LinearModel(
-        A, np.eye(2), np.array([[1.0, 0.0]]), ("v_x", "v_y"), ("a_x", "a_y"), ("v_x",)
-    )
+    A, B = np.zeros((2, 2)), np.zeros((2, 2))
+    _write_kinematic(A, B, gamma)
+    return LinearModel(A, B, np.array([[1.0, 0.0]]), ("v_x", "v_y"), ("a_x", "a_y"), ("v_x",))
 
 
 def velocity_and_roll(vehicle: Vehicle, gamma: float) -> LinearModel:
     """v_x, v_y, phi and phi_dot from both specific forces: double-layer-gps (42), continuous.
 
-    Outputs: v_x and v_y, which the GPS and the first layer tell, and phi_dot.
+    Outputs: v_x and v_y, which the GPS and the first layer measure, and phi_dot.
     """
-    body, plane = roll(vehicle), kinematic(gamma)
     A, B, C = np.zeros((4, 4)), np.zeros((4, 2)), np.zeros((3, 4))
-    A[:2, :2], A[2:, 2:] = plane.A, body.A
+    _write_kinematic(A, B, gamma)
+    _write_roll(A, B, 2, 1, *_roll_shares(vehicle))
     A[1, 2] = -GRAVITY  # double-layer-gps (5)
-    B[:2], B[2:, 1:] = plane.B, body.B
     C[0, 0] = C[1, 1] = C[2, 3] = 1.0
-    return LinearModel(
-        A,
-        B,
-        C,
-        (*plane.states, *body.states),
-        plane.inputs,
-        ("v_x", "v_y", "phi_dot"),
-    )
+    states, outputs = ("v_x", "v_y", "phi", "phi_dot"), ("v_x", "v_y", "phi_dot")
+    return LinearModel(A, B, C, states, ("a_x", "a_y"), outputs)

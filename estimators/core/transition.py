@@ -5,7 +5,7 @@ from typing import Any
 from ...envs.backend.decorators import apart, jit
 from ...envs.backend.primitives import absolute, maximum
 from ...envs.record import GPS
-from ...envs.vehicle.linear import bicycle_coefficients
+from ...envs.vehicle.linear import write_kinematic, write_lateral, write_roll
 from ...envs.vehicle.vehicle import GRAVITY
 from .memory import CORE, INPUTS
 
@@ -19,20 +19,12 @@ SLOWEST = 1.5  # m/s: below it the model stays that of this speed
 def _lateral(f: Any, V: Any) -> None:
     """tie-vision (8), dakf-stability (5)-(11); a_y = V (beta' + gamma) is an output."""
     A, B = f.A, f.B
-    m, I, l_f, l_r, C_f, C_r = f.car[0], f.car[1], f.car[2], f.car[3], f.car[4], f.car[5]  # noqa: E741
-    a11, a12, a21, a22, b11, b21, b22 = bicycle_coefficients(m, I, l_f, l_r, C_f, C_r, V)
-    A[0, 0], A[0, 1], A[1, 0], A[1, 1] = a11, a12, a21, a22
-    B[0, 0], B[1, 0], B[1, 1] = b11, b21, b22
-    states = f.dense - f.delayed
-    if states > 2:
-        A[2, 1] = 1.0  # psi' = gamma, tie-vision (7)
-    if states > 3:
-        A[3, 0], A[3, 1], A[3, 2] = V, f.preview, V  # tie-vision (6)
+    write_lateral(A, B, f.car, V, f.dense - f.delayed, f.preview)
     if f.forces == 1:
-        B[0, INPUTS], B[1, INPUTS + 1] = 1.0 / (m * V), b22
+        B[0, INPUTS], B[1, INPUTS + 1] = 1.0 / (f.car[0] * V), B[1, 1]
     if f.fasts > 1:
-        f.y_row[1, 0], f.y_row[1, 1] = V * a11, V * (a12 + 1.0)
-        f.y_feed[1, 0] = V * b11
+        f.y_row[1, 0], f.y_row[1, 1] = V * A[0, 0], V * (A[0, 1] + 1.0)
+        f.y_feed[1, 0] = V * B[0, 0]
 
 
 @jit
@@ -51,14 +43,11 @@ def continuous(f: Any, V: Any, turning: Any) -> None:
         _lateral(f, V)
     elif f.kind == ROLL or f.kind == VELOCITY_ROLL:
         i = 0 if f.kind == ROLL else 2
-        A[i, i + 1] = 1.0
-        A[i + 1, i], A[i + 1, i + 1] = -f.roll[0], -f.roll[1]  # double-layer-gps (3)
-        B[i + 1, f.inputs - 1] = f.roll[2]
+        write_roll(A, B, i, f.inputs - 1, f.roll[0], f.roll[1], f.roll[2])
     if f.kind == KINEMATIC or f.kind == VELOCITY_ROLL:
-        A[0, 1], A[1, 0] = turning, -turning  # double-layer-gps (4)-(5)
-        B[0, 0], B[1, 1] = 1.0, 1.0
+        write_kinematic(A, B, turning)
         if f.kind == VELOCITY_ROLL:
-            A[1, 2] = -GRAVITY
+            A[1, 2] = -GRAVITY  # double-layer-gps (5)
     if f.kind == YAW or f.kind == FORCES:
         B[0, 0] = 1.0 / f.car[1]
         B[0, INPUTS] = 1.0 / f.car[1]
