@@ -19,6 +19,7 @@ from sideslip.agents.design.sampled_model import (
 )
 from sideslip.envs import COMS, PASSENGER_CAR
 from sideslip.envs.task.reference import MODEL, ZERO_SLIP, reference, target_of
+from sideslip.envs.vehicle.linear import bicycle
 from sideslip.estimators import EstimateObservation
 
 SMALL = {
@@ -127,21 +128,75 @@ def test_it_follows_the_references_where_they_can_be_had(steered: Any) -> None:
 
 
 def test_the_law_is_minus_k_x(steered: Any) -> None:
-    names = [entry.name for entry in steered.get_wrapper_attr("layout")]
     agent = agent_of(steered)
-    obs = np.zeros(len(names), np.float32)
     told = {
         "wheel_left": 6.9, "wheel_right": 7.1, "torque_left": -1.0, "torque_right": 2.0,
         "steer": 0.001, "steer_command": 0.002, "beta_ref": 1e-4, "gamma_ref": 2e-3,
         "beta_hat": 2e-4, "gamma_hat": 1e-3,
     }  # fmt: skip
-    for name, value in told.items():
-        obs[names.index(name)] = value
     share = 3.0 / (2.0 * COMS.motor_torque)
     x = [2e-4, 1e-3, share, 0.001, 0.002, 1e-4, 2e-3]
     wanted = -agent.gains(7.0) @ x / [1.0, COMS.steering_authority]
-    action, _ = agent.predict(obs)
+    action, _ = agent.predict(observed(steered, told))
     assert action == pytest.approx(wanted, rel=1e-4) and np.abs(wanted).max() < 1.0
+
+
+def disturbed(kind: str) -> Any:
+    """An env whose observation has both disturbances: F_d, N_d or the rates d_1, d_2."""
+    if kind == "forces":
+        return estimating(gym.make("sideslip/YawVision-v0", reference="model"), "F_d", "N_d")
+    outputs = ["beta", "gamma", "d1", "d2"]
+    return EstimateObservation(gym.make("sideslip/YawGps-v0"), "dakf", outputs=outputs)
+
+
+def observed(env: Any, told: dict[str, float]) -> np.ndarray:
+    """An observation that is zero but for these entries."""
+    names = [entry.name for entry in env.get_wrapper_attr("layout")]
+    obs = np.zeros(len(names), np.float32)
+    for name, value in told.items():
+        obs[names.index(name)] = value
+    return obs
+
+
+@pytest.mark.parametrize(
+    ("kind", "levels"),
+    [("forces", {"F_d_hat": 30.0, "N_d_hat": -8.0}), ("rates", {"d1_hat": 0.02, "d2_hat": -0.1})],
+)
+def test_disturbances_are_fed_forward_by_their_gains(kind: str, levels: dict[str, float]) -> None:
+    """Of a car that is at rest beside them; each on its own, and both."""
+    env = disturbed(kind)
+    agent = agent_of(env)
+    wheels = {"wheel_left": 7.0, "wheel_right": 7.0}
+    answers = []
+    for share in ((1.0, 0.0), (0.0, 1.0), (1.0, 1.0)):
+        d = np.array(list(levels.values())) * share
+        action, _ = agent.predict(observed(env, wheels | dict(zip(levels, d, strict=True))))
+        answers.append(float(action[0]))
+        assert action == pytest.approx(-agent.gains(7.0)[:, len(DYNAMIC) + 3 :] @ d, rel=1e-5)
+    assert np.abs(answers).min() > 0.01
+
+
+def test_a_held_disturbance_is_met_by_the_best_held_yaw_moment() -> None:
+    """Where everything rests, 0 = A x + B u + d, the action is the u that costs least there."""
+    env = disturbed("rates")
+    agent, v = agent_of(env), SPEEDS[10]
+    model = bicycle(COMS, v)
+    B = model.B[:, 1] * COMS.yaw_moment_limit
+    d, refs = np.array([0.03, -0.1]), np.array([0.002, 0.01])
+    scale = np.array([0.02, 0.1])  # of slip and yaw rate in the cost; effort counts 0.01
+    per_u, free = -np.linalg.solve(model.A, B) / scale, -np.linalg.solve(model.A, d)
+    u = -per_u @ ((free - refs) / scale) / (per_u @ per_u + 0.01)
+    beta, gamma = free + per_u * scale * u
+    torque = u * COMS.motor_torque
+    action, _ = agent.predict(
+        observed(env, {
+            "wheel_left": v, "wheel_right": v, "torque_left": -torque, "torque_right": torque,
+            "beta_hat": beta, "gamma_hat": gamma, "beta_ref": refs[0], "gamma_ref": refs[1],
+            "d1_hat": d[0], "d2_hat": d[1],
+        })
+    )  # fmt: skip
+    assert 0.05 < abs(u) < 1.0
+    assert action[0] == pytest.approx(u, rel=1e-3)
 
 
 def test_disturbances_and_gyro_are_read_where_they_are() -> None:

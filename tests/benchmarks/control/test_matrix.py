@@ -22,6 +22,7 @@ from sideslip.benchmarks.control.episodes import NUMBERS, Chunk
 from sideslip.benchmarks.control.figures import _SHOWN, run_of
 from sideslip.benchmarks.control.run import measure
 from sideslip.benchmarks.control.scores import Ceiling, Resampled
+from sideslip.benchmarks.control.seeds import salt_of, salted_seeds
 from sideslip.benchmarks.control.tables import _metrics, rows_of, standings
 from sideslip.envs import FAILURES, SCENARIOS
 from sideslip.estimators import EstimateObservation
@@ -247,7 +248,16 @@ def test_a_small_matrix_from_end_to_end(monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setattr("sideslip.benchmarks.control.delay_price.DELAYS", (0.0, 0.3))
     monkeypatch.setattr("sideslip.benchmarks.control.suite.DELAYS", (0.0, 0.3))
     monkeypatch.setattr("sideslip.benchmarks.control.figures.DELAYS", (0.0, 0.3))
+    salts: list[str] = []
+
+    def seeds_of(salt: str, n: int) -> list[int]:
+        salts.append(salt)
+        return salted_seeds(salt, n)
+
+    monkeypatch.setattr(results, "salted_seeds", seeds_of)
     suite = control.run(4, jobs=1)
+    assert len(salts) == 3  # the matrix and two delays
+    assert {*salts, *(row.salt for row in suite.rows)} == {salt_of()}
     assert {row.env_version.split()[0] for row in suite.rows} == {YAW, STEERING}
     assert {row.metric for row in suite.rows} >= {"score", "iqm", "cost_over_informed", "spin_rate"}
     assert [row for row in suite.rows if not np.isfinite(row.value)] == []

@@ -4,8 +4,15 @@ import numpy as np
 import pytest
 from scipy.stats import mannwhitneyu, trim_mean
 
-from sideslip.benchmarks.control.scores import Ceiling, Resampled, improvement, normalised
+from sideslip.benchmarks.control.scores import (
+    Ceiling,
+    Estimate,
+    Resampled,
+    improvement,
+    normalised,
+)
 from sideslip.benchmarks.control.seeds import salt_of, salted_seeds
+from sideslip.benchmarks.control.tables import _geometric
 
 TOP = Ceiling(1.0, 0.0)
 
@@ -52,6 +59,68 @@ def test_intervals_cover_what_they_should() -> None:
         found = Resampled(100, 1).score(none, mine, TOP, 0)
         hit += found.low <= true <= found.high
     assert 178 <= hit <= 199  # binomial(200, 0.95), 99.9 %
+
+
+def skewed(manoeuvres: int, seeds: int, which: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """(none, costs), (manoeuvres, seeds) each: means, medians and middles lie far apart."""
+    rng = np.random.default_rng(which)
+    level = np.arange(1.0, manoeuvres + 1.0)[:, None]
+    none = level * (5.0 + rng.gamma(2.0, 1.0, (manoeuvres, seeds)))
+    return none, 0.2 * none + level * rng.gamma(0.3, 6.0, (manoeuvres, seeds))
+
+
+def estimates(draw: Resampled, none: np.ndarray, mine: np.ndarray) -> dict[str, Estimate]:
+    """Everything that `Resampled` gives of the same episodes."""
+    tops = [Ceiling(0.5 * (i + 1.0), 0.0) for i in range(len(none))]
+    return {
+        "score of one": draw.score(none[0], mine[0], tops[0], 0),
+        "over": draw.over(mine[1], none[1], 1),
+        "mean": draw.mean(mine[1], 1),
+    } | draw.aggregate(none, mine, tops)
+
+
+def test_on_the_sample_itself_every_interval_is_its_estimate() -> None:
+    """Resamples that are the sample: whatever the interval is computed from is then the value."""
+    draw = Resampled(50, 3)
+    draw.draws = np.broadcast_to(np.arange(50), draw.draws.shape)
+    found = estimates(draw, *skewed(3, 50))
+    assert len({round(each.value, 3) for each in found.values()}) == len(found)  # far apart
+    for name, each in found.items():
+        assert (each.low, each.high) == pytest.approx((each.value, each.value), rel=1e-12), name
+
+
+def test_every_interval_covers_its_own_number() -> None:
+    """95 % intervals of 60 samples hold what a very large sample of the same law gives."""
+    true = {name: each.value for name, each in estimates_of_many().items()}
+    hits = dict.fromkeys(true, 0)
+    for k in range(60):
+        for name, each in estimates(Resampled(60, 3), *skewed(3, 60, 1 + k)).items():
+            hits[name] += each.low <= true[name] <= each.high
+    for name, hit in hits.items():  # the percentile bootstrap of 60 skewed numbers: some 92 %
+        assert 48 <= hit <= 60, name
+
+
+def estimates_of_many() -> dict[str, Estimate]:
+    """The estimates of 50,000 seeds, without intervals."""
+    draw = Resampled(1, 3)
+    draw.draws = np.zeros((1, 3, 1), int)
+    draw.normal = np.zeros((1, 3))
+    return estimates(draw, *skewed(3, 50_000))
+
+
+def test_the_geometric_means_interval_is_around_it_and_covers_it() -> None:
+    """Three manoeuvres whose ratios are 2, 1 and 0.5 times the same: their geometric mean."""
+    rng, hit = np.random.default_rng(0), 0
+    for _ in range(300):
+        logs = rng.normal(np.log([2.0, 1.0, 0.5]), [0.1, 0.2, 0.3])
+        ends = 1.96 * np.array([0.1, 0.2, 0.3])
+        found = _geometric(
+            [Estimate(*np.exp([m, m - e, m + e])) for m, e in zip(logs, ends, strict=True)]
+        )
+        assert found.value == pytest.approx(np.prod(np.exp(logs)) ** (1.0 / 3.0))
+        assert found.low * found.high == pytest.approx(found.value**2)
+        hit += found.low <= 1.0 <= found.high
+    assert 273 <= hit <= 297  # binomial(300, 0.95), 99.9 %
 
 
 def test_the_ceilings_error_widens_the_interval() -> None:

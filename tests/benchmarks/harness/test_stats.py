@@ -17,6 +17,27 @@ def test_interval_covers_the_mean_nineteen_times_in_twenty() -> None:
     assert 0.87 <= hits / 300 <= 1.0
 
 
+def test_the_interval_is_of_the_same_statistic_as_the_estimate() -> None:
+    """Percentiles pass through rising functions: the root's interval is the interval's root."""
+    values = np.random.default_rng(4).gamma(0.5, 2.0, 40)  # the median is a third of the mean
+
+    def far_away(x: np.ndarray, axis: int = -1) -> np.ndarray:
+        return 7.0 + 1.5 * mean(x, axis)
+
+    plain = np.array(interval(values, mean))
+    assert plain[1] < plain[0] < plain[2]
+    assert np.array(interval(values, far_away)) == pytest.approx(7.0 + 1.5 * plain, rel=1e-12)
+    # between two resamples the percentile is interpolated, which a root is not
+    assert np.array(interval(values, root_mean)) == pytest.approx(np.sqrt(plain), rel=1e-6)
+    least, low, high = interval(values, np.min)  # no resample has a smaller one
+    assert least == low == values.min() <= high
+    # the ratio's interval is that of its inverse, turned round
+    other = np.random.default_rng(5).gamma(0.5, 2.0, 40)
+    ratio = np.array(interval(values, ratio_of_roots, other))
+    inverse = np.array(interval(other, ratio_of_roots, values))
+    assert ratio == pytest.approx(1.0 / inverse[[0, 2, 1]], rel=1e-5)
+
+
 def test_pairing_removes_what_the_seeds_share() -> None:
     rng = np.random.default_rng(2)
     shared = rng.uniform(1.0, 100.0, 50)

@@ -1,0 +1,102 @@
+"""The salt: it follows whoever could have tuned on the test seeds, and its seeds are driven."""
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import sideslip
+from sideslip.agents.learned.files import ENDING
+from sideslip.agents.rollout import rollout
+from sideslip.benchmarks.control import delay_price, run, seeds
+from sideslip.benchmarks.control.cells import YAW, Cell
+from sideslip.benchmarks.control.episodes import NUMBERS, Driven
+from sideslip.benchmarks.control.run import measure
+from sideslip.benchmarks.control.seeds import salt_of, salted_seeds
+
+ONE, OTHER = "0123456789abcdef", "fedcba9876543210"
+SHORT = {"base": "gust", "duration": 0.5}
+NONE, SLOW = (Cell(YAW, "gust", "", who, {"scenario": SHORT}) for who in ("none", "mpc"))
+
+
+@pytest.mark.parametrize("salt", [ONE, OTHER])
+def test_the_episodes_are_those_of_the_salt(salt: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In order and across chunks: each costs what the env alone does on that seed."""
+    monkeypatch.setattr(run, "CHUNK", 3)
+    costs = measure([NONE], 5, salt=salt, jobs=1).of(YAW, "gust", "none").costs
+    env = gym.make(YAW, scenario=SHORT)
+    alone = [rollout(env, None, seed).cost for seed in salted_seeds(salt, 5)]
+    assert costs == pytest.approx(alone, rel=1e-12)
+    assert len(set(costs)) == 5
+
+
+def test_another_salt_is_other_episodes() -> None:
+    one, other = (
+        measure([NONE], 3, salt=salt, jobs=1).of(YAW, "gust", "none") for salt in (ONE, OTHER)
+    )
+    assert not set(one.costs) & set(other.costs)
+
+
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """The cases that are to be driven from now on; none is, and all numbers are 1."""
+    cases: list[Any] = []
+
+    def stand_in(function: Any, chunks: Any, *_: Any) -> list[Driven]:
+        cases.extend((function, chunk) for chunk in chunks)
+        return [Driven(np.ones((len(chunk.seeds), len(NUMBERS))), 0.0) for chunk in chunks]
+
+    monkeypatch.setattr(run, "run_cases", stand_in)
+    return cases
+
+
+def test_everybody_drives_the_same_seeds(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Slow controllers the first ones; and results are looked for under this salt alone."""
+    cases = asked(monkeypatch)
+    measure([NONE, SLOW], 300, salt=ONE, keep=tmp_path)
+    driven: dict[Cell, list[int]] = {}
+    for kept, chunk in cases:
+        driven.setdefault(chunk.cell, []).extend(chunk.seeds)
+        assert (kept.salt, kept.folder) == (ONE, tmp_path)
+    assert driven == {NONE: salted_seeds(ONE, 300), SLOW: salted_seeds(ONE, 64)}
+
+
+def test_the_price_of_delay_is_taken_on_the_salts_seeds(monkeypatch: pytest.MonkeyPatch) -> None:
+    cases = asked(monkeypatch)
+    delay_price.price_of_delay(None, 4, salt=OTHER)
+    assert len(cases) == len(delay_price.DELAYS) * len(delay_price.CONTESTANTS)
+    assert {chunk.seeds for _, chunk in cases} == {tuple(salted_seeds(OTHER, 4))}
+
+
+def test_the_salt_follows_every_file_of_the_contestants(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    contestants = (
+        "estimators/core/a.py",
+        "estimators/b.toml",
+        "agents/c/d.py",
+        f"agents/e{ENDING}",
+    )
+    others = ("envs/f.py", "benchmarks/g.py", "agents/notes.md")
+    for name in contestants + others:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text("one")
+    monkeypatch.setattr(seeds, "_PACKAGE", tmp_path)
+    salts = [salt_of()]
+    for name in contestants:
+        (tmp_path / name).write_text("two")
+        salts.append(salt_of())
+    assert len(set(salts)) == 1 + len(contestants)
+    for name in others:
+        (tmp_path / name).write_text("two")
+    assert salt_of() == salts[-1]
+    (tmp_path / contestants[0]).rename(tmp_path / "estimators/core/renamed.py")
+    assert salt_of() not in salts
+
+
+def test_the_contestants_are_this_packages() -> None:
+    """Where `seeds.py` lies must not decide it."""
+    assert Path(sideslip.__file__ or "").resolve().parent == seeds._PACKAGE
+    for folder in seeds._CONTESTANTS:
+        assert (seeds._PACKAGE / folder / "__init__.py").is_file()
