@@ -1,9 +1,9 @@
-"""One episode as a table of every signal with its unit; the cost of many episodes at once."""
+"""The episode loop, and an episode as a table of every signal with its unit."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -12,26 +12,59 @@ from gymnasium.vector import VectorEnv
 
 from ..envs.record import Log, Record, concatenate
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+class Step(NamedTuple):
+    """The outcome of an env-step, as the env returns it; of a vector env a row a car.
+
+    The first one is the reset: its action and reward are zero. running: (N,) the rows whose first
+    episode this is; a vector env starts the others anew meanwhile.
+    """
+
+    obs: Any
+    info: dict[str, Any]
+    action: Any
+    reward: Any
+    terminated: Any
+    truncated: Any
+    running: npt.NDArray[np.bool_]
+
+
+def steps_of(
+    env: gym.Env[Any, Any] | VectorEnv[Any, Any, Any],
+    agent: Any = None,
+    seeds: Any = None,
+    options: dict[str, Any] | None = None,
+) -> Iterator[Step]:
+    """The steps of an episode, or of each row's first one, until the last row's is over.
+
+    agent: anything with stable-baselines3's `predict`; None leaves the cars alone. seeds, options:
+    of the env's reset.
+    """
+    obs, info = env.reset(seed=seeds, options=options)
+    running = np.ones(getattr(env, "num_envs", 1), np.bool_)
+    action, state, start = np.zeros(env.action_space.shape or (1,), np.float32), None, running
+    yield Step(obs, info, action, 0.0, False, False, running)
+    while running.any():
+        if agent is not None:
+            action, state = agent.predict(obs, state, start, deterministic=True)
+        obs, reward, terminated, truncated, info = env.step(action)
+        yield Step(obs, info, action, reward, terminated, truncated, running)
+        start = np.atleast_1d(np.logical_or(terminated, truncated))
+        running = running & ~start
+
 
 def costs_of(
     env: VectorEnv[Any, Any, Any], agent: Any, seeds: Sequence[int]
 ) -> npt.NDArray[np.float64]:
-    """The cost J of each seed's first episode, (N,); agent: with stable-baselines3's `predict`."""
-    told: Any = list(seeds)
-    obs, _ = env.reset(seed=told)
-    costs, alive = np.zeros(env.num_envs), np.ones(env.num_envs, np.bool_)
-    state, start = None, np.ones(env.num_envs, np.bool_)
-    while alive.any():
-        actions, state = agent.predict(obs, state, start, deterministic=True)
-        obs, rewards, terminated, truncated, _ = env.step(actions)
-        costs -= np.where(alive, rewards, 0.0)
-        start = np.logical_or(terminated, truncated)
-        alive &= ~start
+    """The cost J of each seed's first episode, (N,); agent: of `steps_of`."""
+    costs = np.zeros(env.num_envs)
+    for step in steps_of(env, agent, list(seeds)):
+        costs -= np.where(step.running, step.reward, 0.0)
     return costs
 
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 INFO_UNITS = {
     "t": "s",
@@ -52,7 +85,7 @@ INFO_UNITS = {
     "Y": "m",
 }
 TRUTH = ("beta", "gamma", "psi", "v_x", "v_y", "phi", "y_l")
-"""What a log knows of the states, named as estimators name them."""
+"""The true states in a log, named as estimators name them."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -141,30 +174,21 @@ def rollout(
 ) -> Rollout:
     """Run one episode.
 
-    env: an environment or its id. agent: anything with stable-baselines3's `predict`; None leaves
-    the car alone. options: of the env's reset.
+    env: an environment or its id. agent, options: of `steps_of`.
     """
     if isinstance(env, str):
         env = gym.make(env)
     base: Any = env.unwrapped
     layout = env.get_wrapper_attr("layout")
-    obs, info = env.reset(seed=seed, options=options)
-    actions = np.zeros(env.action_space.shape or (1,), np.float32)
-    info = info | motion_of(base)
-    rows, records, state = [_row(info, obs, actions, 0.0)], [base.record], None
-    start = np.ones(1, bool)
-    over = False
-    while not over:
-        if agent is not None:
-            actions, state = agent.predict(obs, state, start, deterministic=True)
-        obs, reward, terminated, truncated, info = env.step(actions)
-        start, info = np.zeros(1, bool), info | motion_of(base)
-        rows.append(_row(info, obs, actions, float(reward)))
+    rows, records = [], []
+    for step in steps_of(env, agent, seed, options):
+        info = step.info | motion_of(base)
+        info.pop("is_success", None)
+        numbers = (*info.values(), step.reward, *step.action, *step.obs)
+        rows.append([float(number) for number in numbers])
         records.append(base.record)
-        over = terminated or truncated
-    numbers = [name for name in info if name != "is_success"]
-    names = [*numbers, "reward"]
-    names += ["action"] if actions.size == 1 else [f"action_{i}" for i in range(actions.size)]
+    names, width = [*info, "reward"], len(step.action)
+    names += ["action"] if width == 1 else [f"action_{i}" for i in range(width)]
     names += [f"obs_{entry.name}" for entry in layout]
     table = np.array(rows).T
     units = {name: _unit(name) for name in names}
@@ -175,7 +199,7 @@ def rollout(
 
 
 def motion_of(base: Any) -> dict[str, float]:
-    """What an env's `info` leaves out: v_x, v_y (m/s), phi (rad), y_l and the place X, Y (m)."""
+    """The rest of the motion, not in `info`: v_x, v_y (m/s), phi (rad), y_l and place X, Y (m)."""
     motion = base.motion
     return {
         "v_x": motion.v_x,
@@ -188,16 +212,11 @@ def motion_of(base: Any) -> dict[str, float]:
 
 
 def _unit(name: str) -> str:
-    """The unit of a number of `info`; those that wrappers add end like what they speak of."""
+    """The unit of a number of `info`; those of wrappers end in a state's name."""
     for ending in ("beta_hat", "beta_std"):
         if name.endswith(ending):
             return "rad"
     return INFO_UNITS.get(name, "-")
-
-
-def _row(info: dict[str, Any], obs: Any, action: Any, reward: float) -> list[float]:
-    numbers = [float(value) for name, value in info.items() if name != "is_success"]
-    return [*numbers, reward, *map(float, action), *map(float, obs)]
 
 
 def _log(base: Any, record: Record, columns: dict[str, npt.NDArray[np.float64]]) -> Log:

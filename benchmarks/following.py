@@ -3,6 +3,7 @@ kept on curved roads from camera and gyro, the aim of uneven-delay."""
 
 import warnings
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any
 
 import gymnasium as gym
@@ -13,6 +14,7 @@ from rich.console import Console
 from .. import __version__
 from ..agents import make_agent
 from ..agents.controllers.model_following import feedback_gains
+from ..agents.rollout import steps_of
 from ..envs.scenarios.manoeuvres import scenario_from
 from ..envs.ticks import TICK
 from ..envs.vehicle.dynamics import Motion
@@ -105,20 +107,14 @@ def keep_lane(keeper: int, cars: int) -> Array:
     options = {} if moment is None else {"moment": moment}
     agent = make_agent("none" if moment is None else "lane-keeping", env, **options)
     base = env.unwrapped
-    obs, infos = env.reset(seed=0)
-    state, start = None, np.ones(cars, bool)
-    on, most, squares, steps = np.ones(cars, bool), np.zeros(cars), np.zeros(cars), np.zeros(cars)
-    left = np.zeros(cars)
+    most, squares, steps, left = np.zeros((4, cars))
     y = Motion._fields.index("y")
-    while on.any():
-        actions, state = agent.predict(obs, state, start, deterministic=True)
-        obs, _, terminated, truncated, infos = env.step(actions)
+    for step in islice(steps_of(env, agent, 0), 1, None):
+        on = step.running
         most = np.where(on, np.maximum(most, np.abs(base.motion[:, y])), most)
-        squares += np.where(on, infos["beta"] ** 2, 0.0)
+        squares += np.where(on, step.info["beta"] ** 2, 0.0)
         steps += on
-        left = np.where(on & terminated, 1.0, left)
-        on &= ~(terminated | truncated)
-        start = np.zeros(cars, bool)
+        left = np.where(on & step.terminated, 1.0, left)
     return np.stack([most, np.sqrt(squares / steps), left], axis=1)
 
 

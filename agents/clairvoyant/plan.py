@@ -18,6 +18,7 @@ from ...envs.scenarios.steering import DRIVER
 from ...envs.task.reference import reference
 from ...envs.vehicle.vehicle import GRAVITY
 from ..controllers.base import Controller
+from ..rollout import steps_of
 from .foresight import Foreseen, Known, State, foresee, state_of
 from .qp import is_linear, solve_linear
 from .shooting import Solution, Trajectory, solve, tracking_gains
@@ -210,16 +211,10 @@ def ceiling(
 def actions_of(env: gym.Env[Any, Any], agent: Any, seed: int) -> Actions:
     """(K, width): what an agent does in an episode; zeros after a failure."""
     base: Any = env.unwrapped
-    obs, _ = env.reset(seed=seed)
+    _, *steps = steps_of(env, agent, seed)
     periods = -int(-base.get_state()["params"][P.task.duration] // base.control_period)
     taken = np.zeros((periods, *base.action_space.shape), np.float32)
-    state, first = None, np.ones(1, bool)
-    for k in range(periods):
-        taken[k], state = agent.predict(obs, state, first, deterministic=True)
-        obs, _, terminated, truncated, _ = env.step(taken[k])
-        first = np.zeros(1, bool)
-        if terminated or truncated:
-            break
+    taken[: len(steps)] = [step.action for step in steps]
     return taken
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...agents import make_agent
+from ...agents.rollout import steps_of
 from ...envs.outside.plants import OUTSIDE_PLANTS, Acting, OutsidePlant
 from ...envs.scenarios.draws import Draws
 from ...envs.scenarios.scenario import Scenario
@@ -106,19 +107,12 @@ def of_env(
 
 def _episode(env: gym.Env[Any, Any], agent: Any, seed: int) -> Series:
     base: Any = env.unwrapped
-    obs, info = env.reset(seed=seed)
-    rows, state, start, over = [_row(base, info)], None, np.ones(1, bool), False
-    while not over:
-        action, state = agent.predict(obs, state, start, deterministic=True)
-        obs, _, terminated, truncated, info = env.step(action)
-        rows.append(_row(base, info))
-        start, over = np.zeros(1, bool), terminated or truncated
+    rows = []
+    for step in steps_of(env, agent, seed):
+        info = step.info
+        rows.append([info["t"], info["steer"], *_moving(base.motion), info["yaw_moment"]])
     env.close()
     return _series(rows, bool(info["failure"]))
-
-
-def _row(base: Any, info: Fields) -> list[float]:
-    return [info["t"], info["steer"], *_moving(base.motion), info["yaw_moment"]]
 
 
 def _series(rows: list[list[float]], failed: bool) -> Series:

@@ -10,6 +10,7 @@ import pytest
 
 import sideslip
 from sideslip.agents import make_agent
+from sideslip.agents.rollout import costs_of, steps_of
 
 
 @pytest.mark.smoke
@@ -28,6 +29,32 @@ def test_rollout_is_reproducible_and_takes_an_id() -> None:
     one = sideslip.rollout("sideslip/YawGps-v0", seed=4)
     two = sideslip.rollout("sideslip/YawGps-v0", seed=4)
     assert all((one[name] == two[name]).all() for name in one.columns)
+
+
+def test_steps_of_a_batch_are_each_rows_first_episode() -> None:
+    """Cars leave their lanes one by one; the agent hears where an episode starts."""
+    seen: list[np.ndarray] = []
+
+    class Idle:
+        def predict(self, obs: Any, state: Any, start: Any, **_: Any) -> tuple[Any, None]:
+            seen.append(start)
+            return np.zeros((len(obs), 1), np.float32), None
+
+    options: dict[str, Any] = {"scenario": {"base": "curved-road", "duration": 9.0}}
+    envs = gym.make_vec("sideslip/YawVision-v0", num_envs=3, **options)
+    env = gym.make("sideslip/YawVision-v0", **options)
+    drives = [sideslip.rollout(env, None, seed) for seed in (1, 2, 3)]
+    reset, *steps = steps_of(envs, Idle(), [1, 2, 3])
+    assert not np.any(reset.reward) and not reset.action.any() and reset.running.all()
+    lengths = np.sum([step.running for step in steps], axis=0)
+    assert lengths.tolist() == [len(drive["t"]) - 1 for drive in drives]
+    assert len(set(lengths)) > 1 and len(steps) == max(lengths)
+    costs = costs_of(envs, Idle(), [1, 2, 3])
+    assert costs == pytest.approx([drive.cost for drive in drives], rel=1e-12)
+    starts = np.array(seen[: len(steps)])
+    assert starts[0].all()
+    for row, length in enumerate(lengths):
+        assert not starts[1:length, row].any() and starts[length : length + 1, row].all()
 
 
 def test_parquet_carries_units_and_pictures_are_drawn(tmp_path: Path) -> None:
