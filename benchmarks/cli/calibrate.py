@@ -28,11 +28,12 @@ def calibrate_command(
 
     A stopped run goes on where it was when the same command is given again in the same folder.
     """
-    from ..control.calibration import FILE, calibrate, cases_of, forget, scored_scenarios, update
+    from ..control.calibration import FILE, calibrate, cases_of, forget, update
+    from ..control.cells import MANOEUVRES
 
     path = FILE if out is None else out
     check_writable(path)
-    names = scenario or scored_scenarios()
+    names = scenario or list(MANOEUVRES)
     words = ["sideslip", "calibrate", "--env", env]
     words += [word for name in scenario or [] for word in ("--scenario", name)]
     words += ["--seeds", str(seeds), "--start", start, "--estimator", estimator]

@@ -99,11 +99,6 @@ def _digits(text: str) -> int:
     return int.from_bytes(hashlib.sha256(text.encode()).digest()[:4]) % _FIRST
 
 
-def scored_scenarios() -> list[str]:
-    """The scenarios of a score."""
-    return [name for name, scenario in SCENARIOS.items() if scenario.scored]
-
-
 def measure(case: Case) -> Episode:
     """The ceiling of one episode, from the folder of finished cases where it is there."""
     from ...agents.clairvoyant.plan import actions_of, ceiling

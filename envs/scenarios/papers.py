@@ -25,9 +25,8 @@ _SIMULATED: dict[str, Any] = {  # the plant of the papers' own equations
     "hdop": 1.0,
     "hdop_spread": 0.0,
     "hdop_law": "constant",
-    "scored": False,
 }
-_ON_THE_ROAD: dict[str, Any] = {"half_width": 200.0, "scored": False}  # all that the plant has
+_ON_THE_ROAD: dict[str, Any] = {"half_width": 200.0}  # all that the plant has
 _QUIET: dict[str, Any] = {"disturbance_force": 0.0, "disturbance_moment": 0.0}
 _WIND: dict[str, Any] = {"wind_force": 200.0, "wind_start": 4.0, "wind_length": 4.0}
 

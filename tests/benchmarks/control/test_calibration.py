@@ -17,7 +17,6 @@ from sideslip.benchmarks.control.calibration import (
     cases_of,
     forget,
     read_calibration,
-    scored_scenarios,
     update,
 )
 
@@ -44,7 +43,6 @@ def test_seeds_are_its_own() -> None:
     assert many[:4] == few and len(set(many)) == 64
     assert min(many) > 10**6
     assert not set(many) & set(calibration_seeds(ID, "sine", 64))
-    assert {"gust", "random-steering"} <= set(scored_scenarios())
 
 
 def test_means_and_errors_over_the_seeds(asked: list[int], tmp_path: Path) -> None:

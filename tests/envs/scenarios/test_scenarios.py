@@ -19,7 +19,7 @@ pytestmark = pytest.mark.plain
 
 CAR = car_of(COMS)
 TRACK: dict[str, Any] = {"steering": "driver", "path": "iso-3888-2"}
-SCORED = [name for name, scenario in SCENARIOS.items() if scenario.scored]
+DRAWN = [name for name, scenario in SCENARIOS.items() if scenario.mirror]
 
 
 def draws(name: str, count: int, first: int = 0) -> tuple[list[Draws], list[int]]:
@@ -33,7 +33,7 @@ def draws(name: str, count: int, first: int = 0) -> tuple[list[Draws], list[int]
     return drawn, lost
 
 
-@pytest.mark.parametrize("name", SCORED)
+@pytest.mark.parametrize("name", DRAWN)
 def test_draws_lie_in_their_ranges_and_fill_them(name: str) -> None:
     values = np.array(draws(name, 400)[0])
     low, high = SCENARIOS[name].draws()
@@ -45,8 +45,8 @@ def test_draws_lie_in_their_ranges_and_fill_them(name: str) -> None:
     assert np.all(values[:, ~fixed].max(axis=0) > high[~fixed] - 0.05 * width)
 
 
-@pytest.mark.parametrize("name", SCORED)
-def test_every_scored_scenario_draws_what_a_table_of_actions_would_need(name: str) -> None:
+@pytest.mark.parametrize("name", DRAWN)
+def test_every_drawn_scenario_draws_what_a_table_of_actions_would_need(name: str) -> None:
     low, high = SCENARIOS[name].draws()
     drawn = {Draws._fields[i] for i in np.flatnonzero(low < high)}
     expected = {"speed", "friction", "front_stiffness", "rear_stiffness", "side", "wind_side"}
@@ -67,6 +67,9 @@ def test_every_scored_scenario_draws_what_a_table_of_actions_would_need(name: st
         "stiffness-step": pairs | {"tyre_change_time", "front_change", "rear_change"},
         "sensor-outage": turns | {"frequency"},
         "uneven-delay": pairs,
+        "split-friction": {"friction_right"},
+        "curved-road": {"curvature"},
+        "curved-road-driver": {"curvature"},
     }[name]
     assert drawn == expected
 
@@ -240,7 +243,7 @@ def test_values_that_cannot_be_are_refused_by_name(changes: dict[str, Any], mess
 
 
 def test_unknown_scenario_and_field_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"unknown scenario 'slalon'; known: straight, sine,"):
+    with pytest.raises(ValueError, match=r"unknown scenario 'slalon'; known: random-steering, sine-with-dwell,"):
         scenario_from("slalon")
     with pytest.raises(TypeError, match="unknown scenario field 'speeed'"):
         scenario_from({"base": "sine", "speeed": 1.0})
