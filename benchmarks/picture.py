@@ -5,7 +5,8 @@ from pathlib import Path
 from typing import Any
 
 from .control.cells import REFERENCE_FILTER, YAW
-from .harness.results import METRICS, Row, Suite
+from .harness.metrics import METRICS
+from .harness.results import Row, Suite
 from .report.colours import INK, colour
 
 

@@ -15,7 +15,7 @@ from .. import __version__
 from ..agents.learned.card import JsonMap
 from ..agents.learned.files import Policy, load_policy, save_policy
 from .control.cells import REFERENCE_FILTER, Cell
-from .control.episodes import NUMBERS, Array, Chunk, Driven, drive
+from .control.episodes import Array, Chunk, Driven, drive
 from .control.scores import improvement
 from .control.seeds import salted_seeds
 from .control.tables import spec_of
@@ -43,11 +43,7 @@ class Enjoyed:
 
     def costs(self, name: str) -> Array:
         """(seeds,) of a contestant."""
-        return self.numbers(name, "cost")
-
-    def numbers(self, name: str, what: str) -> Array:
-        """(seeds,) one of NUMBERS."""
-        return self.driven[name].numbers[:, NUMBERS.index(what)]
+        return self.driven[name].costs
 
 
 def enjoy(
@@ -169,9 +165,9 @@ def _table(found: Enjoyed) -> Table:
                 f"{low:.3f} .. {high:.3f}",
                 f"{100.0 * cost / none.mean():.1f} %",
                 "" if name == first else f"{100.0 * improvement(own, costs):.0f} %",
-                f"{1e3 * found.numbers(name, 'rms_slip').mean():.2f}",
-                f"{found.numbers(name, 'largest_step').mean():.0f}",
-                f"{100.0 * np.mean(found.numbers(name, 'failure') != 0.0):.1f} %",
+                f"{1e3 * found.driven[name]['rms_slip'].mean():.2f}",
+                f"{found.driven[name]['largest_step'].mean():.0f}",
+                f"{100.0 * np.mean(found.driven[name]['failure'] != 0.0):.1f} %",
             ]
         )
     note = (
@@ -199,6 +195,6 @@ def _rows(found: Enjoyed) -> list[Row]:
             "spec": spec_of(cell),
         }
         for metric in ("cost", "rms_slip", "peak_slip", "effort", "largest_step"):
-            value, low, high = interval(found.numbers(name, metric))
+            value, low, high = interval(found.driven[name][metric])
             rows.append(Row(metric=metric, value=value, low=low, high=high, **common))
     return rows

@@ -52,8 +52,8 @@ class Kept:
 def sources() -> str:
     """A hash of all files that an episode's numbers depend on."""
     digest = hashlib.sha256(source_stamp("agents").encode())
-    for name in ("build.py", "cells.py", "episodes.py"):
-        digest.update(Path(__file__).with_name(name).read_bytes())
+    for name in ("build.py", "cells.py", "episodes.py", "../harness/metrics.py"):
+        digest.update((Path(__file__).parent / name).read_bytes())
     return digest.hexdigest()
 
 

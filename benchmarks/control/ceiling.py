@@ -4,7 +4,7 @@ import numpy as np
 
 from ...envs.task.failures import FAILURES
 from .calibration import FILE, Entry, read_calibration
-from .run import FAILURE, Results
+from .run import Results
 from .scores import Array, Ceiling
 
 _OF_THE_CAR = ("none", "spin", "off-road")
@@ -43,11 +43,11 @@ def ceilings(results: Results, env_id: str) -> dict[str, Ceiling]:
 
 
 def judged(results: Results, env_id: str, tops: dict[str, Ceiling]) -> list[str]:
-    """The manoeuvres that are scored: worth controlling, and what 1 means is known there."""
+    """The manoeuvres with a score: control matters there, and the ceiling is known well enough."""
     return [
         name
         for name, top in tops.items()
-        if results.scored(env_id, name)
+        if results.worth_controlling(env_id, name)
         and top.error < KNOWN * (results.of(env_id, name, "none").costs.mean() - top.mean)
     ]
 
@@ -91,12 +91,12 @@ def refusals_of(results: Results) -> list[list[str]]:
         if result.error:
             lines.append([*where, f"not driven: {result.error}"])
             continue
-        codes = result.numbers[:, FAILURE].astype(int)
-        told = [
+        codes = result["failure"].astype(int)
+        ended = [
             f"{name} {100.0 * (codes == code).mean():.1f} %"
             for code, name in enumerate(FAILURES)
             if name not in _OF_THE_CAR and (codes == code).any()
         ]
-        if told:
-            lines.append([*where, ", ".join(told)])
+        if ended:
+            lines.append([*where, ", ".join(ended)])
     return lines

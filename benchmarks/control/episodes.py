@@ -1,4 +1,4 @@
-"""Drive a cell: all its seeds at once, reduced to a few numbers an episode."""
+"""The episodes of a cell: all seeds at once, reduced to a few numbers an episode."""
 
 import time
 from dataclasses import dataclass
@@ -7,40 +7,23 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ...agents.rollout import Step, steps_of
 from ...envs.arguments import actions_of
 from ...envs.task.failures import FAILURES
 from ...envs.ticks import TICK
+from ..harness.metrics import EPISODE, FOLDS, Moment
 from .build import make_contest
 from .cells import Cell
 
 Array = npt.NDArray[np.float64]
 
-NUMBERS = (
-    "cost",
-    "rms_slip",
-    "peak_slip",
-    "rms_slip_error",
-    "rms_yaw_error",
-    "effort",
-    "largest_step",
-    "steer_effort",
-    "largest_steer_step",
-    "saturation",
-    "failure",
-)
-"""What is kept of an episode, in this order; `failure` is a code of `FAILURES`.
-
-effort: mean square share of the yaw moment that was delivered. steer_effort: of the added steering
-that was asked for. largest_step (N m), largest_steer_step (rad): between two decisions. saturation:
-share of the decisions that ask for all of an input.
-"""
+NUMBERS = tuple(metric.name for metric in EPISODE)
 SIGNALS = ("beta", "gamma", "beta_ref", "gamma_ref", "yaw_moment", "steer")
-FULL = 0.999  # of the yaw moment: saturated
 
 
 @dataclass(frozen=True)
 class Chunk:
-    """A case: some seeds of a cell. keep: whether to keep the first seed's time series."""
+    """A case: some seeds of a cell. keep: whether the first seed's time series is wanted."""
 
     cell: Cell
     seeds: tuple[int, ...]
@@ -49,76 +32,62 @@ class Chunk:
 
 @dataclass
 class Driven:
-    """numbers: (seeds, NUMBERS). seconds: of CPU time. series: (k, 1 + SIGNALS) with the time
-    first, of the first seed. error: why the cell could not be driven; its numbers are NaN."""
+    """Episodes of a cell in the order of their seeds.
+
+    numbers: (seeds, NUMBERS). seconds: of CPU time. series: (k, 1 + SIGNALS) with the time first,
+    of the first seed. error: why the cell could not be driven; its numbers are NaN.
+    """
 
     numbers: Array
     seconds: float
     series: Array | None = None
     error: str = ""
 
+    def __getitem__(self, name: str) -> Array:
+        """(seeds,) one of NUMBERS."""
+        return self.numbers[:, NUMBERS.index(name)]
 
-class _Sums:
-    """What accumulates while the episodes run; full: of each input, N m and rad."""
+    @property
+    def costs(self) -> Array:
+        """(seeds,)."""
+        return self["cost"]
 
-    def __init__(self, cars: int, full: Array) -> None:
-        self.full = full
-        self.alive = np.ones(cars, bool)
-        self.steps = np.zeros(cars)
-        self.sums = np.zeros((7, cars))
-        self.peak, self.failure = np.zeros(cars), np.zeros(cars)
-        self.before, self.largest = np.zeros((cars, 2)), np.zeros((cars, 2))
+    def failed(self, by: str) -> Array:
+        """(seeds,) 1 where an episode ended by this failure, NaN where none was driven."""
+        return np.where(np.isnan(self["failure"]), np.nan, self["failure"] == FAILURES.index(by))
 
-    def add(self, actions: Any, rewards: Any, ended: Any, infos: dict[str, Any]) -> None:
-        on = self.alive
-        asked = np.zeros((len(on), 2))
-        shares = actions_of(actions, len(on), len(self.full), fail=True)
-        asked[:, : len(self.full)] = np.clip(np.nan_to_num(shares), -1.0, 1.0)
-        beta, gamma = infos["beta"], infos["gamma"]
-        e_beta, e_gamma = beta - infos["beta_ref"], gamma - infos["gamma_ref"]
-        terms = (
-            -rewards,
-            beta * beta,
-            e_beta * e_beta,
-            e_gamma * e_gamma,
-            (infos["yaw_moment"] / self.full[0]) ** 2,
-            asked[:, 1] ** 2,
-            (np.abs(asked) >= FULL).any(axis=1),
-        )
-        self.sums += np.where(on, terms, 0.0)
-        self.peak = np.where(on, np.maximum(self.peak, np.abs(beta)), self.peak)
-        step = np.maximum(self.largest, np.abs(asked - self.before))
-        self.largest = np.where(on[:, None], step, self.largest)
-        self.failure = np.where(on & ended, infos["failure"], self.failure)
-        self.steps += on
-        self.before = asked
-        self.alive = on & ~ended
+
+class _Tally:
+    """The metrics of all cars while their episodes run; reset: the first of their steps."""
+
+    def __init__(self, base: Any, reset: Step) -> None:
+        car, self.width = base.vehicle[0], base.single_action_space.shape[0]
+        self.full = np.array([car.yaw_moment_limit, car.steering_authority])
+        self.full[self.width :] = 0.0
+        self.dt = base.control_period * TICK
+        self.last, self.before = reset.info, np.zeros((base.num_envs, 2))
+        self.steps, self.totals = np.zeros(base.num_envs), np.zeros((len(EPISODE), base.num_envs))
+
+    def add(self, step: Step) -> None:
+        asked = np.zeros_like(self.before)
+        shares = actions_of(step.action, len(asked), self.width, fail=True)
+        asked[:, : self.width] = np.clip(np.nan_to_num(shares), -1.0, 1.0)
+        moment = Moment(asked, self.before, step.reward, step.info, self.last, self.full, self.dt)
+        for metric, total in zip(EPISODE, self.totals, strict=True):
+            added = FOLDS[metric.fold].add(total, metric.of(moment))
+            np.copyto(total, added, where=step.running)
+        self.steps += step.running
+        self.last, self.before = step.info, asked
 
     def numbers(self) -> Array:
         """(cars, NUMBERS)."""
-        cost, *squares, effort, steer_effort, saturation = self.sums
-        slip, slip_error, yaw_error = (np.sqrt(s / self.steps) for s in squares)
-        largest = self.largest[:, : len(self.full)] * self.full
-        return np.stack(
-            [
-                cost,
-                slip,
-                self.peak,
-                slip_error,
-                yaw_error,
-                effort / self.steps,
-                largest[:, 0],
-                steer_effort / self.steps,
-                largest[:, 1] if len(self.full) > 1 else np.zeros(len(cost)),
-                saturation / self.steps,
-                self.failure,
-            ],
-            axis=1,
-        )
+        folds = [FOLDS[metric.fold] for metric in EPISODE]
+        done = [f.finish(t, self.steps) for f, t in zip(folds, self.totals, strict=True)]
+        return np.stack(done, axis=1)
 
 
 def drive(chunk: Chunk) -> Driven:
-    """Drive one episode a seed; a cell that cannot be built or driven says why in `error`."""
+    """Drive one episode a seed; the reason why a cell cannot be built or driven is its `error`."""
     try:
         return _drive(chunk)
     except Exception as error:
@@ -129,41 +98,20 @@ def drive(chunk: Chunk) -> Driven:
 def _drive(chunk: Chunk) -> Driven:
     begun = time.process_time()
     env, agent = make_contest(chunk.cell, len(chunk.seeds))
-    base: Any = env.unwrapped
-    car, width = base.vehicle[0], base.single_action_space.shape[0]
-    full = np.array([car.yaw_moment_limit, car.steering_authority])[:width]
-    sums = _Sums(len(chunk.seeds), full)
-    seeds: Any = list(chunk.seeds)
-    obs, infos = env.reset(seed=seeds)
-    state, start = None, np.ones(len(chunk.seeds), bool)
-    series = [_signals(infos)]
-    while sums.alive.any():
-        actions, state = agent.predict(obs, state, start, deterministic=True)
-        obs, rewards, terminated, truncated, infos = env.step(actions)
-        ended = terminated | truncated
-        if chunk.keep and sums.alive[0]:
-            series.append(_signals(infos))
-        sums.add(actions, rewards, ended, infos)
-        start = np.zeros(len(start), bool)
+    steps = steps_of(env, agent, list(chunk.seeds))
+    reset = next(steps)
+    tally, series = _Tally(env.unwrapped, reset), [_signals(reset.info)]
+    for step in steps:
+        if chunk.keep and step.running[0]:
+            series.append(_signals(step.info))
+        tally.add(step)
     env.close()
-    return Driven(
-        sums.numbers(), time.process_time() - begun, np.array(series) if chunk.keep else None
-    )
+    spent = time.process_time() - begun
+    return Driven(tally.numbers(), spent, np.array(series) if chunk.keep else None)
 
 
 def _signals(infos: dict[str, Any]) -> list[float]:
     return [float(infos[name][0]) for name in ("t", *SIGNALS)]
-
-
-def rate_of(numbers: Array, failure: str) -> float:
-    """The share of episodes that ended by a failure of this name; NaN where none was driven."""
-    return float(failed_by(numbers, failure).mean())
-
-
-def failed_by(numbers: Array, failure: str) -> Array:
-    """(episodes,) 1 where an episode ended by a failure of this name, NaN where none was driven."""
-    codes = numbers[:, NUMBERS.index("failure")]
-    return np.where(np.isnan(codes), np.nan, codes == FAILURES.index(failure))
 
 
 def control_period(cell: Cell) -> float:

@@ -1,54 +1,34 @@
-"""All cells driven, put together: per cell the episodes, per manoeuvre the yardsticks."""
+"""All cells driven: the episodes of each."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 from rich.console import Console
 
 from ..harness.parallel import run_cases
 from .cache import Kept
 from .cells import EPISODES, INFORMED, SLOW_EPISODES, Cell
-from .episodes import NUMBERS, Chunk, Driven
+from .episodes import Chunk, Driven
 from .seeds import salted_seeds
 
-Array = npt.NDArray[np.float64]
-
 CHUNK = 250
-COST, FAILURE = NUMBERS.index("cost"), NUMBERS.index("failure")
-NOTEWORTHY = 2.0  # a manoeuvre is scored where the uncontrolled car costs this often informed
-
-
-@dataclass
-class Result:
-    """A cell's episodes in the order of the seeds, CPU seconds; error where it was not driven."""
-
-    cell: Cell
-    numbers: Array
-    seconds: float
-    series: Array | None = None
-    error: str = ""
-
-    @property
-    def costs(self) -> Array:
-        """(seeds,)."""
-        return self.numbers[:, COST]
+NOTEWORTHY = 2.0  # times informed's cost: what the uncontrolled car's is where control matters
 
 
 @dataclass
 class Results:
-    """Every cell's result and the salt of the seeds."""
+    """Every cell's episodes and the salt of the seeds."""
 
     salt: str
-    found: dict[Cell, Result] = field(default_factory=dict)
+    found: dict[Cell, Driven] = field(default_factory=dict)
 
-    def of(self, env_id: str, scenario: str, controller: str, estimator: str = "") -> Result:
+    def of(self, env_id: str, scenario: str, controller: str, estimator: str = "") -> Driven:
         """One cell; KeyError if it was not asked for."""
         return self.found[Cell(env_id, scenario, estimator, controller)]
 
-    def scored(self, env_id: str, scenario: str) -> bool:
+    def worth_controlling(self, env_id: str, scenario: str) -> bool:
         """Whether the uncontrolled car costs more than twice what informed does."""
         none, informed = (self.of(env_id, scenario, who).costs for who in ("none", INFORMED))
         return bool(none.mean() > NOTEWORTHY * informed.mean())
@@ -76,16 +56,14 @@ def measure(
     results = Results(salt)
     for cell in cells:
         mine_driven = [d for c, d in zip(chunks, driven, strict=True) if c.cell is cell]
-        results.found[cell] = _joined(cell, mine_driven)
+        results.found[cell] = _joined(mine_driven)
     return results
 
 
-def _joined(cell: Cell, parts: list[Driven]) -> Result:
-    errors = [part.error for part in parts if part.error]
-    return Result(
-        cell,
+def _joined(parts: list[Driven]) -> Driven:
+    return Driven(
         np.concatenate([part.numbers for part in parts]),
         sum(part.seconds for part in parts),
         parts[0].series,
-        errors[0] if errors else "",
+        next((part.error for part in parts if part.error), ""),
     )

@@ -1,17 +1,18 @@
 """The matrix as rows for machines and tables for people."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
 from ... import __version__
+from ..harness.metrics import EPISODE
 from ..harness.results import Row, Table
 from .ceiling import judged
 from .cells import INFORMED, REFERENCE_CONTROLLER, REFERENCE_FILTER, Cell
-from .episodes import NUMBERS, control_period, failed_by, rate_of
-from .run import Result, Results
+from .episodes import NUMBERS, Driven, control_period
+from .run import Results
 from .scores import Ceiling, Estimate, Resampled, improvement
 
 RATES = {"spin": "spin_rate", "off-road": "departure_rate"}
@@ -29,7 +30,7 @@ class Standing:
     """
 
     cell: Cell
-    results: dict[str, Result]
+    results: dict[str, Driven]
     by_scenario: dict[str, dict[str, Estimate]]
     overall: dict[str, Estimate]
     us: float = float("nan")
@@ -41,23 +42,24 @@ class Standing:
 
     def mean(self, name: str) -> float:
         """A number of NUMBERS over all episodes of all manoeuvres."""
-        column = NUMBERS.index(name)
-        return float(np.mean([r.numbers[:, column].mean() for r in self.results.values()]))
+        return float(np.mean([driven[name].mean() for driven in self.results.values()]))
 
     def rate(self, failure: str) -> float:
         """The share of episodes of all manoeuvres that ended so."""
-        return float(np.mean([rate_of(r.numbers, failure) for r in self.results.values()]))
+        return float(np.mean([driven.failed(failure).mean() for driven in self.results.values()]))
 
 
 def standings(results: Results, env_id: str, tops: dict[str, Ceiling]) -> list[Standing]:
     """Every contestant of a table, the best first; tops: the ceilings by manoeuvre."""
     cells = [cell for cell in results.found if cell.env_id == env_id]
-    names = list(dict.fromkeys((cell.controller, cell.estimator) for cell in cells))
+    contestants: dict[tuple[str, str], Cell] = {}
+    for cell in cells:
+        contestants.setdefault((cell.controller, cell.estimator), cell)
     scenarios = list(dict.fromkeys(cell.scenario for cell in cells))
     scored = judged(results, env_id, tops)
     draws: dict[int, Resampled] = {}
     found = []
-    for controller, estimator in names:
+    for (controller, estimator), first in contestants.items():
         mine = {s: results.of(env_id, s, controller, estimator) for s in scenarios}
         n = len(mine[scenarios[0]].costs)
         draw = draws.setdefault(n, Resampled(n, len(scenarios)))
@@ -72,7 +74,7 @@ def standings(results: Results, env_id: str, tops: dict[str, Ceiling]) -> list[S
         ratios = [by[s]["cost_over_informed"] for s in scenarios]
         overall["cost_over_informed"] = _geometric(ratios)
         overall["probability_of_improvement"] = _improvement(results, env_id, mine)
-        found.append(Standing(mine[scenarios[0]].cell, mine, by, overall))
+        found.append(Standing(first, mine, by, overall))
     return sorted(found, key=lambda each: -_rank(each))
 
 
@@ -84,7 +86,7 @@ def _rank(standing: Standing) -> float:
 
 
 def _metrics(
-    draw: Resampled, which: int, mine: Result, none: Any, informed: Any, top: Ceiling | None
+    draw: Resampled, which: int, mine: Driven, none: Any, informed: Any, top: Ceiling | None
 ) -> dict[str, Estimate]:
     found = {
         "cost": draw.mean(mine.costs, which),
@@ -93,9 +95,9 @@ def _metrics(
     if top is not None:
         found["score"] = draw.score(none, mine.costs, top, which)
     for name in _MEANS:
-        found[name] = draw.mean(mine.numbers[:, NUMBERS.index(name)], which)
+        found[name] = draw.mean(mine[name], which)
     for failure, metric in (RATES | _FAILED).items():
-        found[metric] = draw.mean(failed_by(mine.numbers, failure), which)
+        found[metric] = draw.mean(mine.failed(failure), which)
     return found
 
 
@@ -103,7 +105,7 @@ def _overall(draw: Resampled, costs: Any, none: Any, tops: list[Ceiling]) -> dic
     return draw.aggregate(np.array(none), np.array(costs), tops) if tops else {}
 
 
-def _improvement(results: Results, env_id: str, mine: dict[str, Result]) -> Estimate:
+def _improvement(results: Results, env_id: str, mine: dict[str, Driven]) -> Estimate:
     """Over the reference pair, on every manoeuvre alike."""
     pairs = [
         (r.costs, results.of(env_id, s, REFERENCE_CONTROLLER, REFERENCE_FILTER).costs)
@@ -134,8 +136,8 @@ def rows_of(standing: Standing, salt: str) -> list[Row]:
     }
     rows = []
     for scenario, metrics in standing.by_scenario.items():
-        result = standing.results[scenario]
-        rest = common | {"n": len(result.costs), "spec": spec_of(result.cell)}
+        n, spec = len(standing.results[scenario].costs), spec_of(replace(cell, scenario=scenario))
+        rest = common | {"n": n, "spec": spec}
         rows += [_row(scenario, name, each, rest) for name, each in metrics.items()]
     total = common | {"n": sum(len(r.costs) for r in standing.results.values())}
     rows += [_row("all", name, each, total) for name, each in standing.overall.items()]
@@ -190,36 +192,16 @@ def main_table(title: str, found: list[Standing], note: str) -> Table:
 
 
 def motion_table(title: str, found: list[Standing]) -> Table:
-    """What the contestants do to the car, in the same order: means over all manoeuvres."""
-    header = (
-        "controller and estimator",
-        "RMS slip",
-        "peak slip",
-        "yaw error",
-        "effort",
-        "step",
-        "steer step",
-        "saturated",
-        "of the period",
-    )
-    cells = [
-        [
-            each.label,
-            f"{1e3 * each.mean('rms_slip'):.1f}",
-            f"{1e3 * each.mean('peak_slip'):.1f}",
-            f"{1e3 * each.mean('rms_yaw_error'):.1f}",
-            f"{each.mean('effort'):.3f}",
-            f"{each.mean('largest_step'):.0f}",
-            f"{1e3 * each.mean('largest_steer_step'):.1f}",
-            f"{100 * each.mean('saturation'):.1f}",
-            f"{1e-4 * each.us / control_period(each.cell):.2f}" if np.isfinite(each.us) else "",
-        ]
-        for each in found
-    ]
+    """The motion under each contestant, in the same order: means over all manoeuvres."""
+    shown = [metric for metric in EPISODE if metric.heading]
+    header = ["controller and estimator", *(m.heading for m in shown), "of the period / %"]
+    cells = []
+    for each in found:
+        share = f"{1e-4 * each.us / control_period(each.cell):.2f}" if np.isfinite(each.us) else ""
+        cells.append([each.label, *(m.text(each.mean(m.name)) for m in shown), share])
     note = (
-        "Slip in mrad, RMS error of the yaw rate in mrad/s, effort: mean square share of the full "
-        "yaw moment, steps: largest of what is asked between two decisions in N m and mrad, "
-        "saturated: % of the decisions, a decision's time in % of the control period."
+        "effort: mean square share of the full yaw moment. Steps: the largest of what is asked "
+        "between two decisions. saturated: of the decisions. The last column: a decision's time."
     )
     return Table(title, header, cells, note)
 
@@ -231,7 +213,7 @@ def yardsticks(results: Results, env_id: str, tops: dict[str, Ceiling]) -> Table
         none = results.of(env_id, scenario, "none")
         informed = results.of(env_id, scenario, INFORMED)
         top = tops.get(scenario)
-        failed = 100.0 * np.mean(none.numbers[:, NUMBERS.index("failure")] != 0.0)
+        failed = 100.0 * np.mean(none["failure"] != 0.0)
         cells.append(
             [
                 scenario,

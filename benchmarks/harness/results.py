@@ -10,54 +10,7 @@ from typing import Any
 
 from ...envs.backend.files import write_whole
 from .explorer import Explorer
-
-METRICS = {
-    "rmse": "rad",
-    "rmse_over_bound": "-",
-    "us_per_tick": "us",
-    "us_per_step": "us",
-    "wall_us_per_tick": "us",
-    "wall_us_per_step": "us",
-    "cpu_seconds": "s",
-    "bytes_per_row": "B",
-    "rms_slip": "rad",
-    "peak_slip": "rad",
-    "largest_step": "N m",
-    "saturation": "-",
-    "effort": "-",
-    "cost": "-",
-    "score": "-",
-    "iqm": "-",
-    "cost_over_informed": "-",
-    "probability_of_improvement": "-",
-    "rms_slip_error": "rad",
-    "rms_yaw_error": "rad/s",
-    "spin_rate": "-",
-    "departure_rate": "-",
-    "not_finite_rate": "-",
-    "bad_action_rate": "-",
-    "steer_effort": "-",
-    "largest_steer_step": "rad",
-    "us_per_decision": "us",
-    "ratio": "-",
-    "static_slip": "rad",
-    "drift": "rad",
-    "difference": "-",
-    "residual": "-",
-    "offset": "m",
-    "rank": "-",
-    "share": "-",
-    "spectral_radius": "-",
-    "decibels": "dB",
-    "hertz": "Hz",
-    "count": "-",
-    "amplitude": "-",
-    "speed": "m/s",
-    "understeer_gradient": "rad s2/m",
-    "response_time": "s",
-    "overshoot": "-",
-}
-"""The vocabulary of metrics with their units; a new one is added here first."""
+from .metrics import METRICS
 
 VERDICTS = ("", "reproduced", "partly", "not reproduced", "report only")
 

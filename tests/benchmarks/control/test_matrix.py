@@ -23,8 +23,9 @@ from sideslip.benchmarks.control.figures import _SHOWN, run_of
 from sideslip.benchmarks.control.run import measure
 from sideslip.benchmarks.control.scores import Ceiling, Resampled
 from sideslip.benchmarks.control.seeds import salt_of, salted_seeds
-from sideslip.benchmarks.control.tables import _metrics, rows_of, standings
-from sideslip.envs import FAILURES, SCENARIOS
+from sideslip.benchmarks.control.tables import _metrics, motion_table, rows_of, standings
+from sideslip.benchmarks.harness.metrics import EPISODE
+from sideslip.envs import COMS, FAILURES, SCENARIOS, Scenario
 from sideslip.estimators import EstimateObservation
 
 SEEDS = (3, 4, 2**32 - 1)
@@ -34,10 +35,6 @@ PAIRS = (
     ("exact-kf", "lqr"),
     ("", "ppo-yaw-vision"),
 )
-
-
-def number(driven: Any, name: str) -> np.ndarray:
-    return np.asarray(driven.numbers[:, NUMBERS.index(name)])
 
 
 @pytest.mark.parametrize(("estimator", "controller"), PAIRS)
@@ -52,21 +49,26 @@ def test_a_cell_is_its_single_episodes(estimator: str, controller: str) -> None:
     agent = make_agent(controller, env)
     for i, seed in enumerate(SEEDS):
         alone = rollout(env, agent, seed)
-        assert number(driven, "cost")[i] == pytest.approx(alone.cost, rel=1e-12)
-        assert number(driven, "peak_slip")[i] == np.abs(alone["beta"][1:]).max()
-        assert number(driven, "failure")[i] == alone["failure"][-1]
+        assert driven["cost"][i] == pytest.approx(alone.cost, rel=1e-12)
+        assert driven["peak_slip"][i] == np.abs(alone["beta"][1:]).max()
+        assert driven["failure"][i] == alone["failure"][-1]
         error = alone["gamma"][1:] - alone["gamma_ref"][1:]
         rms = np.sqrt(np.mean(error**2))
-        assert number(driven, "rms_yaw_error")[i] == pytest.approx(rms, rel=1e-12)
+        assert driven["rms_yaw_error"][i] == pytest.approx(rms, rel=1e-12)
+        rate = np.mean(np.abs(np.diff(alone["yaw_moment"]))) / 0.01
+        assert driven["moment_rate"][i] == pytest.approx(rate, rel=1e-12)
         if i == 0:
             assert driven.series is not None
             assert np.array_equal(driven.series[:, 1], alone["beta"])
 
 
-def test_every_manoeuvre_exists_and_is_scored() -> None:
-    assert len(MANOEUVRES) == 10
-    for name in MANOEUVRES:
-        assert SCENARIOS[name].scored
+def test_ten_manoeuvres_are_scored_and_nothing_else_is() -> None:
+    assert (
+        *("random-steering", "sine-with-dwell", "double-lane-change", "step-steer", "gust"),
+        *("low-friction", "brake-in-turn", "stiffness-step", "sensor-outage", "uneven-delay"),
+    ) == MANOEUVRES
+    assert [name for name, each in SCENARIOS.items() if each.scored] == list(MANOEUVRES)
+    assert not Scenario(name="a user's own").scored
     assert len(set(cells())) == len(list(cells()))
 
 
@@ -99,13 +101,50 @@ def broken(monkeypatch: pytest.MonkeyPatch, agent: Any) -> None:
     monkeypatch.setattr(drive, "make_contest", lambda cell, n: (make(cell, n)[0], agent))
 
 
+class SquareWave:
+    """All of the yaw moment to one side, then to the other, every 0.2 s."""
+
+    def __init__(self) -> None:
+        self.calls = -1
+
+    def predict(self, obs: Any, *_: Any, **__: Any) -> tuple[Any, None]:
+        self.calls += 1
+        return np.full((len(obs), 1), 1.0 if self.calls // 20 % 2 else -1.0, np.float32), None
+
+
+def test_the_moment_rate_is_what_the_motors_delivered_and_the_step_what_was_asked(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """From limit to limit five times a second: ten times the limit, in N m/s, whatever the lag."""
+    scenario = {"base": "straight", "duration": 4.0, "speed": 8.0}
+    broken(monkeypatch, SquareWave())
+    driven = drive.drive(Chunk(Cell(YAW, "straight", "", "none", {"scenario": scenario}), SEEDS))
+    limit = COMS.yaw_moment_limit
+    assert driven["moment_rate"] == pytest.approx(np.full(3, 2.0 * limit / 0.2), rel=0.05)
+    assert driven["largest_step"] == pytest.approx(np.full(3, 2.0 * limit))
+    assert (driven["saturation"] == 1.0).all()
+
+
+def test_a_metric_of_the_table_has_its_rows_and_its_column() -> None:
+    asked = [cell for cell in cells(MANOEUVRES[:1]) if cell.env_id == YAW]
+    standing = standings(ready(asked), YAW, {})
+    metrics = {row.metric for row in rows_of(standing[0], "ab")}
+    assert {metric.name for metric in EPISODE} - {"failure"} <= metrics
+    table = motion_table("", standing)
+    for metric in EPISODE:
+        if metric.heading:
+            column = list(table.header).index(metric.heading)
+            value = float(table.cells[0][column]) / metric.scale
+            assert value == pytest.approx(standing[0].mean(metric.name), abs=0.5 / metric.scale)
+
+
 def test_nan_ends_its_car_and_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
     cell = Cell(YAW, "gust", "", "none")
     whole = drive.drive(Chunk(cell, SEEDS))
     broken(monkeypatch, Broken())
     driven = drive.drive(Chunk(cell, SEEDS))
-    assert FAILURES[int(number(driven, "failure")[0])] == "bad-action"
-    assert number(driven, "cost")[0] > 90.0 * (SCENARIOS["gust"].duration - 0.1)
+    assert FAILURES[int(driven["failure"][0])] == "bad-action"
+    assert driven["cost"][0] > 90.0 * (SCENARIOS["gust"].duration - 0.1)
     assert np.array_equal(driven.numbers[1:], whole.numbers[1:])
 
 
@@ -113,7 +152,7 @@ def test_actions_of_the_wrong_shape_are_failures_too(monkeypatch: pytest.MonkeyP
     broken(monkeypatch, Broken("wrong"))
     driven = drive.drive(Chunk(Cell(YAW, "gust", "", "none"), SEEDS))
     assert driven.error == ""
-    assert {FAILURES[int(code)] for code in number(driven, "failure")} == {"bad-action"}
+    assert {FAILURES[int(code)] for code in driven["failure"]} == {"bad-action"}
 
 
 def test_a_cell_that_cannot_be_built_says_why_and_the_rest_goes_on() -> None:
@@ -134,7 +173,7 @@ def test_standing_car_and_diverging_plant_end_finite() -> None:
         cell = Cell(YAW, "gust", "exact-kf", "lqr", {"scenario": scenario})
         driven = drive.drive(Chunk(cell, SEEDS))
         assert driven.error == "" and np.isfinite(driven.numbers).all()
-        assert FAILURES[int(number(driven, "failure")[0])] == name
+        assert FAILURES[int(driven["failure"][0])] == name
 
 
 def test_a_stopped_run_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -167,7 +206,7 @@ def ready(asked: list[Cell]) -> results.Results:
         level = {"none": 10.0, "informed": 2.0, "lqr": 3.0}.get(cell.controller, 5.0)
         numbers = np.abs(rng.normal(1.0, 0.01, (8, len(NUMBERS)))) * level
         numbers[:, NUMBERS.index("failure")] = 0.0
-        found.found[cell] = results.Result(cell, numbers, 1.0)
+        found.found[cell] = drive.Driven(numbers, 1.0)
     return found
 
 
@@ -228,9 +267,9 @@ def test_an_unsure_ceiling_is_no_yardstick() -> None:
 def test_a_manoeuvre_that_informed_hardly_improves_is_not_scored() -> None:
     asked = [cell for cell in cells(MANOEUVRES[:1]) if cell.env_id == YAW]
     found = ready(asked)
-    assert found.scored(YAW, MANOEUVRES[0])
-    found.of(YAW, MANOEUVRES[0], "informed").numbers[:, 0] = 5.5
-    assert not found.scored(YAW, MANOEUVRES[0])
+    assert found.worth_controlling(YAW, MANOEUVRES[0])
+    found.of(YAW, MANOEUVRES[0], "informed").costs[:] = 5.5
+    assert not found.worth_controlling(YAW, MANOEUVRES[0])
     assert "score" not in standings(found, YAW, {MANOEUVRES[0]: Ceiling(1.0, 0.0)})[0].overall
 
 
@@ -273,7 +312,7 @@ def test_the_run_in_motion_is_the_cells_own(monkeypatch: pytest.MonkeyPatch) -> 
         same = Cell(cell.env_id, "sine-with-dwell", cell.estimator, cell.controller)
         driven = drive.drive(Chunk(same, (5,)))
         alone = run_of(same, 5)
-        assert alone.cost == pytest.approx(number(driven, "cost")[0], rel=1e-12)
+        assert alone.cost == pytest.approx(driven["cost"][0], rel=1e-12)
 
 
 def test_the_shipped_ceilings_are_of_this_env() -> None:

@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.harness.results import METRICS, VERDICTS
+from sideslip.benchmarks.harness.metrics import METRICS
+from sideslip.benchmarks.harness.results import VERDICTS
 from sideslip.benchmarks.papers import suite as papers
 from sideslip.benchmarks.papers.claims import CLAIMS, FIGURES, SIMULATIONS
 from sideslip.benchmarks.papers.ledger.claim import (

@@ -1,0 +1,143 @@
+"""The vocabulary of metrics with their units, and how an episode's own are taken, step by step.
+
+A new metric of the matrix is one entry of `EPISODE`: its rows, its column and its unit follow.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+
+FULL = 0.999  # of an input's range: saturated
+
+
+class Moment(NamedTuple):
+    """An env-step of N cars.
+
+    asked: (N, 2) shares of the yaw moment and of the added steering. before: those of the last
+    step. reward: (N,). info, last: the env's infos after and before the step. full: (2,) N m and
+    rad at a share of 1. dt: s.
+    """
+
+    asked: Array
+    before: Array
+    reward: Array
+    info: Mapping[str, Any]
+    last: Mapping[str, Any]
+    full: Array
+    dt: float
+
+
+class Fold(NamedTuple):
+    """How the values of an episode's steps make one number, starting from 0.
+
+    add: from the number so far and a step's value. finish: from the last of them and the steps.
+    """
+
+    add: Callable[[Array, Array], Array]
+    finish: Callable[[Array, Array], Array]
+
+
+def _as_it_is(total: Array, _: Array) -> Array:
+    return total
+
+
+FOLDS = {
+    "sum": Fold(np.add, _as_it_is),
+    "mean": Fold(np.add, np.divide),
+    "rms": Fold(lambda total, value: total + value * value, lambda t, steps: np.sqrt(t / steps)),
+    "max": Fold(np.maximum, _as_it_is),
+    "last": Fold(lambda _, value: value, _as_it_is),
+}
+
+
+@dataclass(frozen=True)
+class Metric:
+    """A number of an episode.
+
+    of: a step's value (N,) from its `Moment`. fold: a key of `FOLDS`. heading: of its column in
+    the matrix's table of motion, "" for none. scale, digits: of a number there.
+    """
+
+    name: str
+    unit: str
+    of: Callable[[Moment], Array]
+    fold: str
+    heading: str = ""
+    scale: float = 1.0
+    digits: int = 1
+
+    def text(self, value: float) -> str:
+        """A value as its column shows it."""
+        return f"{self.scale * value:.{self.digits}f}"
+
+
+def _error(name: str) -> Callable[[Moment], Array]:
+    return lambda m: m.info[name] - m.info[f"{name}_ref"]
+
+
+def _change(i: int) -> Callable[[Moment], Array]:
+    """Of what is asked of an input from one decision to the next."""
+    return lambda m: np.abs(m.asked[:, i] - m.before[:, i]) * m.full[i]
+
+
+EPISODE = (
+    Metric("cost", "-", lambda m: -m.reward, "sum"),
+    Metric("rms_slip", "rad", lambda m: m.info["beta"], "rms", "RMS slip / mrad", 1e3),
+    Metric("peak_slip", "rad", lambda m: np.abs(m.info["beta"]), "max", "peak slip / mrad", 1e3),
+    Metric("rms_slip_error", "rad", _error("beta"), "rms"),
+    Metric("rms_yaw_error", "rad/s", _error("gamma"), "rms", "yaw error / (mrad/s)", 1e3),
+    Metric(
+        "effort", "-", lambda m: (m.info["yaw_moment"] / m.full[0]) ** 2, "mean", "effort", 1, 3
+    ),
+    Metric(
+        "moment_rate",
+        "N m/s",
+        lambda m: np.abs(m.info["yaw_moment"] - m.last["yaw_moment"]) / m.dt,
+        "mean",
+        "moment rate / (N m/s)",
+        digits=0,
+    ),
+    Metric("largest_step", "N m", _change(0), "max", "step / (N m)", digits=0),
+    Metric("steer_effort", "-", lambda m: m.asked[:, 1] ** 2, "mean"),
+    Metric("largest_steer_step", "rad", _change(1), "max", "steer step / mrad", 1e3),
+    Metric(
+        "saturation",
+        "-",
+        lambda m: (np.abs(m.asked).max(axis=1) >= FULL).astype(np.float64),
+        "mean",
+        "saturated / %",
+        1e2,
+    ),
+    Metric("failure", "code", lambda m: m.info["failure"], "last"),
+)
+"""The metrics of an episode.
+
+effort: mean square share of the yaw moment that was delivered. moment_rate: how fast the delivered
+yaw moment changes, on average. steer_effort: mean square share of the added steering that was asked
+for. largest_step, largest_steer_step: between two decisions. saturation: share of the decisions
+that ask for all of an input. failure: a code of `FAILURES`.
+"""
+
+_OTHERS = {
+    "rad": "rmse static_slip drift",
+    "m": "offset",
+    "m/s": "speed",
+    "s": "cpu_seconds response_time",
+    "us": "us_per_tick us_per_step us_per_decision wall_us_per_tick wall_us_per_step",
+    "B": "bytes_per_row",
+    "dB": "decibels",
+    "Hz": "hertz",
+    "rad s2/m": "understeer_gradient",
+    "-": "rmse_over_bound score iqm cost_over_informed probability_of_improvement spin_rate "
+    "departure_rate not_finite_rate bad_action_rate ratio difference residual rank share "
+    "spectral_radius count amplitude overshoot",
+}
+METRICS = {metric.name: metric.unit for metric in EPISODE} | {
+    name: unit for unit, names in _OTHERS.items() for name in names.split()
+}
+"""Every metric that a row may have, with its unit; a new one is added here first."""
