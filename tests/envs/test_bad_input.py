@@ -21,7 +21,7 @@ ARGUMENTS: list[tuple[Arguments, type[Exception], str]] = [
         ValueError,
         "unknown sensors 'radar'; known: vision, ",
     ),
-    ({"scenario": "slalon"}, ValueError, "unknown scenario 'slalon'; known: straight"),
+    ({"scenario": "slalon"}, ValueError, "unknown scenario 'slalon'; known: random-steering"),
     ({"scenario": {"speeed": 1.0}}, TypeError, "unknown scenario field 'speeed'"),
     ({"scenario": {"duration": -1.0}}, ValueError, "'custom': duration -1.0"),
     ({"vehicle": "comms"}, ValueError, "unknown vehicle 'comms'; known: coms"),
