@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sideslip.estimators import DualRate
-from tests.estimators.papers.test_dual_rate import random_system
+from tests.estimators.filters.test_dual_rate import random_system
 
 pytestmark = pytest.mark.plain
 

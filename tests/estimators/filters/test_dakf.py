@@ -9,7 +9,7 @@ from scipy.signal import place_poles
 from sideslip.envs.record import FAST, PACKET
 from sideslip.envs.vehicle.vehicle import COMS
 from sideslip.estimators import make_estimator
-from tests.estimators.papers.literal import (
+from tests.estimators.filters.literal import (
     COURSE,
     T,
     car,

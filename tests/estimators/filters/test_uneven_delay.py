@@ -7,7 +7,7 @@ import pytest
 
 from sideslip.envs.record import FAST, PACKET, SlowSensor
 from sideslip.estimators import make_estimator
-from tests.estimators.papers.literal import (
+from tests.estimators.filters.literal import (
     T,
     car,
     correct,

@@ -10,7 +10,7 @@ from sideslip.envs.vehicle.vehicle import COMS, GRAVITY
 from sideslip.estimators import make_estimator
 from sideslip.estimators.design.periodic import design
 from sideslip.estimators.design.schedule import NO_SENSOR
-from tests.estimators.papers.literal import (
+from tests.estimators.filters.literal import (
     COURSE,
     T,
     car,

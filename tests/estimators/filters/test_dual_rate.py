@@ -9,7 +9,7 @@ from scipy.linalg import solve_discrete_are
 from sideslip.envs.record import PACKET, SlowSensor
 from sideslip.estimators import DualRate, make_estimator
 from sideslip.estimators.design.dual_rate import frame_map, shares_of
-from tests.estimators.papers.literal import COURSE, T, car, due, excited, gain, inputs, pushed, zoh
+from tests.estimators.filters.literal import COURSE, T, car, due, excited, gain, inputs, pushed, zoh
 from tests.estimators.simulation import FIG6, simulate
 
 pytestmark = [
