@@ -1,10 +1,13 @@
-"""What every classical controller shares: named inputs, batches, memory outside the object."""
+"""The base of every classical controller: named inputs, batches, memory outside the object."""
 
+import math
 from abc import ABC, abstractmethod
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from ...envs.backend.decorators import jit
 from ..env_facts import AnyEnv, given
 
 Array = npt.NDArray[np.float64]
@@ -13,7 +16,7 @@ Array = npt.NDArray[np.float64]
 class Controller(ABC):
     """Stable-baselines3's `predict` around a compiled law.
 
-    A subclass names its inputs (`needs`, entries of the env's layout), how many numbers it
+    A subclass names its inputs (`needs`, entries of the env's layout) and how many numbers it
     remembers (`memory`), and fills `_law`. `predict` is pure: all memory is in `state`, an array
     (N, memory).
 
@@ -22,15 +25,16 @@ class Controller(ABC):
     estimator that fails is seen: an env with `on_bad_action="fail"` ends the episode, others raise.
 
     Raises ValueError when the env's observation lacks a needed entry, or where the rows of a vector
-    env were told different cars.
+    env have different nominal cars.
     """
 
     needs: tuple[str, ...] = ()
     memory = 0
+    _design: tuple[Any, ...] = ()  # the arguments of a compiled law behind inputs, state, action
 
     def __init__(self, env: AnyEnv) -> None:
-        told = given(env)
-        names = [entry.name for entry in told.layout]
+        facts = given(env)
+        names = [entry.name for entry in facts.layout]
         missing = [name for name in self.needs if name not in names]
         if missing:
             raise ValueError(
@@ -39,18 +43,18 @@ class Controller(ABC):
             )
         self._columns = np.array([names.index(name) for name in self.needs], dtype=np.int64)
         self._width = len(names)
-        self.nominal = told.nominal
-        self.full_scale, self.authority = told.full_scale, told.authority
-        self.control_period, self.reference = told.control_period, told.reference
-        self.width = told.width
+        self.nominal = facts.nominal
+        self.full_scale, self.authority = facts.full_scale, facts.authority
+        self.control_period, self.reference = facts.control_period, facts.reference
+        self.width = facts.width
 
     @abstractmethod
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
         """Fill action (N, width), which is zero, and update state (N, memory) in place.
 
-        inputs: (N, len(needs)), finite. A NaN that the law leaves in an action says that it failed.
-        Its first column is the yaw moment as a share of full scale, its second, where the env has
-        one, the added steering as a share of the vehicle's authority.
+        inputs: (N, len(needs)), finite. A NaN that the law leaves in an action means that it
+        failed. The action's first column is the yaw moment as a share of full scale, its second,
+        where the env has one, the added steering as a share of the vehicle's authority.
         """
 
     def predict(
@@ -87,12 +91,32 @@ class Controller(ABC):
 
 
 def _hint(missing: list[str]) -> str:
-    """What to wrap the env in, so that its observation has these entries."""
+    """The wrapper whose observation has these entries."""
     if any(name.startswith("true_") for name in missing):
-        return "; build env and agent with sideslip.agents.informed.make_informed"
+        return "; build env and agent with sideslip.agents.controllers.informed.make_informed"
     if any(name.endswith("_hat") for name in missing):
         return "; wrap the env in sideslip.estimators.EstimateObservation"
     return ""
+
+
+def entries_of(env: AnyEnv) -> set[str]:
+    """The names in the env's observation."""
+    return {entry.name for entry in given(env).layout}
+
+
+def positive(name: str, value: float) -> float:
+    """The value; ValueError unless it is positive and finite."""
+    if not 0.0 < value < math.inf:
+        raise ValueError(f"{name} is a positive number, got {value!r}")
+    return float(value)
+
+
+@jit
+def integrated(integral: Any, step: Any, wanted: Any, limited: Any) -> Any:
+    """An integral after a step, which is dropped where it would push further past the limit."""
+    if wanted == limited or (wanted > limited) != (step > 0.0):
+        return integral + step
+    return integral
 
 
 class NoControl(Controller):

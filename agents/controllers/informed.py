@@ -1,4 +1,4 @@
-"""The informed controller: LQG of the true linear car with the same sensors, DESIGN section 4."""
+"""The informed controller: LQG of the true linear car with the same sensors."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -14,9 +14,9 @@ from ...estimators.vector import estimate as vector
 from ...estimators.vector.truth import TruthObservation as VectorTruthObservation
 from ...estimators.wrappers.estimate import TRUTH, EstimateObservation
 from ...estimators.wrappers.truth import STIFFNESSES, TruthObservation
-from ..env_facts import AnyEnv, given
+from ..env_facts import AnyEnv
 from .base import Array
-from .lqr import Lqr
+from .lqr import IN, Lqr
 
 OUTPUTS = ["beta", "gamma", "F_d", "N_d"]
 PARAMETERS = (*STIFFNESSES, "friction")
@@ -38,28 +38,28 @@ TYRES = 4.0
 What Fiala tyres lack against their own stiffness is a disturbance to a linear filter. Of 1, 2, 4
 and 8, tried on random-steering of YawFusion and YawVision (seeds 1000 to 1029), 8 has the least
 mean cost, but pays for it where tyres do not saturate (YawVision's median is 0.97, with 4 it is
-0.68); 4 is the compromise. It serves a filter told the nominal car as well: where tyres saturate,
+0.68); 4 is the compromise. It serves a filter of the nominal car as well: where tyres saturate,
 most of what this controller gains on `lqr` with the scenario's own levels comes from it, not from
 knowing the stiffnesses. Compare at equal levels (`levels_of`).
 """
 
 
 def levels_of(scenario: Scenario) -> dict[str, Any]:
-    """Options of `exact-kf` that say the noise and the disturbances of a scenario.
+    """Options of `exact-kf`: the noise and the disturbances of a scenario.
 
     The course's noise follows the HDOP that comes with each packet, as far as the scenario's does.
     """
     noise = dict(scenario.noise)
     share = HDOP_LAWS[scenario.hdop_law]
     more = 1.0 if scenario.tyres == "linear" else TYRES
-    told = {
+    options = {
         "force_sd": more * scenario.disturbance_force,
         "moment_sd": more * scenario.disturbance_moment,
         "disturbance_time": scenario.disturbance_time,
         "hdop_table": [(1.0, 1.0), (101.0, 1.0 + 100.0 * share)],
     }
     names = {"gyro": "gyro_noise", "camera_psi": "psi_noise", "camera_y": "y_l_noise"}
-    return told | {option: noise[key] for key, option in names.items() if key in noise}
+    return options | {option: noise[key] for key, option in names.items() if key in noise}
 
 
 class Informed(Lqr):
@@ -69,18 +69,15 @@ class Informed(Lqr):
     for the yaw moment, and it adds no steering that only slides the front ones.
 
     For an env whose observation has `true_front_stiffness`, `true_rear_stiffness` and
-    `true_friction` and the estimates of a filter that was told the truth: `make_informed` builds
-    both. Arguments and errors are those of `lqr`.
+    `true_friction` and the estimates of a filter of the true car: `make_informed` builds both.
+    Arguments and errors are those of `lqr`.
     """
+
+    more = (FRICTION,)
 
     def __init__(self, env: AnyEnv, **options: Any) -> None:
         true = [f"true_{name}" for name in STIFFNESSES]
         super().__init__(env, stiffness=true, **{"steer_weight": STEER_WEIGHT, **options})
-        names = [entry.name for entry in given(env).layout]
-        if FRICTION not in names:
-            raise ValueError(f"Informed needs {FRICTION} in the observation: see make_informed")
-        self.needs = (*self.needs, FRICTION)
-        self._columns = np.append(self._columns, names.index(FRICTION))
         car = self.vehicle
         per_tyre = car.mass * GRAVITY / (2.0 * car.wheelbase)
         self._moment = GRIP * car.rear_track * per_tyre * car.front_arm / self.full_scale
@@ -92,8 +89,9 @@ class Informed(Lqr):
         most = self._moment * friction
         action[:, 0] = np.clip(action[:, 0], -most, most)
         if self.width == 2:
-            wheels, driver, front = inputs[:, :2], inputs[:, 5], inputs[:, -3]
-            beta, gamma = inputs[:, 8], inputs[:, 9]
+            wheels, driver = inputs[:, : IN.torque_left], inputs[:, IN.steer_command]
+            front = inputs[:, IN.front_stiffness]
+            beta, gamma = inputs[:, IN.beta_hat], inputs[:, IN.gamma_hat]
             v = np.maximum(wheels.mean(axis=1), SLOW)
             slides = 3.0 * friction * self._front_load / np.maximum(front, 1.0)  # rad, Fiala's
             straight = beta + self.vehicle.front_arm * gamma / v - driver

@@ -5,10 +5,11 @@ serve one controller of all four.
 """
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from ...envs.backend.arrays import offsets
 from ...envs.backend.decorators import jit
 from ...envs.backend.primitives import maximum
 from ...envs.task.cost import BETA_SCALE, EFFORT_WEIGHT, GAMMA_SCALE, STEER_SCALE
@@ -18,21 +19,59 @@ from ...envs.vehicle.vehicle import Vehicle
 from ..design.gain_schedule import SPEEDS, interpolated
 from ..design.sampled_model import optimal
 from ..env_facts import AnyEnv
-from .base import Array, Controller
+from .base import Array, Controller, positive
 
-MOVED = ("beta", "gamma", "psi", "y", "N_z", "delta_f", "integral")
-"""States that the inputs move; y is the offset of the centre of gravity from the road, in m, and
-the integral its own, in m s."""
-OTHERS = ("driver", "kappa")
+
+class Inputs(NamedTuple):
+    """Columns of the law's inputs."""
+
+    wheel_left: Any
+    wheel_right: Any
+    torque_left: Any
+    torque_right: Any
+    steer: Any
+    steer_command: Any
+    beta_hat: Any
+    gamma_hat: Any
+    psi_hat: Any
+    y_l_hat: Any
+
+
+class Lane(NamedTuple):
+    """States of the lane model: the inputs move the first seven, the others move by themselves."""
+
+    beta: Any
+    gamma: Any
+    psi: Any  # relative to the road
+    y: Any  # m, of the centre of gravity from the road's centre line
+    N_z: Any  # share of full scale
+    delta_f: Any
+    integral: Any  # m s, of y
+    driver: Any
+    kappa: Any
+
+
+class Memory(NamedTuple):
+    """The integral, the filtered gamma / V and psi that the curvature is from, whether it began."""
+
+    integral: Any
+    rate: Any
+    heading: Any
+    started: Any
+
+
+IN, _ = offsets(Inputs)
+AT, WIDTH = offsets(Lane)
+LAST, _ = offsets(Memory)
+MOVED = Lane._fields[: AT.driver]
 HASTE = 3.0
 OFFSET_SCALE, INTEGRAL_SCALE = 0.1, 0.2  # m, m s
-MEMORY = ("integral", "rate", "heading", "started")
 
 
 def lane_model(
     vehicle: Vehicle, speed: float, period: int, full_scale: float, haste: float
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """(G, H, Q, R, N) of MOVED and OTHERS over `period` ticks, as `optimal` takes them.
+    """(G, H, Q, R, N) of `Lane` over `period` ticks, as `optimal` takes them.
 
     Inputs: the share of the full yaw moment in N m, and rad added to the driver's steering. The
     cost rate is the env's of beta and of both inputs, with gamma against V kappa, the offset over
@@ -40,23 +79,26 @@ def lane_model(
     asked for is ahead of the applied, in what its rate covers in a period and a lag: without it a
     linear law asks for what the rate cannot give. It is taken at the end of each period.
     """
-    n, T = len(MOVED) + len(OTHERS), period * TICK
+    n, T = WIDTH, period * TICK
     plane = vision(vehicle, speed)
     lags = [max(tau, TICK) for tau in (vehicle.motor_lag, vehicle.steering_lag)]
     A, B = np.zeros((n, n)), np.zeros((n, 2))
     A[:3, :3] = plane.A[:3, :3]
-    A[:3, 4], A[:3, 5], A[:3, 8] = (plane.B[:3, i] for i in (1, 0, 2))  # N_z, delta_f, kappa
-    A[:3, 4] *= full_scale
-    A[3, 0] = A[3, 2] = speed  # y' = V (beta + psi), tie-vision (5)
-    A[4, 4], B[4, 0] = -1.0 / lags[0], 1.0 / lags[0]
-    A[5, 5], A[5, 7], B[5, 1] = -1.0 / lags[1], 1.0 / lags[1], 1.0 / lags[1]
-    A[6, 3] = 1.0
-    G, H = LinearModel(A, B, np.eye(n), MOVED + OTHERS, (), ()).discrete(T)
-    C = np.zeros((6, n))  # beta, gamma - V kappa, N_z, y, its integral, added steering
-    C[0, 0] = C[1, 1] = C[2, 4] = C[3, 3] = C[4, 6] = C[5, 5] = 1.0
-    C[1, 8], C[5, 7] = -speed, -1.0
+    for state, column in ((AT.N_z, 1), (AT.delta_f, 0), (AT.kappa, 2)):
+        A[:3, state] = plane.B[:3, column]
+    A[:3, AT.N_z] *= full_scale
+    A[AT.y, AT.beta] = A[AT.y, AT.psi] = speed  # y' = V (beta + psi), tie-vision (5)
+    for i, (state, lag) in enumerate(zip((AT.N_z, AT.delta_f), lags, strict=True)):
+        A[state, state], B[state, i] = -1.0 / lag, 1.0 / lag
+    A[AT.delta_f, AT.driver] = 1.0 / lags[1]
+    A[AT.integral, AT.y] = 1.0
+    G, H = LinearModel(A, B, np.eye(n), Lane._fields, (), ()).discrete(T)
+    C = np.zeros((6, n))
+    for row, state in enumerate((AT.beta, AT.gamma, AT.N_z, AT.y, AT.integral, AT.delta_f)):
+        C[row, state] = 1.0
+    C[1, AT.kappa], C[5, AT.driver] = -speed, -1.0  # gamma - V kappa; the added steering alone
     ahead = np.zeros((1, n + 2))  # of the applied steering, the one asked for
-    ahead[0, 5], ahead[0, 7], ahead[0, n + 1] = -1.0, 1.0, 1.0
+    ahead[0, AT.delta_f], ahead[0, AT.driver], ahead[0, n + 1] = -1.0, 1.0, 1.0
     judged = np.vstack([C @ np.hstack([G, H]), ahead])
     reach = vehicle.steering_rate * (T + vehicle.steering_lag)
     scales = (BETA_SCALE, GAMMA_SCALE, 1.0, OFFSET_SCALE, INTEGRAL_SCALE, STEER_SCALE, reach)
@@ -71,6 +113,7 @@ def lane_model(
 def _lane_keeping_law(
     x: Any,
     state: Any,
+    action: Any,
     table: Any,
     axes: Any,
     share: float,
@@ -78,23 +121,25 @@ def _lane_keeping_law(
     time: float,
     dt: float,
     authority: float,
-    action: Any,
 ) -> None:
-    """x: wheels, torques, steer, steer_command, beta, gamma, psi, y_l. state: MEMORY."""
+    """x: `Inputs`. state: `Memory`."""
     m, n = table.shape[3:]
     K, z = np.empty((m, n)), np.empty(n)
     for row in range(len(x)):
-        v = maximum(0.5 * (x[row, 0] + x[row, 1]), axes[0][0])
-        gamma, psi = x[row, 7], x[row, 8]
-        if state[row, 3] == 0.0:
-            state[row, 1], state[row, 2], state[row, 3] = gamma / v, psi, 1.0
-        kappa = state[row, 1] - (psi - state[row, 2]) / (v * time)  # psi' = gamma - V kappa
-        state[row, 1] += (gamma / v - state[row, 1]) * dt / time
-        state[row, 2] += (psi - state[row, 2]) * dt / time
-        y = x[row, 9] - preview * psi + 0.5 * kappa * preview * preview  # tie-vision (4)
-        z[0], z[1], z[2], z[3] = x[row, 6], gamma, psi, y
-        z[4], z[5], z[6] = share * (x[row, 3] - x[row, 2]), x[row, 4], state[row, 0]
-        z[7], z[8] = x[row, 5], kappa
+        v = maximum(0.5 * (x[row, IN.wheel_left] + x[row, IN.wheel_right]), axes[0][0])
+        gamma, psi = x[row, IN.gamma_hat], x[row, IN.psi_hat]
+        if state[row, LAST.started] == 0.0:
+            state[row, LAST.rate], state[row, LAST.heading] = gamma / v, psi
+            state[row, LAST.started] = 1.0
+        turned = psi - state[row, LAST.heading]
+        kappa = state[row, LAST.rate] - turned / (v * time)  # psi' = gamma - V kappa
+        state[row, LAST.rate] += (gamma / v - state[row, LAST.rate]) * dt / time
+        state[row, LAST.heading] += turned * dt / time
+        y = x[row, IN.y_l_hat] - preview * psi + 0.5 * kappa * preview * preview  # tie-vision (4)
+        z[AT.beta], z[AT.gamma], z[AT.psi], z[AT.y] = x[row, IN.beta_hat], gamma, psi, y
+        z[AT.N_z] = share * (x[row, IN.torque_right] - x[row, IN.torque_left])
+        z[AT.delta_f], z[AT.driver] = x[row, IN.steer], x[row, IN.steer_command]
+        z[AT.integral], z[AT.kappa] = state[row, LAST.integral], kappa
         interpolated(table, axes, v, 0.0, 0.0, K)
         free = True
         for i in range(m):
@@ -108,7 +153,7 @@ def _lane_keeping_law(
         for i in range(2):
             free = free and -1.0 <= action[row, i] <= 1.0
         if free:  # else the integral would wind up
-            state[row, 0] += y * dt
+            state[row, LAST.integral] += y * dt
 
 
 class LaneKeeping(Controller):
@@ -119,25 +164,14 @@ class LaneKeeping(Controller):
     `curvature_time` seconds; what that lacks, the integral makes up. y is the offset of the centre
     of gravity, not of the preview point, which on a curve is never zero for a car in its lane.
 
-    moment: also by the yaw moment, else by steering alone. haste: of `lane_model`. Memory: MEMORY.
+    moment: also by the yaw moment, else by steering alone. haste: of `lane_model`.
 
     Raises ValueError for an env whose action does not steer, a missing entry or an option out of
     range, ModuleNotFoundError without python-control.
     """
 
-    needs = (
-        "wheel_left",
-        "wheel_right",
-        "torque_left",
-        "torque_right",
-        "steer",
-        "steer_command",
-        "beta_hat",
-        "gamma_hat",
-        "psi_hat",
-        "y_l_hat",
-    )
-    memory = len(MEMORY)
+    needs = Inputs._fields
+    memory = len(Memory._fields)
 
     def __init__(
         self,
@@ -149,35 +183,24 @@ class LaneKeeping(Controller):
         super().__init__(env)
         if self.width != 2:
             raise ValueError("LaneKeeping needs an env whose action steers (steering=True)")
-        if not 0.0 < curvature_time < math.inf:
-            raise ValueError(f"curvature_time is positive, in s, got {curvature_time!r}")
         if not 0.0 <= haste < math.inf:
             raise ValueError(f"haste is zero or more, got {haste!r}")
-        self.moment, self.curvature_time = bool(moment), float(curvature_time)
         speeds = SPEEDS[::2]
         inputs = slice(0 if moment else 1, 2)
-        gains = []
+        gains, car = [], self.nominal
         for speed in speeds:
-            G, H, Q, R, N = lane_model(
-                self.nominal, speed, self.control_period, self.full_scale, haste
-            )
-            gains.append(
-                optimal(G, H[:, inputs], Q, R[inputs, inputs], N[:, inputs], len(MOVED))[0]
-            )
-        self._table = np.ascontiguousarray(np.array(gains)[:, None, None])
-        self._axes = (np.array(speeds), np.zeros(1), np.zeros(1))
-        self._share = 0.5 * self.nominal.rear_track / self.nominal.wheel_radius / self.full_scale
-
-    def _law(self, inputs: Array, state: Array, action: Array) -> None:
-        _lane_keeping_law(
-            inputs,
-            state,
-            self._table,
-            self._axes,
-            self._share,
-            self.nominal.preview,
-            self.curvature_time,
+            G, H, Q, R, N = lane_model(car, speed, self.control_period, self.full_scale, haste)
+            optimum = optimal(G, H[:, inputs], Q, R[inputs, inputs], N[:, inputs], len(MOVED))
+            gains.append(optimum[0])
+        self._design = (
+            np.ascontiguousarray(np.array(gains)[:, None, None]),
+            (np.array(speeds), np.zeros(1), np.zeros(1)),
+            0.5 * car.rear_track / car.wheel_radius / self.full_scale,
+            car.preview,
+            positive("curvature_time", curvature_time),
             self.control_period * TICK,
             self.authority,
-            action,
         )
+
+    def _law(self, inputs: Array, state: Array, action: Array) -> None:
+        _lane_keeping_law(inputs, state, action, *self._design)

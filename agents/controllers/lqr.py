@@ -2,10 +2,11 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from ...envs.backend.arrays import offsets
 from ...envs.backend.decorators import jit
 from ...envs.backend.primitives import absolute
 from ...envs.task.reference import REFERENCES
@@ -13,47 +14,63 @@ from ...envs.ticks import TICK
 from ...envs.vehicle.vehicle import Vehicle
 from ..design.gain_schedule import SPEEDS, gain_table, interpolated
 from ..design.sampled_model import Purpose
-from ..env_facts import AnyEnv, given
-from .base import Array, Controller
+from ..env_facts import AnyEnv
+from .base import Array, Controller, entries_of, positive
 
-STATES = ("steer", "steer_command", "beta_ref", "gamma_ref")
+
+class Inputs(NamedTuple):
+    """Columns of the law's inputs; `Lqr` puts in beta_ref for those that it does without."""
+
+    wheel_left: Any
+    wheel_right: Any
+    torque_left: Any
+    torque_right: Any
+    steer: Any
+    steer_command: Any
+    beta_ref: Any
+    gamma_ref: Any
+    beta_hat: Any
+    gamma_hat: Any
+    disturbance_1: Any
+    disturbance_2: Any
+    front_stiffness: Any
+    rear_stiffness: Any
+
+
+IN, _ = offsets(Inputs)
 
 
 @jit
 def predicted_state(x: Any, share: Any, z: Any) -> None:
-    """Fill z, the states of the design model, from a row of inputs, which `_lqr_law` names.
+    """Fill z, the states of the design model, from a row of `Inputs`.
 
     share: what 1 N m of difference between the motors is of the full yaw moment.
     """
-    n = len(z)
-    z[0], z[1] = x[8], x[9]
-    z[2] = share * (x[3] - x[2])
-    z[3:7] = x[4:8]
-    z[7:] = x[10 : 3 + n]
+    z[0], z[1] = x[IN.beta_hat], x[IN.gamma_hat]
+    z[2] = share * (x[IN.torque_right] - x[IN.torque_left])
+    z[3:7] = x[IN.steer : IN.beta_hat]
+    z[7:] = x[IN.disturbance_1 : IN.disturbance_1 + len(z) - 7]
 
 
 @jit
 def _lqr_law(
     x: Any,
     state: Any,
+    action: Any,
     table: Any,
     axes: Any,
     scheduled: int,
     share: Any,
     authority: Any,
     slew: Any,
-    action: Any,
 ) -> None:
-    """x: wheels, torques, STATES, beta, gamma, disturbances, then stiffnesses if scheduled.
-
-    state: rad of steering last added, where the car steers.
-    """
+    """x: `Inputs`. state: rad of steering last added, where the car steers."""
     m, n = table.shape[3], table.shape[4] - table.shape[3]
     KS, z = np.empty((m, n + m)), np.empty(n)
     for row in range(len(x)):
-        v = 0.5 * (x[row, 0] + x[row, 1])
-        front = x[row, 1 + n + 2] if scheduled else 0.0
-        rear = x[row, 1 + n + 3] if scheduled else 0.0
+        v = 0.5 * (x[row, IN.wheel_left] + x[row, IN.wheel_right])
+        front = x[row, IN.front_stiffness] if scheduled else 0.0
+        rear = x[row, IN.rear_stiffness] if scheduled else 0.0
         interpolated(table, axes, v, front, rear, KS)
         predicted_state(x[row], share, z)
         u, w = 0.0, 0.0
@@ -87,6 +104,8 @@ class Lqr(Controller):
     python-control.
     """
 
+    more: tuple[str, ...] = ()  # entries that a subclass reads, behind `Inputs`
+
     def __init__(
         self,
         env: AnyEnv,
@@ -97,23 +116,20 @@ class Lqr(Controller):
         knots: int = 7,
         steer_weight: float = 1.0,
     ) -> None:
-        if not 0.0 < steer_weight < math.inf:
-            raise ValueError(f"steer_weight is positive, got {steer_weight!r}")
-        if not 0.0 < disturbance_time < math.inf:
-            raise ValueError(f"disturbance_time is positive, in s, got {disturbance_time!r}")
         if len(stiffness) not in (0, 2):
             raise ValueError(f"stiffness names two entries or none, got {list(stiffness)}")
         if not (0.0 < span[0] < span[1] < math.inf and knots >= 2):
             raise ValueError(f"span rises from above zero, with 2 knots or more: {span}, {knots}")
-        names = {entry.name for entry in given(env).layout}
+        names = entries_of(env)
         pairs = {"forces": ("F_d_hat", "N_d_hat"), "rates": ("d1_hat", "d2_hat")}
         kind = next((kind for kind, pair in pairs.items() if names.issuperset(pair)), "none")
+        instead = ("beta_ref", "beta_ref")
         self.needs = (
-            *("wheel_left", "wheel_right", "torque_left", "torque_right"),
-            *STATES,
-            *("beta_hat", "gamma_hat" if "gamma_hat" in names else "gyro"),
-            *pairs.get(kind, ()),
-            *stiffness,
+            *Inputs._fields[: IN.gamma_hat],
+            "gamma_hat" if "gamma_hat" in names else "gyro",
+            *pairs.get(kind, instead),
+            *(stiffness or instead),
+            *self.more,
         )
         super().__init__(env)
         car = self.nominal if vehicle is None else vehicle
@@ -124,18 +140,21 @@ class Lqr(Controller):
             self.width == 2,
             REFERENCES.index(self.reference),
             kind,
-            float(disturbance_time),
-            float(steer_weight),
+            positive("disturbance_time", disturbance_time),
+            positive("steer_weight", steer_weight),
         )
         fronts, rears = (
             tuple((own * np.geomspace(*span, knots)).tolist()) if stiffness else ()
             for own in (car.front_stiffness, car.rear_stiffness)
         )
         self.share = 0.5 * car.rear_track / car.wheel_radius / self.full_scale
-        self.vehicle, self.scheduled = car, len(stiffness) == 2
+        self.vehicle = car
         speeds = SPEEDS[::2] if stiffness else SPEEDS
         self.table = gain_table(car, self.purpose, speeds, fronts, rears)
         self.axes = tuple(np.array(axis) for axis in (speeds, fronts or (0.0,), rears or (0.0,)))
+        slew = car.steering_rate * self.control_period * TICK
+        scheduled = int(len(stiffness) == 2)
+        self._design = self.table, self.axes, scheduled, self.share, self.authority, slew
 
     def gains(self, speed: float, front: float = 0.0, rear: float = 0.0) -> Array:
         """K (m, n) at a speed in m/s, and at stiffnesses in N/rad where it is scheduled on them."""
@@ -144,21 +163,11 @@ class Lqr(Controller):
         return KS[:, : len(self.purpose.states)]
 
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
-        _lqr_law(
-            inputs,
-            state,
-            self.table,
-            self.axes,
-            int(self.scheduled),
-            self.share,
-            self.authority,
-            self.vehicle.steering_rate * self.control_period * TICK,
-            action,
-        )
+        _lqr_law(inputs, state, action, *self._design)
 
 
 @jit
-def _held(value: Any, low: Any, high: Any) -> Any:
+def _clipped(value: Any, low: Any, high: Any) -> Any:
     return min(max(value, low), high)
 
 
@@ -166,10 +175,10 @@ def _held(value: Any, low: Any, high: Any) -> Any:
 def best_within(
     s_uu: Any, s_uw: Any, s_ww: Any, u: Any, w: Any, most: Any, low: Any, high: Any
 ) -> Any:
-    """(u, w) with |u| <= most and low <= w <= high nearest to the given ones.
+    """The point with |u| <= most and low <= w <= high that is nearest to (u, w).
 
-    Nearest in du^2 s_uu + 2 du dw s_uw + dw^2 s_ww, positive definite. The given ones where they
-    are within; else the least of the four edges' own minima.
+    Nearest in du^2 s_uu + 2 du dw s_uw + dw^2 s_ww, positive definite: (u, w) itself where it is
+    within, else the least of the four edges' own minima.
     """
     if absolute(u) <= most and low <= w <= high:
         return u, w
@@ -177,10 +186,10 @@ def best_within(
     for edge in range(4):
         if edge < 2:
             a = most if edge == 0 else -most
-            b = _held(w - s_uw / s_ww * (a - u), low, high)
+            b = _clipped(w - s_uw / s_ww * (a - u), low, high)
         else:
             b = low if edge == 2 else high
-            a = _held(u - s_uw / s_uu * (b - w), -most, most)
+            a = _clipped(u - s_uw / s_uu * (b - w), -most, most)
         du, dw = a - u, b - w
         cost = du * du * s_uu + 2.0 * du * dw * s_uw + dw * dw * s_ww
         if least < 0.0 or cost < least:

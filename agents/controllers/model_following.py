@@ -7,53 +7,50 @@ that nothing is tabulated and no design tool is needed.
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from ...envs.backend.arrays import offsets
 from ...envs.backend.decorators import jit
 from ...envs.backend.primitives import maximum
+from ...envs.backend.rebuild import plain
 from ...envs.task.reference import REFERENCES, reference, target_of
 from ...envs.ticks import TICK
-from ...envs.vehicle.linear import bicycle_coefficients
 from ...envs.vehicle.vehicle import Vehicle
-from ..env_facts import AnyEnv, given
-from .base import Array, Controller
+from ..design.nominal_car import drift, inputs_for, nominal_car, plant_at, plant_of
+from ..env_facts import AnyEnv
+from .base import Array, Controller, entries_of, integrated
 
 SLOWEST = 2.0  # m/s: below it the vehicle is taken as at this speed
 BANDWIDTH = (5.0, 5.0)  # rad/s, K_beta and K_gamma of dakf-stability V.D
 
 
-def _car(vehicle: Vehicle) -> tuple[float, ...]:
-    """The vehicle as `bicycle_coefficients` takes it."""
-    return (
-        vehicle.mass,
-        vehicle.yaw_inertia,
-        vehicle.front_arm,
-        vehicle.rear_arm,
-        vehicle.front_stiffness,
-        vehicle.rear_stiffness,
-    )
+class Inputs(NamedTuple):
+    """Columns of the law's inputs; what the observation lacks is put in by `ModelFollowing`."""
+
+    wheel_left: Any
+    wheel_right: Any
+    steer_command: Any
+    beta_ref: Any
+    gamma_ref: Any
+    beta_hat: Any
+    gamma_hat: Any
+    d1_hat: Any
+    d2_hat: Any
 
 
-@jit
-def _plant(car: Any, v: Any) -> Any:
-    return bicycle_coefficients(car[0], car[1], car[2], car[3], car[4], car[5], v)
+class Memory(NamedTuple):
+    """The integrals in rad and N m, the last steering command, and whether there was one."""
+
+    delta_f: Any
+    N_z: Any
+    driver: Any
+    known: Any
 
 
-@jit
-def _drift(plant: Any, beta: Any, gamma: Any) -> Any:
-    """A [beta, gamma]."""
-    a11, a12, a21, a22, _, _, _ = plant
-    return a11 * beta + a12 * gamma, a21 * beta + a22 * gamma
-
-
-@jit
-def _inputs_for(plant: Any, first: Any, second: Any) -> Any:
-    """B^-1 [first, second]: the steering angle and yaw moment that have this effect, (26)."""
-    _, _, _, _, b11, b21, b22 = plant
-    delta_f = first / b11
-    return delta_f, (second - b21 * delta_f) / b22
+IN, _ = offsets(Inputs)
+LAST, _ = offsets(Memory)
 
 
 def feedback_gains(
@@ -66,25 +63,21 @@ def feedback_gains(
     internally stable where the nominal car is, below its critical speed. The printed (32) is this
     for equal K only.
     """
-    plant = _plant(_car(vehicle), float(speed))
+    plant = plant_of(nominal_car(vehicle), float(speed))
     columns = np.diag(np.asarray(bandwidth, np.float64))
-    P = [_inputs_for(plant, *column) for column in columns]
-    I = [_inputs_for(plant, *(-x for x in _drift(plant, *column))) for column in columns]  # noqa: E741
+    P = [_inputs(plant, *column) for column in columns]
+    I = [_inputs(plant, *(-x for x in _drift(plant, *column))) for column in columns]  # noqa: E741
     return np.array(P).T, np.array(I).T
 
 
-@jit
-def _integrated(memory: Any, step: Any, wanted: Any, held: Any) -> Any:
-    """The integral after a step, which is dropped where it would push further past the limit."""
-    if wanted == held or (wanted > held) != (step > 0.0):
-        return memory + step
-    return memory
+_drift, _inputs = plain(drift), plain(inputs_for)
 
 
 @jit
 def _model_following_law(
     x: Any,
     state: Any,
+    action: Any,
     car: Any,
     target: Any,
     kind: int,
@@ -93,36 +86,33 @@ def _model_following_law(
     full_scale: float,
     authority: float,
     dt: float,
-    action: Any,
 ) -> None:
-    """x: wheels, steer_command, beta_ref, gamma_ref, beta, gamma, d1, d2.
-
-    state: integrals in rad and N m, the last steering command, whether there was one.
-    """
+    """x: `Inputs`. state: `Memory`. K: K_beta, K_gamma."""
     for n in range(len(x)):
-        v = maximum(0.5 * (x[n, 0] + x[n, 1]), SLOWEST)
-        driver, beta_ref, gamma_ref = x[n, 2], x[n, 3], x[n, 4]
-        plant = _plant(car, v)
-        before = state[n, 2] if state[n, 3] > 0.0 else driver
+        v = maximum(0.5 * (x[n, IN.wheel_left] + x[n, IN.wheel_right]), SLOWEST)
+        driver, beta_ref, gamma_ref = x[n, IN.steer_command], x[n, IN.beta_ref], x[n, IN.gamma_ref]
+        plant = plant_at(car, v)
+        before = state[n, LAST.driver] if state[n, LAST.known] > 0.0 else driver
         old, new = reference(before, v, target, kind), reference(driver, v, target, kind)
-        drift = _drift(plant, beta_ref, gamma_ref)
-        p_beta, p_gamma = K[0] * (beta_ref - x[n, 5]), K[1] * (gamma_ref - x[n, 6])
+        moved = drift(plant, beta_ref, gamma_ref)
+        p_beta = K[0] * (beta_ref - x[n, IN.beta_hat])
+        p_gamma = K[1] * (gamma_ref - x[n, IN.gamma_hat])
         # (28) by the references' derivatives, P of (31), and (26) at once: B^-1 is linear
-        delta_f, N_z = _inputs_for(
+        delta_f, N_z = inputs_for(
             plant,
-            (new[0] - old[0]) / dt - drift[0] + p_beta - rejection * x[n, 7],
-            (new[1] - old[1]) / dt - drift[1] + p_gamma - rejection * x[n, 8],
+            (new[0] - old[0]) / dt - moved[0] + p_beta - rejection * x[n, IN.d1_hat],
+            (new[1] - old[1]) / dt - moved[1] + p_gamma - rejection * x[n, IN.d2_hat],
         )
-        delta_f, N_z = delta_f + state[n, 0], N_z + state[n, 1]  # (33)
-        delta_held = min(max(delta_f, driver - authority), driver + authority)
-        N_held = min(max(N_z, -full_scale), full_scale)
-        drift = _drift(plant, p_beta, p_gamma)
-        steps = _inputs_for(plant, -drift[0] * dt, -drift[1] * dt)  # I of (31), forward Euler
-        state[n, 0] = _integrated(state[n, 0], steps[0], delta_f, delta_held)
-        state[n, 1] = _integrated(state[n, 1], steps[1], N_z, N_held)
-        state[n, 2], state[n, 3] = driver, 1.0
-        action[n, 0] = N_held / full_scale
-        action[n, 1] = (delta_held - driver) / authority
+        delta_f, N_z = delta_f + state[n, LAST.delta_f], N_z + state[n, LAST.N_z]  # (33)
+        steer = min(max(delta_f, driver - authority), driver + authority)
+        moment = min(max(N_z, -full_scale), full_scale)
+        moved = drift(plant, p_beta, p_gamma)
+        steps = inputs_for(plant, -moved[0] * dt, -moved[1] * dt)  # I of (31), forward Euler
+        state[n, LAST.delta_f] = integrated(state[n, LAST.delta_f], steps[0], delta_f, steer)
+        state[n, LAST.N_z] = integrated(state[n, LAST.N_z], steps[1], N_z, moment)
+        state[n, LAST.driver], state[n, LAST.known] = driver, 1.0
+        action[n, 0] = moment / full_scale
+        action[n, 1] = (steer - driver) / authority
 
 
 class ModelFollowing(Controller):
@@ -133,27 +123,15 @@ class ModelFollowing(Controller):
     are the env's; their derivatives are those of the driver's steering at the measured speed, whose
     noise would drown a difference of references.
 
-    Memory: the two integrals, the last steering command, and whether there was one. Anti-windup is
-    conditional integration, each input for itself: an integral holds while its input is at the
-    limit (yaw moment: full scale; steering: the authority around the driver's) and the error would
-    push it further out.
+    Memory: `Memory`. Anti-windup is conditional integration, each input for itself: an integral
+    holds while its input is at the limit (yaw moment: full scale; steering: the authority around
+    the driver's) and the error would push it further out.
 
     Raises ValueError for an env whose action does not steer, a bandwidth that is not two positive
     numbers, or an observation without a needed entry.
     """
 
-    needs: tuple[str, ...] = (
-        "wheel_left",
-        "wheel_right",
-        "steer_command",
-        "beta_ref",
-        "gamma_ref",
-        "beta_hat",
-        "gamma_hat",
-        "d1_hat",
-        "d2_hat",
-    )
-    memory = 4
+    memory = len(Memory._fields)
 
     def __init__(
         self,
@@ -161,35 +139,26 @@ class ModelFollowing(Controller):
         bandwidth: Sequence[float] = BANDWIDTH,
         rejection: bool = True,
     ) -> None:
-        names = {entry.name for entry in given(env).layout}
-        instead = {} if "gamma_hat" in names else {"gamma_hat": "gyro"}
+        instead = {} if "gamma_hat" in entries_of(env) else {"gamma_hat": "gyro"}
         if not rejection:  # whatever stands there is multiplied by zero
             instead |= {"d1_hat": "beta_ref", "d2_hat": "gamma_ref"}
-        self.needs = tuple(instead.get(name, name) for name in self.needs)
+        self.needs = tuple(instead.get(name, name) for name in Inputs._fields)
         super().__init__(env)
         if self.width != 2:
             raise ValueError("ModelFollowing needs an env whose action steers (steering=True)")
         K = [float(each) for each in bandwidth]
         if len(K) != 2 or not all(0.0 < each < math.inf for each in K):
             raise ValueError(f"bandwidth is two positive numbers in rad/s, got {bandwidth!r}")
-        self.bandwidth = np.array(K)
-        self.rejection = bool(rejection)
-        self.dt = self.control_period * TICK
-        self._car = np.array(_car(self.nominal))
-        self._target = target_of(self.nominal)
-        self._kind = REFERENCES.index(self.reference)
-
-    def _law(self, inputs: Array, state: Array, action: Array) -> None:
-        _model_following_law(
-            inputs,
-            state,
-            self._car,
-            self._target,
-            self._kind,
-            self.bandwidth,
-            float(self.rejection),
+        self._design = (
+            nominal_car(self.nominal),
+            target_of(self.nominal),
+            REFERENCES.index(self.reference),
+            np.array(K),
+            float(rejection),
             self.full_scale,
             self.authority,
-            self.dt,
-            action,
+            self.control_period * TICK,
         )
+
+    def _law(self, inputs: Array, state: Array, action: Array) -> None:
+        _model_following_law(inputs, state, action, *self._design)

@@ -15,7 +15,7 @@ from ..design.gain_schedule import SPEEDS
 from ..design.sampled_model import Purpose, design_model
 from ..env_facts import AnyEnv
 from .base import Array
-from .lqr import Lqr, predicted_state
+from .lqr import IN, Lqr, predicted_state
 
 STEP = 10  # ticks, the shortest of the prediction
 NOT_FINITE = "the observation is not finite"
@@ -49,10 +49,10 @@ class Mpc(Lqr):
     horizon: steps of a control period, or of 10 ms where that is shorter. iterations: the solver's
     most. disturbance_time: of `lqr`.
 
-    `status` says for each row of the last call "solved", "solved inaccurate" (ten times the
-    tolerance of 1e-4 of full scale) or why there is no solution: then the row's action is NaN.
-    `solve_time` is how long the solver took for each, s. Memory: the last share of added steering,
-    and the last solution, which the next one starts from.
+    status: of each row of the last call, "solved", "solved inaccurate" (ten times the tolerance of
+    1e-4 of full scale) or why there is no solution: then the row's action is NaN. solve_time: of
+    the solver for each, s. Memory: the last share of added steering, and the last solution, which
+    the next one starts from.
 
     Raises ModuleNotFoundError without the extras `mpc` and `design`, ValueError for a missing entry
     or an option out of range.
@@ -112,24 +112,25 @@ class Mpc(Lqr):
         episode_start: npt.NDArray[np.bool_] | None = None,
         deterministic: bool = True,
     ) -> tuple[npt.NDArray[np.float32], Array]:
-        """As every controller's; rows without a solution have NaN, and `status` says why."""
+        """As every controller's; rows without a solution have NaN, `status` has the reason."""
         shares, memory = super().predict(observation, state, episode_start, deterministic)
         for i, row in enumerate(shares.reshape(-1, self.width)):
             if np.isnan(row).any() and self.status[i].startswith("solved"):
                 self.status[i] = NOT_FINITE
         return shares, memory
 
-    def _law(self, inputs: Array, state: Array, action: npt.NDArray[np.float64]) -> None:
+    def _law(self, inputs: Array, state: Array, action: Array) -> None:
         self.status, self.solve_time = [], []
         z = np.empty(len(self.purpose.states))
         for x, memory, chosen in zip(inputs, state, action, strict=True):
             predicted_state(x, self.share, z)
-            said, seconds = self._solve(0.5 * (x[0] + x[1]), z, memory, chosen)
-            self.status.append(said)
+            speed = 0.5 * (x[IN.wheel_left] + x[IN.wheel_right])
+            status, seconds = self._solve(speed, z, memory, chosen)
+            self.status.append(status)
             self.solve_time.append(seconds)
 
     def _solve(self, speed: float, z: Array, memory: Array, chosen: Array) -> tuple[str, float]:
-        """Fill the action `chosen` (m,) and the memory of a row; what the solver said and took."""
+        """Fill the action `chosen` (m,) and the memory of a row; the solver's status and time."""
         m, count = self.width, self.horizon * self.width
         low, high = -np.ones(self._rows), np.ones(self._rows)
         if m > 1:

@@ -5,26 +5,50 @@ front wheel speeds: the feedforward by its formula, the PI on a grid of speeds.
 """
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from ...envs.backend.arrays import offsets
 from ...envs.backend.decorators import jit
 from ...envs.backend.primitives import absolute, maximum, select
 from ...envs.ticks import TICK
 from ...envs.vehicle.vehicle import COMS, Vehicle
+from ..design.nominal_car import CAR, nominal_car
 from ..design.pi import COMS_PI, PLACEMENTS, POLE, design_pi, sample_pi
 from ..env_facts import AnyEnv
-from .base import Array, Controller
+from .base import Array, Controller, integrated
 
 SLOWEST = 2.0  # m/s: gains below it are those of this speed
 SPEEDS = np.arange(SLOWEST, 61.0, 0.5)  # m/s
 CAMERA_PERIOD = 0.033  # s
 
 
+class Inputs(NamedTuple):
+    """Columns of the laws' inputs; the feedforward reads the first three alone."""
+
+    wheel_left: Any
+    wheel_right: Any
+    steer_command: Any
+    beta_hat: Any
+    beta_ref: Any
+
+
+class Memory(NamedTuple):
+    """The integral in N m, the decisions until the next update, the share held until then."""
+
+    integral: Any
+    wait: Any
+    share: Any
+
+
+IN, _ = offsets(Inputs)
+LAST, _ = offsets(Memory)
+
+
 @jit
 def _static_gain(car: Any, V: Any) -> Any:
-    m, l_f, l_r, C_f, C_r = car[0], car[1], car[2], car[3], car[4]
+    m, l_f, l_r, C_f, C_r = car[CAR.m], car[CAR.l_f], car[CAR.l_r], car[CAR.C_f], car[CAR.C_r]
     mV2 = m * V * V
     numerator = 4.0 * l_r * (l_f + l_r) * C_f * C_r - 2.0 * l_f * C_f * mV2
     denominator = mV2 + 2.0 * (l_f * C_f - l_r * C_r)
@@ -34,26 +58,13 @@ def _static_gain(car: Any, V: Any) -> Any:
     return numerator / denominator  # tie-vision (24)
 
 
-def _car(vehicle: Vehicle) -> Array:
-    """m, l_f, l_r, C_f, C_r as `_static_gain` takes them."""
-    return np.array(
-        [
-            vehicle.mass,
-            vehicle.front_arm,
-            vehicle.rear_arm,
-            vehicle.front_stiffness,
-            vehicle.rear_stiffness,
-        ]
-    )
-
-
 def feedforward_gain(vehicle: Vehicle, speed: float) -> float:
     """C_FF in N m/rad: the yaw moment per steering angle that brings static slip to zero.
 
     Where the yaw moment has no static effect on beta (m V^2 = 2 (l_r C_r - l_f C_f), which exists
     for understeering cars only) the gain is limited to what 5 % of the terms would give.
     """
-    return float(_static_gain(_car(vehicle), float(speed)))
+    return float(_static_gain(nominal_car(vehicle), float(speed)))
 
 
 def _pi_table(
@@ -69,8 +80,7 @@ def _pi_table(
         if vehicle.name != COMS.name or pole != POLE or placement != PLACEMENTS[0]:
             raise ModuleNotFoundError(
                 "designing two-dof for another car or pole than the shipped one needs "
-                "python-control: "
-                "pip install 'sideslip[design]'"
+                "python-control: pip install 'sideslip[design]'"
             ) from None
         gains = [COMS_PI] * len(SPEEDS)
     return gain * np.array([(each.k_p, each.k_i) for each in gains])
@@ -85,54 +95,55 @@ def _scheduled(table: Any, v: Any) -> Any:
 
 
 @jit
-def _feedforward_law(x: Any, car: Any, full_scale: float, action: Any) -> None:
+def _feedforward_law(x: Any, action: Any, car: Any, full_scale: float) -> None:
     for n in range(len(x)):
-        v = 0.5 * (x[n, 0] + x[n, 1])
-        action[n, 0] = _static_gain(car, maximum(v, SLOWEST)) * x[n, 2] / full_scale
+        v = 0.5 * (x[n, IN.wheel_left] + x[n, IN.wheel_right])
+        gain = _static_gain(car, maximum(v, SLOWEST))
+        action[n, 0] = gain * x[n, IN.steer_command] / full_scale
 
 
 @jit
 def _two_dof_law(
     x: Any,
     state: Any,
+    action: Any,
     car: Any,
     k_p: Any,
     k_i: Any,
     full_scale: float,
     wait: int,
     dt: float,
-    action: Any,
 ) -> None:
-    """state: integral in N m, decisions until the next update, the action now held."""
+    """x: `Inputs`. state: `Memory`."""
     for n in range(len(x)):
-        if state[n, 1] > 0.0:
-            state[n, 1] -= 1.0
-            action[n, 0] = state[n, 2]
+        if state[n, LAST.wait] > 0.0:
+            state[n, LAST.wait] -= 1.0
+            action[n, 0] = state[n, LAST.share]
             continue
-        v = 0.5 * (x[n, 0] + x[n, 1])
-        error = x[n, 4] - x[n, 3]
-        forward = _static_gain(car, maximum(v, SLOWEST)) * x[n, 2]
-        wanted = forward + _scheduled(k_p, v) * error + state[n, 0]
-        held = min(max(wanted, -full_scale), full_scale)
+        v = 0.5 * (x[n, IN.wheel_left] + x[n, IN.wheel_right])
+        error = x[n, IN.beta_ref] - x[n, IN.beta_hat]
+        forward = _static_gain(car, maximum(v, SLOWEST)) * x[n, IN.steer_command]
+        integral = state[n, LAST.integral]
+        wanted = forward + _scheduled(k_p, v) * error + integral
+        N_z = min(max(wanted, -full_scale), full_scale)
         step = _scheduled(k_i, v) * error * dt  # forward Euler
-        if wanted == held or (wanted > held) != (step > 0.0):  # else it would wind up further
-            state[n, 0] += step
-        state[n, 1] = wait - 1.0
-        state[n, 2] = held / full_scale
-        action[n, 0] = state[n, 2]
+        state[n, LAST.integral] = integrated(integral, step, wanted, N_z)
+        state[n, LAST.wait] = wait - 1.0
+        state[n, LAST.share] = N_z / full_scale
+        action[n, 0] = state[n, LAST.share]
 
 
 class Feedforward(Controller):
     """The yaw moment of tie-vision (24) for the driver's steering command."""
 
-    needs = ("wheel_left", "wheel_right", "steer_command")
+    needs = Inputs._fields[: IN.beta_hat]
 
     def __init__(self, env: AnyEnv) -> None:
         super().__init__(env)
-        self.car = _car(self.nominal)
+        self._design = nominal_car(self.nominal), self.full_scale
 
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
-        _feedforward_law(inputs, self.car, self.full_scale, action)
+        _feedforward_law(inputs, action, *self._design)
 
 
 class TwoDof(Controller):
@@ -141,14 +152,13 @@ class TwoDof(Controller):
     rate: "control" updates at every decision of the env, "camera" every 33 ms (held between;
     for a control period that is no divisor of it, the next decision). gain: a factor on the PI.
     pole (rad/s), placement: of `design_pi`. sampled: place the poles of the loop as sampled at
-    that rate (`sample_pi`) instead of the continuous one's. Memory: the integral, the decisions
-    until the next update, the held action.
+    that rate (`sample_pi`) instead of the continuous one's. Memory: `Memory`.
 
     Raises ValueError for an unknown rate or placement or an env whose observation lacks beta_hat.
     """
 
-    needs = ("wheel_left", "wheel_right", "steer_command", "beta_hat", "beta_ref")
-    memory = 3
+    needs = Inputs._fields
+    memory = len(Memory._fields)
 
     def __init__(
         self,
@@ -163,21 +173,12 @@ class TwoDof(Controller):
         if rate not in ("control", "camera"):
             raise ValueError(f"rate is 'control' or 'camera', got {rate!r}")
         period = self.control_period * TICK
-        self.wait = 1 if rate == "control" else max(1, math.ceil(CAMERA_PERIOD / period - 1e-9))
-        self.dt = self.wait * period
-        self.car = _car(self.nominal)
-        table = _pi_table(self.nominal, gain, pole, placement, self.dt if sampled else None)
+        wait = 1 if rate == "control" else max(1, math.ceil(CAMERA_PERIOD / period - 1e-9))
+        dt = wait * period
+        table = _pi_table(self.nominal, gain, pole, placement, dt if sampled else None)
         self.k_p, self.k_i = np.ascontiguousarray(table.T)
+        car = nominal_car(self.nominal)
+        self._design = car, self.k_p, self.k_i, self.full_scale, wait, dt
 
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
-        _two_dof_law(
-            inputs,
-            state,
-            self.car,
-            self.k_p,
-            self.k_i,
-            self.full_scale,
-            self.wait,
-            self.dt,
-            action,
-        )
+        _two_dof_law(inputs, state, action, *self._design)

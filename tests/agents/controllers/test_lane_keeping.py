@@ -103,7 +103,7 @@ def test_without_the_moment_it_only_steers() -> None:
 
 def test_bad_input() -> None:
     env = env_of(0.02)
-    with pytest.raises(ValueError, match="curvature_time is positive"):
+    with pytest.raises(ValueError, match="curvature_time is a positive number"):
         make_agent("lane-keeping", env, curvature_time=0.0)
     with pytest.raises(ValueError, match="haste is zero or more"):
         make_agent("lane-keeping", env, haste=-1.0)

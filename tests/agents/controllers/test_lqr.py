@@ -211,7 +211,7 @@ def test_disturbances_and_gyro_are_read_where_they_are() -> None:
 def test_bad_input(steered: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ValueError, match=r"beta_hat.*EstimateObservation"):
         make_agent("lqr", gym.make("sideslip/YawFusion-v0"))
-    with pytest.raises(ValueError, match="disturbance_time is positive"):
+    with pytest.raises(ValueError, match="disturbance_time is a positive number"):
         make_agent("lqr", steered, disturbance_time=0.0)
     with pytest.raises(ValueError, match="names two entries or none"):
         make_agent("lqr", steered, stiffness=["a"])

@@ -8,6 +8,7 @@ import pytest
 
 from sideslip.agents import make_agent
 from sideslip.agents.controllers.sliding_mode import SlidingMode, surface
+from sideslip.agents.design.nominal_car import Plant
 from sideslip.envs import COMS, critical_speed
 from sideslip.envs.vehicle.linear import bicycle
 from sideslip.estimators import EstimateObservation
@@ -35,9 +36,9 @@ def agent_of(env: Any, **options: float) -> SlidingMode:
     return agent
 
 
-def coefficients(speed: float) -> tuple[float, ...]:
+def coefficients(speed: float) -> Plant:
     A, B = bicycle(COMS, speed).A, bicycle(COMS, speed).B
-    return A[0, 0], A[0, 1], A[1, 0], A[1, 1], B[0, 0], B[1, 0], B[1, 1]
+    return Plant(A[0, 0], A[0, 1], A[1, 0], A[1, 1], B[0, 0], B[1, 0], B[1, 1])
 
 
 @pytest.mark.parametrize("reference", ["model", "zero-slip"])

@@ -1,0 +1,73 @@
+"""The nominal car in compiled laws: its numbers by name, and its bicycle model at a speed."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from ...envs.backend.arrays import offsets
+from ...envs.backend.decorators import jit
+from ...envs.backend.rebuild import plain
+from ...envs.vehicle.linear import bicycle_coefficients
+from ...envs.vehicle.vehicle import Vehicle
+
+Array = npt.NDArray[np.float64]
+
+
+class NominalCar(NamedTuple):
+    """A vehicle as laws read it, an array at these indices: SI units, stiffness per tyre."""
+
+    m: Any
+    I: Any  # noqa: E741
+    l_f: Any
+    l_r: Any
+    C_f: Any
+    C_r: Any
+
+
+CAR, _ = offsets(NominalCar)
+
+
+class Plant(NamedTuple):
+    """A and B of tie-vision (8): beta and gamma, from the steering angle and the yaw moment."""
+
+    a11: Any
+    a12: Any
+    a21: Any
+    a22: Any
+    b11: Any
+    b21: Any
+    b22: Any
+
+
+def nominal_car(vehicle: Vehicle) -> Array:
+    """The numbers of `NominalCar`, (6,)."""
+    v = vehicle
+    numbers = v.mass, v.yaw_inertia, v.front_arm, v.rear_arm, v.front_stiffness, v.rear_stiffness
+    return np.array(NominalCar(*numbers))
+
+
+@jit
+def plant_at(car: Any, V: Any) -> Any:
+    """The plant at a speed in m/s."""
+    a11, a12, a21, a22, b11, b21, b22 = bicycle_coefficients(
+        car[CAR.m], car[CAR.I], car[CAR.l_f], car[CAR.l_r], car[CAR.C_f], car[CAR.C_r], V
+    )
+    return Plant(a11, a12, a21, a22, b11, b21, b22)
+
+
+plant_of = plain(plant_at)
+"""`plant_at` for designs, in Python."""
+
+
+@jit
+def drift(plant: Any, beta: Any, gamma: Any) -> Any:
+    """A [beta, gamma]."""
+    return plant.a11 * beta + plant.a12 * gamma, plant.a21 * beta + plant.a22 * gamma
+
+
+@jit
+def inputs_for(plant: Any, first: Any, second: Any) -> Any:
+    """B^-1 [first, second]: steering angle and yaw moment of this effect, dakf-stability (26)."""
+    delta_f = first / plant.b11
+    return delta_f, (second - plant.b21 * delta_f) / plant.b22
