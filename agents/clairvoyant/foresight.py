@@ -1,4 +1,4 @@
-"""An episode known before it begins: what the driver, the wind and the disturbances will do."""
+"""Forecast of an episode before it begins: driver, wind and disturbances, step by step."""
 
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -8,11 +8,12 @@ import numpy.typing as npt
 
 from ...envs.backend.arrays import read
 from ...envs.backend.rebuild import plain
-from ...envs.engine.layout import Drive, P, Switches, Task, Z
-from ...envs.engine.step import step_vehicle
+from ...envs.engine.layout import Drive, P, Task, Z
+from ...envs.engine.step import kind_of, step_vehicle
+from ...envs.engine.tick import Kind
 from ...envs.engine.window import scratch_of
 from ...envs.scenarios.speed import Pace, acceleration_command
-from ...envs.scenarios.steering import DRIVER, steering_at
+from ...envs.scenarios.steering import steering_at
 from ...envs.scenarios.wind import wind_at
 from ...envs.task.info import REPORT
 from ...envs.task.reference import Target
@@ -24,9 +25,10 @@ Array = npt.NDArray[np.float64]
 
 
 class Known(NamedTuple):
-    """What is known of one step of the plan; its `command` and `weight` are of the step's start."""
+    """Inputs and parameters of one step of the plan that no action changes; `command` and `weight`
+    are of the step's start."""
 
-    steer_start: Any  # rad, front steering angle without what is added
+    steer_start: Any  # rad, front steering angle without the added one
     steer_middle: Any
     steer_end: Any
     command: Any  # rad, the driver's
@@ -37,13 +39,13 @@ class Known(NamedTuple):
     C_r: Any
     mu: Any
     mu_r: Any
-    speed: Any  # m/s, the driver's wish
+    speed: Any  # m/s, the driver's set point
     ahead: Any  # m/s2, the driver's acceleration, fed forward
     weight: Any  # s for which the cost rate at the start counts
 
 
 class State(NamedTuple):
-    """What a plan may have to carry from step to step: motion, actuators, the driver's integral."""
+    """States of a plan: motion, actuators, the driver's integral."""
 
     v_x: Any
     v_y: Any
@@ -64,11 +66,11 @@ class State(NamedTuple):
 
 
 class Fixed(NamedTuple):
-    """What does not change within an episode; hashable, so that it can name a solver.
+    """Parameters that are constant within an episode; hashable, so that they are a solver's key.
 
-    car: with zeros for what `Known` tells. motor, steering: of a step; motor_tick, steering_tick:
-    of a tick. ticks: of a step. steps: in a control period. periods: of the episode. width: of
-    the action.
+    car: with zeros for the fields of `Known`. motor, steering: of a step; motor_tick,
+    steering_tick: of a tick. ticks: of a step. steps: in a control period. periods: of the
+    episode. width: of the action.
     """
 
     car: Car
@@ -80,7 +82,7 @@ class Fixed(NamedTuple):
     steering_tick: Lag
     target: Target
     task: Task
-    switches: Switches
+    kind: Kind
     width: int
     ticks: int
     steps: int
@@ -88,7 +90,7 @@ class Fixed(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Foreseen:
+class Forecast:
     """An episode as a plan sees it.
 
     known: (len(Known), periods * steps + 1), the last column of the episode's end. start: the
@@ -101,12 +103,12 @@ class Foreseen:
     driver: Array
 
 
-def foresee(base: Any, steps: int = 1, actions: Array | None = None) -> Foreseen:
+def forecast_of(base: Any, steps: int = 1, actions: Array | None = None) -> Forecast:
     """The rest of an episode that was just reset.
 
     base: the unwrapped env at tick 0. steps: of the plan in one control period, which they divide.
-    actions: (K, width), none: zero; a driver who reacts to the car is foreseen to steer as in the
-    run of these actions. Raises ValueError where steps do not divide it, and for an env that is not
+    actions: (K, width), none: zero; a driver who reacts to the car steers as in the run of these
+    actions. Raises ValueError where steps do not divide it, and for an env that is not
     at the start of an episode.
     """
     n = base.control_period
@@ -115,7 +117,7 @@ def foresee(base: Any, steps: int = 1, actions: Array | None = None) -> Foreseen
     snapshot = base.get_state()
     p, z = snapshot["params"], snapshot["state"]
     if z[Z.clock.tick] != 0.0:
-        raise ValueError("an episode is foreseen from its start: call reset() first")
+        raise ValueError("a forecast starts at an episode's start: call reset() first")
     start = state_of(z)
     fixed = _fixed(base, p, snapshot["template"].switches, n // steps, steps)
     ticks = fixed.periods * n
@@ -123,11 +125,13 @@ def foresee(base: Any, steps: int = 1, actions: Array | None = None) -> Foreseen
         actions = np.zeros((fixed.periods, fixed.width))
     drive, driver = _driven(base, snapshot, actions, n)
     programme = read(p, P.programme)
-    reacts = fixed.switches.steering == DRIVER
     every = range(ticks + 1)
-    command = driver if reacts else np.array([steering_at(float(k), programme) for k in every])
+    if fixed.kind.follows:
+        command = driver
+    else:
+        command = np.array([steering_at(float(k), programme) for k in every])
     known = _known(p, fixed, drive, command)
-    return Foreseen(fixed, known, start, command[:-1].reshape(-1, n))
+    return Forecast(fixed, known, start, command[:-1].reshape(-1, n))
 
 
 def state_of(z: Array) -> State:
@@ -150,7 +154,7 @@ def _fixed(base: Any, p: Array, switches: Any, ticks: int, steps: int) -> Fixed:
         lag_of(steering, TICK),
         read(p, P.target),
         task,
-        Switches(*np.asarray(switches).tolist()),
+        plain(kind_of)(p, switches),
         base.action_space.shape[0],
         ticks,
         steps,
@@ -161,7 +165,7 @@ def _fixed(base: Any, p: Array, switches: Any, ticks: int, steps: int) -> Fixed:
 def _driven(base: Any, snapshot: Any, actions: Array, n: int) -> tuple[Array, Array]:
     """(K n + 1, len(Drive)) and the driver's angle (K n + 1,): the env's own ticks under actions.
 
-    Disturbances, and a programme's front wheels without what is added, do not depend on them.
+    Disturbances, and a programme's front wheels without the added angle, do not depend on them.
     """
     p, z = snapshot["params"], snapshot["state"]
     bounds = np.array([[entry.low, entry.high] for entry in base.layout]).T.copy()
@@ -174,8 +178,7 @@ def _driven(base: Any, snapshot: Any, actions: Array, n: int) -> tuple[Array, Ar
     for tick in range(ticks + 1):
         drive[tick] = read(z, Z.drive)
         driver[tick] = z[Z.driver]
-        told = (bounds, obs, rows, packets, report, scratch)
-        step_vehicle(p, z, switches, taken[tick], 1, *told)
+        step_vehicle(p, z, switches, taken[tick], 1, bounds, obs, rows, packets, report, scratch)
     return np.nan_to_num(drive), np.nan_to_num(driver)  # a car thrown about may leave the numbers
 
 
@@ -187,7 +190,7 @@ def _known(p: Array, fixed: Fixed, drive: Array, command: Array) -> Array:
     angle = drive[:, names.index("delta_f")] - drive[:, names.index("added")]
 
     def wheels(ticks: Any, rest: float) -> Array:
-        """The front wheels without what is added, once `rest` of a tick's deviation is left."""
+        """The front wheels without the added angle, once `rest` of a tick's deviation is left."""
         return np.asarray(plain(lagged)(command[ticks], angle[ticks], rest))
 
     lag, middle = fixed.steering_tick, at + q // 2
@@ -197,7 +200,7 @@ def _known(p: Array, fixed: Fixed, drive: Array, command: Array) -> Array:
         [drive[:last, names.index("F_d")], drive[:last, names.index("N_d")], np.zeros(last)]
     )
     push = (forces + blown).reshape(-1, q, 3).mean(axis=1)
-    pace = np.array([_wish(float(tick), read(p, P.pace)) for tick in at])
+    pace = np.array([_set_point(float(tick), read(p, P.pace)) for tick in at])
     car, change = read(p, P.car), read(p, P.change)
     worn = at >= change.tick
     tyres = [
@@ -216,7 +219,7 @@ def _known(p: Array, fixed: Fixed, drive: Array, command: Array) -> Array:
         _weights(at, fixed),
     )
     known = np.array(Known._make(table))
-    end = known[:, -1:].copy()  # of the episode's end only command and weight are looked at
+    end = known[:, -1:].copy()  # of the episode's end only command and weight count
     end[Known._fields.index("command")] = command[last]
     end[Known._fields.index("weight")] = (
         0.5 * (q + 1) * TICK if last == fixed.task.duration else 0.0
@@ -224,8 +227,8 @@ def _known(p: Array, fixed: Fixed, drive: Array, command: Array) -> Array:
     return np.hstack([known, end])
 
 
-def _wish(tick: float, pace: Pace) -> tuple[float, float]:
-    """(speed in m/s, acceleration in m/s2 fed forward) that the driver wants at a tick."""
+def _set_point(tick: float, pace: Pace) -> tuple[float, float]:
+    """The driver's (speed in m/s, acceleration in m/s2 fed forward) at a tick."""
     bare = pace._replace(hold=1.0, k_p=0.0, k_i=0.0)
     ahead = acceleration_command(tick, 0.0, 0.0, bare, np.inf)[0]
     both = acceleration_command(tick, 0.0, 0.0, bare._replace(k_p=1.0), np.inf)[0]
@@ -235,7 +238,7 @@ def _wish(tick: float, pace: Pace) -> tuple[float, float]:
 def _weights(at: npt.NDArray[np.int_], fixed: Fixed) -> Array:
     """Seconds for which the cost rate at each step's start stands in the sum over ticks 1 .. T.
 
-    The sum over every q-th tick by the trapezoid rule, its end kept apart; exact for q = 1.
+    The sum over every q-th tick by the trapezoid rule, its end apart; exact for q = 1.
     """
     q = fixed.ticks
     weights = np.where(at < fixed.task.duration, q * TICK, 0.0)

@@ -1,6 +1,6 @@
-"""The ceiling: what a driver who knows the car, the road and every disturbance ahead would do.
+"""The ceiling: the best actions for a known car, road and every disturbance ahead.
 
-A plan is solved for the whole episode and scored by what its actions cost in the real env, not by
+A plan is solved for the whole episode and scored by the cost of its actions in the real env, not by
 its own objective. On the nonlinear plant it is a local optimum, solved from several starts.
 """
 
@@ -14,12 +14,11 @@ import numpy as np
 import numpy.typing as npt
 
 from ...envs.engine.layout import P
-from ...envs.scenarios.steering import DRIVER
 from ...envs.task.reference import reference
 from ...envs.vehicle.vehicle import GRAVITY
 from ..controllers.base import Controller
 from ..rollout import steps_of
-from .foresight import Foreseen, Known, State, foresee, state_of
+from .foresight import Forecast, Known, State, forecast_of, state_of
 from .qp import is_linear, solve_linear
 from .shooting import Solution, Trajectory, solve, tracking_gains
 
@@ -36,8 +35,8 @@ AGREEMENT = 5e-3  # between a solved plan's cost and objective: nothing is left 
 class Plan:
     """Actions (K, width) for an episode, the best run that a start led to.
 
-    cost: of the run in the env. objective: what the solver expected of it, without the cap on the
-    cost rate. status: the solver's return text. seconds: of CPU time.
+    cost: of the run in the env. objective: the solver's, without the cap on the cost
+    rate. status: the solver's return text. seconds: of CPU time.
     """
 
     actions: Actions
@@ -49,7 +48,7 @@ class Plan:
 
 @dataclass(frozen=True)
 class Run:
-    """What the env made of actions."""
+    """The env's run of actions."""
 
     trajectory: Trajectory
     cost: float
@@ -68,8 +67,8 @@ def drive(
     for k in range(len(taken)):
         if follow is not None:
             planned, gains = follow
-            wish = actions[k] - gains[k] @ (states[k] - planned[k])
-            taken[k] = np.clip(wish, -1.0, 1.0)
+            corrected = actions[k] - gains[k] @ (states[k] - planned[k])
+            taken[k] = np.clip(corrected, -1.0, 1.0)
         _, reward, terminated, truncated, _ = env.step(taken[k])
         cost -= float(reward)
         states[k + 1 :] = state_of(base.get_state()["state"])
@@ -80,7 +79,7 @@ def drive(
 
 
 def replay(env: gym.Env[Any, Any], seed: int, actions: npt.ArrayLike) -> float:
-    """The cost of an episode with given actions (K, width) in the env."""
+    """The cost of actions (K, width) in an episode of the env."""
     return drive(env, seed, np.asarray(actions, np.float64)).cost
 
 
@@ -93,42 +92,41 @@ def plan(env: gym.Env[Any, Any], seed: int, start: npt.ArrayLike | None = None) 
     env.reset(seed=seed)
     base: Any = env.unwrapped
     linear = is_linear(base)
-    foreseen = foresee(base, base.control_period if linear else 1)
-    reacts = foreseen.fixed.switches.steering == DRIVER
-    shape = (foreseen.fixed.periods, foreseen.fixed.width)
+    forecast = forecast_of(base, base.control_period if linear else 1)
+    shape = (forecast.fixed.periods, forecast.fixed.width)
     actions = np.zeros(shape) if start is None else np.asarray(start, np.float64)
     if actions.shape != shape:
         raise ValueError(f"a plan of this episode has shape {shape}, got {actions.shape}")
-    if reacts and start is not None:
-        foreseen = foresee(base, 1, actions)
+    if forecast.fixed.kind.follows and start is not None:
+        forecast = forecast_of(base, 1, actions)
     if linear:
-        made, objective, status = solve_linear(foreseen)
+        made, objective, status = solve_linear(forecast)
         best = drive(env, seed, made)
     else:
-        best, objective, status = _search(env, seed, foreseen, actions, start is None)
+        best, objective, status = _search(env, seed, forecast, actions, start is None)
     taken = best.trajectory.actions.astype(np.float32)
     return Plan(taken, best.cost, objective, status, time.process_time() - began)
 
 
 def _search(
-    env: gym.Env[Any, Any], seed: int, foreseen: Foreseen, actions: Array, free: bool
+    env: gym.Env[Any, Any], seed: int, forecast: Forecast, actions: Array, free: bool
 ) -> tuple[Run, float, str]:
     """The best run of the plans from a start, with the objective and status of its plan.
 
     free: whether the plan may start elsewhere where IPOPT does not finish from the actions' run.
     """
-    found = solve(foreseen, drive(env, seed, actions).trajectory)
+    found = solve(forecast, drive(env, seed, actions).trajectory)
     if free and not found.solved:
-        found = _from_grip(foreseen)
-    best, objective, status = _follow(env, seed, foreseen, found), found.objective, found.status
+        found = _from_grip(forecast)
+    best, objective, status = _follow(env, seed, forecast, found), found.objective, found.status
     if found.solved and abs(best.cost - objective) <= AGREEMENT * best.cost:
         return best, objective, status
     for _ in range(REFINEMENTS):
-        if foreseen.fixed.switches.steering == DRIVER:  # who will answer to the newest run
+        if forecast.fixed.kind.follows:  # the driver answers to the newest run
             env.reset(seed=seed)
-            foreseen = foresee(env.unwrapped, 1, best.trajectory.actions)
-        before, found = best.cost, solve(foreseen, best.trajectory)
-        run = _follow(env, seed, foreseen, found)
+            forecast = forecast_of(env.unwrapped, 1, best.trajectory.actions)
+        before, found = best.cost, solve(forecast, best.trajectory)
+        run = _follow(env, seed, forecast, found)
         if run.cost < best.cost:
             best, objective, status = run, found.objective, found.status
         if best.cost > before * (1.0 - GAIN):
@@ -136,31 +134,31 @@ def _search(
     return best, objective, status
 
 
-def _follow(env: gym.Env[Any, Any], seed: int, foreseen: Foreseen, found: Solution) -> Run:
-    """The better run of a solution: as it stands, or kept on its course."""
+def _follow(env: gym.Env[Any, Any], seed: int, forecast: Forecast, found: Solution) -> Run:
+    """The better run of a solution: as it stands, or regulated along its course."""
     plan = found.trajectory
-    gains = tracking_gains(foreseen, plan)
+    gains = tracking_gains(forecast, plan)
     runs = drive(env, seed, plan.actions), drive(env, seed, plan.actions, (plan.states, gains))
     return min(runs, key=lambda run: run.cost)
 
 
-def _from_grip(foreseen: Foreseen) -> Solution:
+def _from_grip(forecast: Forecast) -> Solution:
     """A plan that starts on the reference with much friction and comes down to the true one."""
-    fixed, known = foreseen.fixed, Known(*foreseen.known)
-    v = np.full(len(known.command), foreseen.start.v_x)
+    fixed, known = forecast.fixed, Known(*forecast.known)
+    v = np.full(len(known.command), forecast.start.v_x)
     refs = [
-        reference(command, speed, fixed.target, fixed.switches.reference)
+        reference(command, speed, fixed.target, fixed.kind.reference)
         for command, speed in zip(known.command, v, strict=True)
     ]
     beta, gamma = np.array(refs).T
     mu = 0.5 * (known.mu + known.mu_r)
     share = np.minimum(1.0, 0.8 * mu * GRAVITY / np.maximum(v * np.abs(gamma), 1e-9))
-    states = np.tile(np.array(foreseen.start), (len(v), 1))
+    states = np.tile(np.array(forecast.start), (len(v), 1))
     states[:, State._fields.index("v_y")] = share * beta * v
     states[:, State._fields.index("gamma")] = share * gamma
     at = Trajectory(states, np.zeros((fixed.periods, fixed.width)))
     for grip in GRIPS:
-        found = solve(foreseen, at, grip)
+        found = solve(forecast, at, grip)
         at = found.trajectory
     return found
 
@@ -209,7 +207,7 @@ def ceiling(
 
 
 def actions_of(env: gym.Env[Any, Any], agent: Any, seed: int) -> Actions:
-    """(K, width): what an agent does in an episode; zeros after a failure."""
+    """(K, width): the actions of an agent in an episode; zeros after a failure."""
     base: Any = env.unwrapped
     _, *steps = steps_of(env, agent, seed)
     periods = -int(-base.get_state()["params"][P.task.duration] // base.control_period)

@@ -1,4 +1,4 @@
-"""The plant of a foreseen episode on CasADi's symbols: one step ahead, and what it costs."""
+"""The plant on CasADi's symbols: one step of a plan, and its cost."""
 
 from typing import Any, NamedTuple
 
@@ -6,18 +6,17 @@ import casadi as ca
 
 from ...envs.backend.on_casadi import SYMBOLS, symbolic
 from ...envs.backend.rebuild import plain
-from ...envs.scenarios.speed import acceleration_command
+from ...envs.engine.tick import load_at, torques
 from ...envs.task.cost import cost_rate
 from ...envs.task.reference import reference
 from ...envs.ticks import TICK
-from ...envs.vehicle.actuators import distribute, lagged, yaw_moment
+from ...envs.vehicle.actuators import lagged, yaw_moment
 from ...envs.vehicle.dynamics import Motion, Push, rk4, sideslip_angle
-from ...envs.vehicle.tyres import Inputs, load_of
 from .foresight import Fixed, Known, State
 
-_rk4, _load_of, _distribute = symbolic(rk4), symbolic(load_of), symbolic(distribute)
-_acceleration, _reference = symbolic(acceleration_command), symbolic(reference)
+_rk4, _load_at, _torques = symbolic(rk4), symbolic(load_at), symbolic(torques)
 _slip, _lagged, _yaw_moment = symbolic(sideslip_angle), symbolic(lagged), symbolic(yaw_moment)
+_reference = symbolic(reference)
 # a sum of squares: without its cap and, for the sake of its slope at zero, its sign's guard
 _uncapped = plain(
     cost_rate, SYMBOLS | {"minimum": lambda rate, cap: rate, "absolute": lambda rate: rate}
@@ -27,7 +26,7 @@ TORQUES = ("T_l", "T_r")
 
 
 class Step(NamedTuple):
-    """What one step of the plan leads to."""
+    """The end of one step of the plan."""
 
     state: State
     effort: Any  # cost of the actuators' work within the step
@@ -38,7 +37,7 @@ def carried(fixed: Fixed) -> tuple[str, ...]:
     """The states that matter to the cost in an episode, in the order of `State`."""
     road = fixed.road
     needed = {"v_x", "v_y", "gamma", *TORQUES}
-    if fixed.switches.roll:
+    if fixed.kind.roll:
         needed |= {"phi", "phi_dot"}
     if fixed.pace.hold and fixed.pace.k_i:
         needed |= {"integral"}
@@ -50,11 +49,12 @@ def carried(fixed: Fixed) -> tuple[str, ...]:
 
 
 def node_cost(fixed: Fixed, x: State, known: Known) -> Any:
-    """What the motion at a step's start costs, without the cap, for the seconds it stands for."""
-    kind = fixed.switches.reference
-    beta = _slip(x.v_x, x.v_y, fixed.switches.small_angle)
-    beta_ref, gamma_ref = _reference(known.command, x.v_x, fixed.target, kind)
-    return known.weight * _uncapped(beta - beta_ref, x.gamma - gamma_ref, 0.0, 0.0, kind)
+    """Cost of the motion at a step's start, without the cap, for the seconds it stands for."""
+    kind = fixed.kind
+    beta = _slip(x.v_x, x.v_y, kind.small_angle)
+    beta_ref, gamma_ref = _reference(known.command, x.v_x, fixed.target, kind.reference)
+    e_beta, e_gamma = beta - beta_ref, x.gamma - gamma_ref
+    return known.weight * _uncapped(e_beta, e_gamma, 0.0, 0.0, kind.reference)
 
 
 def advance(fixed: Fixed, x: State, action: Any, known: Known) -> Step:
@@ -64,29 +64,22 @@ def advance(fixed: Fixed, x: State, action: Any, known: Known) -> Step:
     step's start; added steering acts by its mean over the step.
     """
     car = fixed.car._replace(C_f=known.C_f, C_r=known.C_r, mu=known.mu, mu_r=known.mu_r)
-    task, switches, q = fixed.task, fixed.switches, fixed.ticks
+    task, kind, q = fixed.task, fixed.kind, fixed.ticks
     pace = fixed.pace._replace(speed=known.speed, acceleration=known.ahead)
-    limit = 2.0 * car.T_max / (car.m * car.r)
-    a_x, grown = _acceleration(0.0, x.v_x, x.integral, pace, limit)
-    to_l, to_r = _distribute(action[0] * task.yaw_scale, a_x, car, task.yaw_first)
+    N_z = action[0] * task.yaw_scale
+    T_l, T_r, _, integral = _torques(N_z, 0.0, x.v_x, x.integral, pace, car, task.yaw_first)
     slewing = action[1] * task.authority if fixed.width > 1 else 0.0
     moved = slewing - x.slewing if fixed.width > 1 else 0.0
     # the angle moves at its full rate and then rests: its mean over the step
     extra = slewing - moved * ca.fabs(moved) / (2.0 * q * task.slew)
-
-    def load_at(known_angle: Any, steering: float, motor: float) -> Any:
-        inputs = Inputs(
-            known_angle + _lagged(extra, x.added, steering),
-            _lagged(to_l, x.T_l, motor),
-            _lagged(to_r, x.T_r, motor),
-        )
-        return _load_of(inputs, car, switches.small_angle)
-
     motor, steering = fixed.motor, fixed.steering
-    loads = (
-        load_at(known.steer_start, steering.start, motor.start),
-        load_at(known.steer_middle, steering.middle, motor.middle),
-        load_at(known.steer_end, steering.end, motor.end),
+    loads = tuple(
+        _load_at(angle + _lagged(extra, x.added, rest), T_l, T_r, x, motor_rest, car, kind)
+        for angle, rest, motor_rest in (
+            (known.steer_start, steering.start, motor.start),
+            (known.steer_middle, steering.middle, motor.middle),
+            (known.steer_end, steering.end, motor.end),
+        )
     )
     motion = _rk4(
         Motion(*x[: len(Motion._fields)]),
@@ -95,23 +88,23 @@ def advance(fixed: Fixed, x: State, action: Any, known: Known) -> Step:
         car,
         fixed.road,
         q * TICK,
-        switches.small_angle,
-        switches.law,
-        switches.roll,
+        kind.small_angle,
+        kind.law,
+        kind.roll,
     )
     effort = 0.0
     for tick in range(q):
         left, right = fixed.motor_tick, fixed.steering_tick
         rest = left.mean * left.end**tick
-        share = _yaw_moment(_lagged(to_l, x.T_l, rest), _lagged(to_r, x.T_r, rest), car)
+        share = _yaw_moment(_lagged(T_l, x.T_l, rest), _lagged(T_r, x.T_r, rest), car)
         added = _lagged(extra, x.added, right.mean * right.end**tick)
-        effort += TICK * _uncapped(0.0, 0.0, share / task.yaw_scale, added, switches.reference)
+        effort += TICK * _uncapped(0.0, 0.0, share / task.yaw_scale, added, kind.reference)
     after = State._make(
         (
             *motion,
-            _lagged(to_l, x.T_l, motor.end),
-            _lagged(to_r, x.T_r, motor.end),
-            x.integral + q * (grown - x.integral),
+            _lagged(T_l, x.T_l, motor.end),
+            _lagged(T_r, x.T_r, motor.end),
+            x.integral + q * (integral - x.integral),
             slewing,
             _lagged(extra, x.added, steering.end),
         )

@@ -14,8 +14,7 @@ import numpy.typing as npt
 import osqp
 from scipy import sparse
 
-from ...envs.vehicle.tyres import LINEAR
-from .foresight import Fixed, Foreseen, Known, State
+from .foresight import Fixed, Forecast, Known, State
 from .plant import advance, carried, node_cost, scales
 
 Array = npt.NDArray[np.float64]
@@ -58,15 +57,15 @@ def is_linear(base: Any) -> bool:
 
     The rate limit of steering, tyres that change and a driver who reacts to the car are not.
     """
-    scenario, switches = base.scenario, base.get_state()["template"].switches
-    plant = switches[0] == 1 and switches[1] == LINEAR
+    scenario = base.scenario
+    plant = scenario.small_angle and scenario.tyres == "linear"
     plant = plant and scenario.tyre_change_time is None and scenario.steering != "driver"
     return bool(plant and base.held_speed is not None and base.action_space.shape == (1,))
 
 
 @functools.lru_cache(maxsize=8)
 def _expansion(fixed: Fixed, v_x: float) -> tuple[Any, Any]:
-    """Two functions of what is known: of a period, and of the episode's end.
+    """Two functions of `Known`: of a period, and of the episode's end.
 
     They return (next state, its slope, cost, its gradient, its Hessian) at zero, and (cost,
     gradient, Hessian).
@@ -79,18 +78,18 @@ def _expansion(fixed: Fixed, v_x: float) -> tuple[Any, Any]:
     x = rest._replace(**{name: scale[i] * w[i] for i, name in enumerate(names)})
     first, cost = x, ca.SX(0.0)
     for j in range(fixed.steps):
-        told = Known(*ca.vertsplit(known[:, j]))
-        step = advance(fixed, x, ca.vertsplit(w[size:]), told)
-        cost += node_cost(fixed, x, told) + step.effort
+        here = Known(*ca.vertsplit(known[:, j]))
+        step = advance(fixed, x, ca.vertsplit(w[size:]), here)
+        cost += node_cost(fixed, x, here) + step.effort
         x = rest._replace(**{name: getattr(step.state, name) for name in names})
     after = ca.vertcat(*(getattr(x, name) for name in names)) / scale
     H, g = ca.hessian(cost, w)
     zero = ca.DM.zeros(w.shape)
     slope = ca.jacobian(after, w)
     inside = ca.Function("inside", [w, known], [after, slope, cost, g, H])
-    told = Known(*ca.vertsplit(known[:, 0]))
-    H, g = ca.hessian(node_cost(fixed, first, told), w)
-    end = ca.Function("end", [w, known], [node_cost(fixed, first, told), g, H])
+    last = node_cost(fixed, first, Known(*ca.vertsplit(known[:, 0])))
+    H, g = ca.hessian(last, w)
+    end = ca.Function("end", [w, known], [last, g, H])
 
     def at_zero(function: Any) -> Any:
         return lambda known: [value.full() for value in function(zero, known)]
@@ -98,22 +97,22 @@ def _expansion(fixed: Fixed, v_x: float) -> tuple[Any, Any]:
     return at_zero(inside), at_zero(end)
 
 
-def programme_of(foreseen: Foreseen) -> Programme:
-    """The quadratic programme of an episode foreseen tick by tick."""
-    fixed, start = foreseen.fixed, foreseen.start
+def programme_of(forecast: Forecast) -> Programme:
+    """The quadratic programme of an episode whose forecast goes tick by tick."""
+    fixed, start = forecast.fixed, forecast.start
     if fixed.ticks != 1:
         raise ValueError(f"the linear plan is made of ticks, got steps of {fixed.ticks}")
     names = tuple(name for name in carried(fixed) if name not in ("v_x", "integral"))
     size, K = len(names), fixed.periods
     inside, end = _expansion(fixed, start.v_x)
-    known = foreseen.known[:, :-1].reshape(len(Known._fields), K, fixed.steps)
+    known = forecast.known[:, :-1].reshape(len(Known._fields), K, fixed.steps)
     n = size + fixed.width
     q, constant, offsets = np.zeros(K * n + size), 0.0, np.empty((K, size))
     for k in range(K):
         after, slope, cost, g, H = inside(known[:, k])
         offsets[k], q[k * n : (k + 1) * n] = after.ravel(), g.ravel()
         constant += cost.item()
-    last = np.tile(foreseen.known[:, -1:], (1, fixed.steps))
+    last = np.tile(forecast.known[:, -1:], (1, fixed.steps))
     cost, g, H_end = end(last)
     q[K * n :], constant = g.ravel()[:size], constant + cost.item()
     blocks = [sparse.csc_matrix(H)] * K
@@ -133,9 +132,9 @@ def programme_of(foreseen: Foreseen) -> Programme:
     return Programme(P, q, constant, A, np.r_[equal, -most], np.r_[equal, most], size, fixed.width)
 
 
-def solve_linear(foreseen: Foreseen) -> tuple[Array, float, str]:
+def solve_linear(forecast: Forecast) -> tuple[Array, float, str]:
     """(actions (K, 1), the least cost without the cap, OSQP's status)."""
-    made = programme_of(foreseen)
+    made = programme_of(forecast)
     solver = osqp.OSQP()
     solver.setup(sparse.triu(made.P, format="csc"), made.q, made.A, made.low, made.high, **_OPTIONS)
     found = solver.solve(raise_error=False)

@@ -13,7 +13,7 @@ from ...envs.backend.rebuild import plain
 from ...envs.task.cost import BETA_SCALE, GAMMA_SCALE
 from ...envs.vehicle.actuators import within_stop
 from ...envs.vehicle.tyres import SLOW
-from .foresight import Fixed, Foreseen, Known, State
+from .foresight import Fixed, Forecast, Known, State
 from .plant import advance, carried, node_cost, scales
 
 Array = npt.NDArray[np.float64]
@@ -73,7 +73,7 @@ class Trajectory:
 
 @dataclass(frozen=True)
 class Solution:
-    """What IPOPT made of a start: its trajectory, objective, return text and iterations."""
+    """IPOPT's trajectory from a start, its objective, return text and iterations."""
 
     trajectory: Trajectory
     objective: float
@@ -82,13 +82,13 @@ class Solution:
 
     @property
     def solved(self) -> bool:
-        """Whether IPOPT says so."""
+        """Whether IPOPT returned a solution."""
         return self.status in SOLVED
 
 
 @functools.lru_cache(maxsize=8)
 def problem_of(fixed: Fixed) -> Problem:
-    """Build the solver; one is kept for each of the newest few kinds of episode."""
+    """The solver, cached for each of the newest few kinds of episode."""
     if fixed.steps != 1:
         raise ValueError(f"the plan takes one step a control period, got {fixed.steps}")
     names = carried(fixed)
@@ -96,11 +96,11 @@ def problem_of(fixed: Fixed) -> Problem:
     w, known = ca.SX.sym("w", size + fixed.width), ca.SX.sym("known", len(Known._fields))
     zero = State(*(0.0,) * len(State._fields))
     x = zero._replace(**{name: scale[i] * w[i] for i, name in enumerate(names)})
-    told = Known(*ca.vertsplit(known))
-    step = advance(fixed, x, ca.vertsplit(w[size:]), told)
+    each = Known(*ca.vertsplit(known))
+    step = advance(fixed, x, ca.vertsplit(w[size:]), each)
     after = ca.vertcat(*(getattr(step.state, name) for name in names)) / scale
     inside = ca.Function("inside", [w, known], [after, step.effort, step.slewed], {"cse": True})
-    node = ca.Function("node", [w, known], [node_cost(fixed, x, told)])
+    node = ca.Function("node", [w, known], [node_cost(fixed, x, each)])
     W, C = ca.MX.sym("W", w.numel(), K + 1), ca.MX.sym("C", known.numel(), K + 1)
     ahead, effort, moved = inside.map(K)(W[:, :K], C[:, :K])
     rest = [ca.vec(ahead - W[:size, 1:])]
@@ -117,24 +117,24 @@ def problem_of(fixed: Fixed) -> Problem:
     return Problem(fixed, names, scale, solver, slopes.map(K))
 
 
-def solve(foreseen: Foreseen, start: Trajectory, grip: float = 1.0) -> Solution:
+def solve(forecast: Forecast, start: Trajectory, grip: float = 1.0) -> Solution:
     """The plan that IPOPT finds from a trajectory, which need not obey the plant.
 
     grip: factor on the friction of road and tyres. Where IPOPT ends with numbers that are not
     finite the solution is the start, with IPOPT's return text.
     """
-    fixed = foreseen.fixed
+    fixed = forecast.fixed
     problem = problem_of(fixed)
     size, K, at = len(problem.names), fixed.periods, problem.at
     guess = _packed(problem, start)
-    known = foreseen.known.copy()
+    known = forecast.known.copy()
     known[[Known._fields.index(name) for name in ("mu", "mu_r")]] *= grip
     low, high = np.full_like(guess, -np.inf), np.full_like(guess, np.inf)
-    low[:size, 0] = high[:size, 0] = np.array(foreseen.start)[at] / problem.scale
+    low[:size, 0] = high[:size, 0] = np.array(forecast.start)[at] / problem.scale
     low[size:], high[size:] = -1.0, 1.0
     limits = np.zeros(size * K)
     if fixed.width > 1:
-        low[size + 1, :K], high[size + 1, :K] = _steering_room(foreseen)
+        low[size + 1, :K], high[size + 1, :K] = _steering_limits(forecast)
         limits = np.concatenate([limits, np.full(K, fixed.task.slew * fixed.ticks)])
     low[size:, K] = high[size:, K] = 0.0  # nothing acts after the end
     found = problem.solver(
@@ -153,21 +153,21 @@ def solve(foreseen: Foreseen, start: Trajectory, grip: float = 1.0) -> Solution:
     return Solution(Trajectory(states, actions), objective, status, iterations)
 
 
-def tracking_gains(foreseen: Foreseen, plan: Trajectory) -> Array:
-    """(K, width, len(State)): what the actions give back for a deviation from the plan.
+def tracking_gains(forecast: Forecast, plan: Trajectory) -> Array:
+    """(K, width, len(State)): gains from a deviation from the plan to the actions.
 
     A car that slides is unstable: the plan alone, on a plant that differs by its step's error,
     would be lost. The gains are those of the linear-quadratic regulator along the plan.
     """
-    problem = problem_of(foreseen.fixed)
-    size, K, at = len(problem.names), foreseen.fixed.periods, problem.at
-    slopes = problem.slopes(_packed(problem, plan)[:, :K], foreseen.known[:, :K]).full()
+    problem = problem_of(forecast.fixed)
+    size, K, at = len(problem.names), forecast.fixed.periods, problem.at
+    slopes = problem.slopes(_packed(problem, plan)[:, :K], forecast.known[:, :K]).full()
     slopes = slopes.reshape(size, K, -1).transpose(1, 0, 2)
     v = max(float(plan.states[0, 0]), SLOW)
     weight = {"v_y": 1.0 / (BETA_SCALE * v), "gamma": 1.0 / GAMMA_SCALE}
     wanted = np.array([weight.get(name, 0.0) for name in problem.names])
     Q = np.diag((wanted * problem.scale) ** 2)
-    R = np.eye(foreseen.fixed.width)
+    R = np.eye(forecast.fixed.width)
     P, gains = Q, np.zeros((K, len(R), len(State._fields)))
     for k in reversed(range(K)):
         A, B = slopes[k, :, :size], slopes[k, :, size:]
@@ -191,10 +191,10 @@ def _flat(columns: Array) -> Array:
     return columns.ravel(order="F")
 
 
-def _steering_room(foreseen: Foreseen) -> tuple[Array, Array]:
+def _steering_limits(forecast: Forecast) -> tuple[Array, Array]:
     """The least and most share of added steering in each period, within the stop of the wheels."""
-    task = foreseen.fixed.task
+    task = forecast.fixed.task
     inside = plain(within_stop, ARRAYS)
-    low = inside(-task.authority, foreseen.driver, task.stop).max(axis=1)
-    high = inside(task.authority, foreseen.driver, task.stop).min(axis=1)
+    low = inside(-task.authority, forecast.driver, task.stop).max(axis=1)
+    high = inside(task.authority, forecast.driver, task.stop).min(axis=1)
     return low / task.authority, high / task.authority

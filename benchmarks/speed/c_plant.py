@@ -20,8 +20,8 @@ VECTORS = (
     "-fschedule-insns",
     "-fsched-pressure",
 )
-"""What lets gcc make vectors of square roots, floor and choices, and gave it the best time of the
-flags that were tried; no number changes."""
+"""Flags with which gcc makes vectors of square roots, floor and choices: the fastest of those that
+were tried; no number changes."""
 
 
 def compiler() -> str:

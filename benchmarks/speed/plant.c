@@ -2,10 +2,10 @@
  *
  * One tick is what `plant.py` compiles: the actuators' lag, two loads, Fiala tyres, roll, and the
  * classical Runge-Kutta method, operation by operation in the order of `envs`. Blocks of cars,
- * structures of arrays, so that the compiler makes vectors of it; BLOCK cars, told on its command
- * line. What does not change within a call is computed once a block.
+ * structures of arrays, so that the compiler makes vectors of it; BLOCK, the cars in one, is a
+ * macro of its command line. Constants of a call are computed once a block.
  *
- * Compiled with -O3 -march=native -ffp-contract=off; more flags stand in `yardstick.py`.
+ * Compiled with -O3 -march=native -ffp-contract=off; more flags stand in `c_plant.py`.
  */
 #include <math.h>
 #include <string.h>
@@ -21,7 +21,7 @@
 #define INPUTS(DO) DO(delta) DO(T_l) DO(T_r)
 #define MOTION(DO) \
     DO(v_x) DO(v_y) DO(gamma) DO(psi) DO(X) DO(Y) DO(s) DO(y) DO(theta) DO(phi) DO(phi_dot)
-/* What a car's numbers give once and for all. */
+/* Constants of a car. */
 #define FIXED(DO) \
     DO(per_m) DO(per_I) DO(front) DO(rear_l) DO(rear_r) DO(slope_f) DO(per_front) DO(per_rear) \
     DO(direct) DO(per_lean) DO(per_r) DO(per_ramp) DO(half_track)
@@ -251,7 +251,7 @@ INLINE void tick(block *b, double h, const double *left, int curved, int sloped)
 ALONE void tick_anywhere(block *b, double h, const double *left) { tick(b, h, left, 1, 1); }
 ALONE void tick_straight(block *b, double h, const double *left) { tick(b, h, left, 0, 0); }
 
-/* What is not in the arrays: the fixed numbers and the first load. */
+/* The numbers that are not in the arrays: constants and the first load. */
 static void prepare(block *b)
 {
     for (int i = 0; i < BLOCK; i++) {
@@ -266,7 +266,7 @@ static void prepare(block *b)
     }
 }
 
-/* Ticks of h seconds of blocks of cars. Arrays (blocks, fields, BLOCK). left: what is left of a
+/* Ticks of h seconds of blocks of cars. Arrays (blocks, fields, BLOCK). left: the share left of a
  * deviation from the command: of steering at the middle and the end of a tick, then of motors. */
 void plant(long blocks, long ticks, double h, const double *left, const double *cars,
            const double *roads, const double *pushes, const double *commands, double *motions,

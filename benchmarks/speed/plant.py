@@ -1,4 +1,4 @@
-"""What a tick of the plant alone costs: ours, the same in C, and CommonRoad's single track.
+"""Cost of a tick of the plant alone: ours, the same in C, and CommonRoad's single track.
 
 A tick is a millisecond of one car of `YawFusion-v0`: actuators that lag, the loads at the tick's
 middle and end, Fiala tyres, roll, and Runge-Kutta's four stages; no sensors, no driver.
@@ -41,7 +41,7 @@ class Cars(NamedTuple):
     """Cars in the middle of a drive; arrays (blocks, fields, LANES), fields as in the plant's
     tuples.
 
-    left: (4,) what is left of an actuator's deviation from its command, of steering at the middle
+    left: (4,) the share left of an actuator's deviation from its command, of steering at the middle
     and the end of a tick, then of the motors.
     """
 
@@ -198,7 +198,7 @@ def _many(advance: Advance, cars: Cars) -> Contestant:
 
 
 def add(suite: Suite, effort: Effort) -> tuple[dict[str, Taken], dict[str, str]]:
-    """Rows and a table; what each contestant took, and why others are absent."""
+    """Add rows and a table; returns each contestant's time, and why others are absent."""
     cars, field = cars_of(CARS), Field()
     field.add(OURS, lambda: _many(ours, cars))
     field.add(C, lambda: _many(in_c(), cars))

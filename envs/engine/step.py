@@ -11,7 +11,7 @@ scratch array, `drive_on` moves the car tick by tick, `conclude` handles the slo
 from typing import Any
 
 from ..backend.arrays import at, put, read, write
-from ..backend.decorators import apart, copied, jit
+from ..backend.decorators import apart, copied, inlined, jit
 from ..backend.elementary import clip
 from ..backend.primitives import anywhere, select
 from ..record import FAST
@@ -24,7 +24,7 @@ from ..vehicle.tyres import shifts
 from .layout import FLAGS, P, Z
 from .observe import observe, write_report
 from .packets import due, sense_slow
-from .tick import Fixed, Kind, Moving, advance, changed, failure_of, standing_load
+from .tick import Fixed, Kind, Moving, Seen, advance, changed, failure_of, standing_load
 from .window import WINDOW, chance_at, foresee
 
 
@@ -102,21 +102,37 @@ def drive_on(
             if anywhere(seen.lost):  # the last that is fit for `info`
                 motion, beta, refs = before, 0.0 * cost, (0.0 * cost, 0.0 * cost)
             write(z, motion, Z.motion)
-            write(z, now.drive, Z.drive)
-            put(z, now.driver, Z.driver)
-            put(z, tick, Z.clock.tick)
-            failure = failure_of(seen)
-            put(z, failure, Z.clock.failure)
-            rest = rest_of_cost(task.duration, tick)
-            put(report, cost + select(failure != RUNNING, rest, 0.0), REPORT.cost)
-            put(report, beta, REPORT.beta)
-            put(report, refs[0], REPORT.beta_ref)
-            put(report, refs[1], REPORT.gamma_ref)
-            put(report, seen.steer, REPORT.steer)
-            put(report, seen.moment, REPORT.yaw_moment)
-            put(report, select(tick >= task.duration, 1.0, 0.0), REPORT.ended)
+            write_end(z, report, now, seen, beta, refs, tick, cost, task.duration)
             return j + 1
     return 0
+
+
+@inlined
+def write_end(
+    z: Any,
+    report: Any,
+    now: Moving,
+    seen: Seen,
+    beta: Any,
+    refs: Any,
+    tick: Any,
+    cost: Any,
+    duration: Any,
+) -> None:
+    """Write the end of an env-step into z, but for the motion, and into its report."""
+    write(z, now.drive, Z.drive)
+    put(z, now.driver, Z.driver)
+    put(z, tick, Z.clock.tick)
+    failure = failure_of(seen)
+    put(z, failure, Z.clock.failure)
+    rest = rest_of_cost(duration, tick)
+    put(report, cost + select(failure != RUNNING, rest, 0.0), REPORT.cost)
+    put(report, beta, REPORT.beta)
+    put(report, refs[0], REPORT.beta_ref)
+    put(report, refs[1], REPORT.gamma_ref)
+    put(report, seen.steer, REPORT.steer)
+    put(report, seen.moment, REPORT.yaw_moment)
+    put(report, select(tick >= duration, 1.0, 0.0), REPORT.ended)
 
 
 @apart

@@ -1,7 +1,7 @@
-"""One tick of the car: what the driver asks, the actuators do, the plant and the fast sensors make
-of it, and what it costs.
+"""One tick of the car: commands, actuators, plant, fast sensors, cost and failures.
 
-The text of a tick is the same for one car, abreast in lanes, and tensors of them.
+The text is the same for one car, for cars in lanes, and for tensors of them. `advance` is a tick of
+our plant; `command` and `sense`, before and after the motion, serve a plant of another's too.
 """
 
 from typing import Any, NamedTuple
@@ -13,15 +13,14 @@ from ..scenarios.driver import steered
 from ..scenarios.speed import acceleration_command
 from ..scenarios.tracks import path_offset
 from ..scenarios.wind import wind_at
-from ..sensors.inertial import Chance, fast_row
+from ..sensors.inertial import Chance, fast_row, specific_force
 from ..task.cost import cost_rate
 from ..task.failures import NOT_FINITE, OFF_ROAD, RUNNING, SPIN
 from ..task.reference import reference
 from ..ticks import TICK
 from ..vehicle.actuators import distribute, lagged, slewed, within_stop, yaw_moment
-from ..vehicle.dynamics import Car, Push, gravity_at, rk4, sideslip_angle
+from ..vehicle.dynamics import Car, Push, rk4, sideslip_angle
 from ..vehicle.tyres import Inputs, load_of
-from ..vehicle.vehicle import GRAVITY
 from .layout import Drive
 
 NO_LAG, ONE_LAGS = range(2)  # 2: both lag
@@ -40,7 +39,7 @@ class Kind(NamedTuple):
 
 
 class Fixed(NamedTuple):
-    """What does not change within an env-step; each a tuple of numbers."""
+    """Parameters that are constant within an env-step; each a tuple of numbers."""
 
     car: Any
     road: Any
@@ -58,7 +57,7 @@ class Fixed(NamedTuple):
 
 
 class Moving(NamedTuple):
-    """What a tick moves on."""
+    """The state that a tick changes."""
 
     motion: Any
     drive: Any
@@ -67,14 +66,38 @@ class Moving(NamedTuple):
     car: Any  # with its tyres as they are now
 
 
+class Acted(NamedTuple):
+    """Actuators during a tick, means; the first five are columns of `Fast`, from `steer` on."""
+
+    steer: Any  # rad, front wheels
+    T_l: Any  # N m
+    T_r: Any
+    driver: Any  # rad, the driver's command
+    a_x: Any  # m/s2, the driver's command
+    added: Any  # rad, the part of steer that was added to the driver's
+    moment: Any  # N m, yaw moment of both motors
+    effort: Any  # its share of full scale
+
+
+class Control(NamedTuple):
+    """Inputs of the plant during a tick."""
+
+    steer: Any  # rad, command to the front wheels
+    T_l: Any  # N m, command to the left motor
+    T_r: Any
+    push: Any
+    acted: Any
+    drive: Any  # at the tick's end
+
+
 class Seen(NamedTuple):
-    """What a tick shows."""
+    """Sensors, cost and failures at the end of a tick."""
 
     row: Any  # the fast sensors, columns as in `Fast`
     cost: Any  # per second
     beta: Any
     refs: Any
-    steer: Any  # rad, N m: what acted
+    steer: Any  # rad, N m: of `Acted`
     moment: Any
     lost: Any  # whether the numbers are no longer finite,
     spun: Any  # the car spins,
@@ -92,47 +115,139 @@ def changed(car: Any, change: Any, now: Any) -> Any:
 
 @jit
 def standing_load(drive: Any, car: Any, kind: Kind) -> Any:
-    """The Load of what the actuators do now."""
+    """The Load of the actuators as they are now."""
     return load_of(
         Inputs(drive.delta_f, drive.T_l, drive.T_r), car, kind.small_angle, kind.shifting
     )
 
 
 @jit
-def _load_at(
-    command: Any,
-    to_l: Any,
-    to_r: Any,
-    drive: Any,
-    steering_rest: Any,
-    motor_rest: Any,
-    car: Any,
-    kind: Kind,
-) -> Any:
-    """The Load once the given rests of the actuators' deviations from their commands are left."""
-    inputs = Inputs(
-        lagged(command, drive.delta_f, steering_rest),
-        lagged(to_l, drive.T_l, motor_rest),
-        lagged(to_r, drive.T_r, motor_rest),
-    )
+def load_at(steer: Any, T_l: Any, T_r: Any, drive: Any, rest: Any, car: Any, kind: Kind) -> Any:
+    """The Load at a front angle, `rest` of the motors' deviation from T_l and T_r being left."""
+    inputs = Inputs(steer, lagged(T_l, drive.T_l, rest), lagged(T_r, drive.T_r, rest))
     return load_of(inputs, car, kind.small_angle, kind.shifting)
 
 
+@jit
+def torques(
+    N_z: Any, tick: Any, v_x: Any, integral: Any, pace: Any, car: Any, yaw_first: Any
+) -> Any:
+    """(T_l, T_r, a_x, integral): torques in N m for a yaw moment and the driver's acceleration."""
+    limit = 2.0 * car.T_max / (car.m * car.r)
+    a_x, integral = acceleration_command(tick, v_x, integral, pace, limit)
+    T_l, T_r = distribute(N_z, a_x, car, yaw_first)
+    return T_l, T_r, a_x, integral
+
+
 @inlined
-def _specific_force(before: Any, after: Any, road: Any, small_angle: int, roll: int) -> Any:
-    """(a_x, a_y) in m/s2, mean over a tick: v', the turning of the axes, and gravity."""
-    turn_x = 0.5 * (before.gamma * before.v_y + after.gamma * after.v_y)
-    turn_y = 0.5 * (before.gamma * before.v_x + after.gamma * after.v_x)
-    turns_x = (small_angle == 0) | (roll == 1)  # tie-vision holds v_x; double-layer-gps (4)
-    a_x = (after.v_x - before.v_x) * (1.0 / TICK) - select(turns_x, turn_x, 0.0)
-    a_y = (after.v_y - before.v_y) * (1.0 / TICK) + turn_y
-    if roll:
-        a_y = a_y + 0.5 * GRAVITY * (before.phi + after.phi)  # double-layer-gps (5)
-    if anywhere((road.along != 0.0) | (road.across != 0.0)):
-        first = gravity_at(before, road, small_angle)
-        last = gravity_at(after, road, small_angle)
-        a_x, a_y = a_x + 0.5 * (first[0] + last[0]), a_y + 0.5 * (first[1] + last[1])
-    return a_x, a_y
+def _at_change(fixed: Fixed, now: Moving, tick: Any, kind: Kind) -> Moving:
+    """The state once the tyres have changed, if they do so at this tick."""
+    here, car, start = tick == fixed.change.tick, now.car, now.start
+    if anywhere(here):
+        car = changed(car, fixed.change, here)
+        start = standing_load(now.drive, car, kind)
+    return Moving(now.motion, now.drive, start, now.driver, car)
+
+
+@inlined
+def command(fixed: Fixed, N_z: Any, turn: Any, now: Moving, tick: Any, chance: Chance) -> Control:
+    """The plant's inputs during the tick that starts at `tick`; arguments as in `advance`."""
+    motor, steering, task, ou = fixed.motor, fixed.steering, fixed.task, fixed.disturbance
+    drive, driver, car = now.drive, now.driver, now.car
+    slewing = slewed(drive.slewing, turn, task.slew)
+    extra = within_stop(slewing, driver, task.stop)
+    steer = driver + extra
+    T_l, T_r, a_x, integral = torques(
+        N_z, tick, now.motion.v_x, drive.integral, fixed.pace, car, task.yaw_first
+    )
+    F_w, N_w, N_x = wind_at(tick, fixed.wind)
+    left, right = lagged(T_l, drive.T_l, motor.mean), lagged(T_r, drive.T_r, motor.mean)
+    moment = yaw_moment(left, right, car)
+    acted = Acted(
+        lagged(steer, drive.delta_f, steering.mean),
+        left,
+        right,
+        driver,
+        a_x,
+        lagged(extra, drive.added, steering.mean),
+        moment,
+        moment * (1.0 / task.yaw_scale),
+    )
+    after = Drive(
+        lagged(T_l, drive.T_l, motor.end),
+        lagged(T_r, drive.T_r, motor.end),
+        lagged(steer, drive.delta_f, steering.end),
+        integral,
+        ou.keep * drive.F_d + ou.fresh * ou.force * chance.wheels[2],
+        ou.keep * drive.N_d + ou.fresh * ou.moment * chance.wheels[3],
+        slewing,
+        lagged(extra, drive.added, steering.end),
+    )
+    return Control(steer, T_l, T_r, Push(drive.F_d + F_w, drive.N_d + N_w, N_x), acted, after)
+
+
+@inlined
+def _loads(fixed: Fixed, control: Control, now: Moving, kind: Kind) -> Any:
+    """The Load at the start, the middle and the end of a tick."""
+    motor, steering, drive, car, start = fixed.motor, fixed.steering, now.drive, now.car, now.start
+    steer, T_l, T_r = control.steer, control.T_l, control.T_r
+    if kind.lag == NO_LAG:
+        start = load_of(Inputs(steer, T_l, T_r), car, kind.small_angle, kind.shifting)
+        middle, end = start, start
+    else:  # actuators that lag move continuously: a tick starts where the last one ended
+        if kind.lag == ONE_LAGS:  # the other one jumps
+            angle = lagged(steer, drive.delta_f, steering.start)
+            start = load_at(angle, T_l, T_r, drive, motor.start, car, kind)
+        angle = lagged(steer, drive.delta_f, steering.middle)
+        middle = load_at(angle, T_l, T_r, drive, motor.middle, car, kind)
+        angle = lagged(steer, drive.delta_f, steering.end)
+        end = load_at(angle, T_l, T_r, drive, motor.end, car, kind)
+    return start, middle, end
+
+
+@inlined
+def sense(
+    fixed: Fixed,
+    motion: Any,
+    accel: Any,
+    acted: Acted,
+    car: Any,
+    ahead: Any,
+    chance: Chance,
+    kind: Kind,
+) -> tuple[Any, Seen]:
+    """(the driver's command, what is Seen) at the end of a tick that led to a motion.
+
+    accel: (a_x, a_y) in m/s2, specific forces. The others are as in `advance`.
+    """
+    task = fixed.task
+    row = fast_row(motion, accel, acted, car.d_f, fixed.noise, chance)
+    v = 0.5 * (row[FAST.wheel_left] + row[FAST.wheel_right])
+    beta = sideslip_angle(motion.v_x, motion.v_y, kind.small_angle)
+    if kind.follows:
+        driver = steered(
+            acted.driver, motion, fixed.path, fixed.road, fixed.target, fixed.person, task.stop
+        )
+        aside = motion.y - path_offset(fixed.path, motion.s)
+    else:
+        driver = ahead
+        aside = motion.y - 0.0
+    refs = reference(driver, v, fixed.target, kind.reference)
+    e_beta, e_gamma = beta - refs[0], motion.gamma - refs[1]
+    size = motion.v_x * motion.v_x + motion.v_y * motion.v_y + motion.gamma * motion.gamma
+    finite = size + motion.psi + motion.Y + motion.phi  # squares: the references take them too
+    seen = Seen(
+        row,
+        cost_rate(e_beta, e_gamma, acted.effort, acted.added, kind.reference),
+        beta,
+        refs,
+        acted.steer,
+        acted.moment,
+        finite - finite != 0.0,
+        (absolute(beta) > task.spin) & (motion.v_x > 0.0),  # backing up is no spin
+        absolute(aside) > task.half_width,
+    )
+    return driver, seen
 
 
 @inlined
@@ -146,79 +261,21 @@ def advance(
     ahead: Any,
     kind: Kind,
 ) -> tuple[Moving, Seen]:
-    """(what moved, what is seen) at the end of the tick that starts at `tick`.
+    """(the state, what is Seen) at the end of the tick that starts at `tick`.
 
-    N_z: N m and turn: rad, the yaw moment and the added steering that are asked for. chance: the
-    numbers of the next tick. ahead: rad, the programme's steering at the next tick, which counts
-    where no driver reacts to the car.
+    N_z: N m and turn: rad, the commanded yaw moment and added steering. chance: the numbers of the
+    next tick. ahead: rad, the programme's steering at the next tick, which counts where no driver
+    reacts to the car.
     """
     small_angle, law, roll = kind.small_angle, kind.law, kind.roll
-    road, motor, steering, ou = fixed.road, fixed.motor, fixed.steering, fixed.disturbance
-    task = fixed.task
-    before, drive, driver, start, car = now.motion, now.drive, now.driver, now.start, now.car
-    at_change = tick == fixed.change.tick
-    if anywhere(at_change):
-        car = changed(car, fixed.change, at_change)
-        start = standing_load(drive, car, kind)
-    slewing = slewed(drive.slewing, turn, task.slew)
-    extra = within_stop(slewing, driver, task.stop)
-    command = driver + extra
-    limit = 2.0 * car.T_max / (car.m * car.r)
-    a_x, integral = acceleration_command(tick, before.v_x, drive.integral, fixed.pace, limit)
-    to_l, to_r = distribute(N_z, a_x, car, task.yaw_first)
-    if kind.lag == NO_LAG:
-        start = load_of(Inputs(command, to_l, to_r), car, small_angle, kind.shifting)
-        middle, end = start, start
-    else:  # actuators that lag move continuously: a tick starts where the last one ended
-        if kind.lag == ONE_LAGS:  # the other one jumps
-            start = _load_at(command, to_l, to_r, drive, steering.start, motor.start, car, kind)
-        middle = _load_at(command, to_l, to_r, drive, steering.middle, motor.middle, car, kind)
-        end = _load_at(command, to_l, to_r, drive, steering.end, motor.end, car, kind)
-    F_w, N_w, N_x = wind_at(tick, fixed.wind)
-    push = Push(drive.F_d + F_w, drive.N_d + N_w, N_x)
-    motion = rk4(before, (start, middle, end), push, car, road, TICK, small_angle, law, roll)
-    steer = lagged(command, drive.delta_f, steering.mean)
-    added = lagged(extra, drive.added, steering.mean)
-    left, right = lagged(to_l, drive.T_l, motor.mean), lagged(to_r, drive.T_r, motor.mean)
-    drive = Drive(
-        lagged(to_l, drive.T_l, motor.end),
-        lagged(to_r, drive.T_r, motor.end),
-        lagged(command, drive.delta_f, steering.end),
-        integral,
-        ou.keep * drive.F_d + ou.fresh * ou.force * chance.wheels[2],
-        ou.keep * drive.N_d + ou.fresh * ou.moment * chance.wheels[3],
-        slewing,
-        lagged(extra, drive.added, steering.end),
-    )
-    accel = _specific_force(before, motion, road, small_angle, roll)
-    acted = (steer, left, right, driver, a_x)
-    row = fast_row(motion, accel, acted, car.d_f, fixed.noise, chance)
-    v = 0.5 * (row[FAST.wheel_left] + row[FAST.wheel_right])
-    beta = sideslip_angle(motion.v_x, motion.v_y, small_angle)
-    if kind.follows:
-        driver = steered(driver, motion, fixed.path, road, fixed.target, fixed.person, task.stop)
-        aside = motion.y - path_offset(fixed.path, motion.s)
-    else:
-        driver = ahead
-        aside = motion.y - 0.0
-    refs = reference(driver, v, fixed.target, kind.reference)
-    moment = yaw_moment(left, right, car)
-    effort = moment * (1.0 / task.yaw_scale)
-    cost = cost_rate(beta - refs[0], motion.gamma - refs[1], effort, added, kind.reference)
-    size = motion.v_x * motion.v_x + motion.v_y * motion.v_y + motion.gamma * motion.gamma
-    finite = size + motion.psi + motion.Y + motion.phi  # squares: the references take them too
-    seen = Seen(
-        row,
-        cost,
-        beta,
-        refs,
-        steer,
-        moment,
-        finite - finite != 0.0,
-        (absolute(beta) > task.spin) & (motion.v_x > 0.0),  # backing up is no spin
-        absolute(aside) > task.half_width,
-    )
-    return Moving(motion, drive, end, driver, car), seen
+    now = _at_change(fixed, now, tick, kind)
+    control = command(fixed, N_z, turn, now, tick, chance)
+    loads = _loads(fixed, control, now, kind)
+    before, car, road = now.motion, now.car, fixed.road
+    motion = rk4(before, loads, control.push, car, road, TICK, small_angle, law, roll)
+    accel = specific_force(before, motion, road, small_angle, roll)
+    driver, seen = sense(fixed, motion, accel, control.acted, car, ahead, chance, kind)
+    return Moving(motion, control.drive, loads[2], driver, car), seen
 
 
 @jit

@@ -1,4 +1,4 @@
-"""What outside plants cannot do, refused by its name before an episode starts."""
+"""Checks of a scenario and of reset options against what an outside plant can do."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -22,7 +22,7 @@ _OURS = (
 
 
 def check_scenario(scenario: Scenario, model: str) -> None:
-    """ValueError for a scenario that asks for what only our plant has, or this model has not."""
+    """ValueError for a scenario field that only our plant has, or that this model has not."""
     name = f"scenario {scenario.name!r}"
     defaults = {entry.name: entry.default for entry in dataclasses.fields(Scenario)}
     for field in _OURS:

@@ -1,37 +1,27 @@
 """OutsideEnv: our sensors, scenarios, references and cost around a plant that is not ours."""
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ..backend.arrays import read, write
-from ..backend.elementary import clip
-from ..backend.primitives import absolute
-from ..backend.random import CHANNELS, normals
-from ..engine.layout import FLAGS, Disturbance, Drive, P, Task, Z
-from ..engine.observe import observe, write_report
-from ..engine.packets import due, sense_slow
+from ..backend.arrays import at, read, write
+from ..backend.rebuild import plain
+from ..engine.layout import P, Z
+from ..engine.step import conclude, fixed_of, kind_of, shares_of, write_end
+from ..engine.tick import Fixed, Kind, Moving, command, sense
+from ..engine.window import WINDOW, chance_at, foresee
 from ..record import FAST
-from ..scenarios.driver import Driver, steered
 from ..scenarios.manoeuvres import scenario_from
 from ..scenarios.scenario import Scenario
-from ..scenarios.speed import Pace, acceleration_command
-from ..scenarios.steering import DRIVER, steering_at
-from ..scenarios.tracks import Path, path_offset
-from ..scenarios.wind import Wind, wind_at
-from ..sensors.inertial import Chance, fast_row
 from ..stability import StabilityEnv
-from ..task.cost import cost_rate, rest_of_cost
-from ..task.failures import NOT_FINITE, OFF_ROAD, RUNNING, SPIN
-from ..task.info import REPORT
-from ..task.reference import Target, reference
 from ..ticks import TICK
-from ..vehicle.actuators import Lag, distribute, lagged, slewed, within_stop, yaw_moment
-from ..vehicle.dynamics import Motion, Road, sideslip_angle
 from .checks import check_options, check_scenario
 from .plants import OUTSIDE_PLANTS, Acting, OutsidePlant, outside_vehicle
+
+_fixed_of, _kind_of, _write_end = plain(fixed_of), plain(kind_of), plain(write_end)
+_command, _sense = plain(command), plain(sense)
 
 
 class OutsideEnv(StabilityEnv):
@@ -41,13 +31,14 @@ class OutsideEnv(StabilityEnv):
     plant whose state is no longer finite ends the episode as "not-finite". Needs the extra
     `outside`. A loop in Python, hundreds of times slower than ours.
 
-    model: "single-track", "drift" or "multi-body". nominal: what estimators and controllers are
-    told (default: `outside_vehicle()`). The other arguments are those of `StabilityEnv`, but there
-    is no `vehicle`: the true one is the model's. The scenario's friction is the tyre's peak
-    lateral friction, which `vehicle` tells; on the single track, whose tyres are linear, it has no
-    effect, and there is no reset option "friction". One tyre serves both axles, so its stiffness
-    is scaled by the mean of the scenario's two factors. Motors and steering act for a tick with
-    the mean that the record tells. The multi-body model always rolls, the others never do.
+    model: "single-track", "drift" or "multi-body". nominal: the vehicle that estimators and
+    controllers are designed from (default: `outside_vehicle()`). The other arguments are those of
+    `StabilityEnv`, but there is no `vehicle`: the true one is the model's. The scenario's friction
+    is the tyre's peak lateral friction, that of `vehicle`; on the single track, whose tyres are
+    linear, it has no effect, and there is no reset option "friction". One tyre serves both axles,
+    so its stiffness is scaled by the mean of the scenario's two factors. Motors and steering act
+    for a tick with their mean in the record. The multi-body model always rolls, the others never
+    do.
 
     Raises ValueError for an unknown model, a scenario with a road or a plant that the model has
     not (curvature, bank, grade, small_angle, tyres, vehicle, friction_right,
@@ -85,13 +76,13 @@ class OutsideEnv(StabilityEnv):
         if "state" in asked:  # s and y are X and Y on the straight road of these plants
             state = asked["state"]
             asked["state"] = {**state, "s": state.get("X", 0.0), "y": state.get("Y", 0.0)}
-        told = super().reset(seed=seed, options=asked)
+        first = super().reset(seed=seed, options=asked)
         p, base = self._params, self._now.vehicle
         scale = 0.5 * (p[P.car.C_f] / base.front_stiffness + p[P.car.C_r] / base.rear_stiffness)
         p[P.car.C_f], p[P.car.C_r] = scale * base.front_stiffness, scale * base.rear_stiffness
         self.plant = OUTSIDE_PLANTS[self.model](float(p[P.car.mu]), float(scale))
         self.plant.start(self.motion)
-        return told
+        return first
 
     def get_state(self) -> dict[str, Any]:
         """A snapshot that `set_state` continues from, bit for bit."""
@@ -107,142 +98,43 @@ class OutsideEnv(StabilityEnv):
         self.plant.x = x.copy()
 
     def _advance(self, force: npt.NDArray[np.float32], obs: npt.NDArray[np.float32]) -> int:
-        """One control period of the outside plant: the order of `kernel.step_vehicle`."""
-        if not np.isfinite(force).all():
+        """One control period of the outside plant: `step_vehicle` with another motion."""
+        share, turn = shares_of(force)
+        if share != share:
             return super()._advance(force, obs)  # refuses or fails before it moves anything
-        told = _Told(*(read(self._params, getattr(P, name)) for name in _Told._fields))
-        shares = [float(clip(float(share), -1.0, 1.0)) for share in (*force, 0.0)[:2]]
-        z, cost, count, failure, done = self._state, 0.0, 0, RUNNING, 0
-        beta, refs, moment, steer = 0.0, (0.0, 0.0), 0.0, 0.0
-        while done < self.control_period and failure == RUNNING and not self._at_end:
-            before = self.motion
-            acted = self._command(told, before.v_x, shares)
-            steer = acted[0]
-            motion = self.plant.motion if self.plant.finite else before
-            write(z, motion, Z.motion)
-            count = self._sense(motion, acted[:5], done, count)
-            beta = sideslip_angle(motion.v_x, motion.v_y, 0)
-            row = self.rows[done]
-            v = 0.5 * (row[FAST.wheel_left] + row[FAST.wheel_right])
-            kind = int(self._now.switches[FLAGS.reference])
-            z[Z.driver] = self._driver(told, motion)
-            refs = reference(float(z[Z.driver]), float(v), told.target, kind)
-            moment = yaw_moment(acted[1], acted[2], self.plant.car)
-            share = moment / told.task.yaw_scale
-            cost += TICK * cost_rate(beta - refs[0], motion.gamma - refs[1], share, acted[5], kind)
-            done += 1
-            failure = self._failure(told, motion, beta)
-        z[Z.clock.failure] = failure
-        if failure != RUNNING:
-            cost += rest_of_cost(told.task.duration, float(z[Z.clock.tick]))
-        self._tell(done, count, refs, obs)
-        write_report(self._report, z)
-        self._report[REPORT.beta] = beta
-        self._report[[REPORT.beta_ref, REPORT.gamma_ref]] = refs
-        self._report[REPORT.steer], self._report[REPORT.yaw_moment] = steer, moment
-        self._report[REPORT.cost], self._report[REPORT.reward] = cost, -cost
-        self._report[REPORT.packets], self._report[REPORT.ended] = count, float(self._at_end)
+        p, z, switches, n = self._params, self._state, self._now.switches, self.control_period
+        kind = _kind_of(p, switches)
+        foresee(p, z, n, kind.follows, self._scratch)
+        done = self._drive_on(_fixed_of(p), kind, share, turn)
+        record = (self.rows, self.packets, self._report, self._scratch)
+        conclude(p, z, switches, n, done, self._bounds, obs, *record)
         return done
 
-    @property
-    def _at_end(self) -> bool:
-        return bool(self._state[Z.clock.tick] >= self._params[P.task.duration])
-
-    def _command(
-        self, told: "_Told", v_x: float, shares: list[float]
-    ) -> tuple[float, float, float, float, float, float]:
-        """Let the actuators follow and the plant move for a tick.
-
-        Returns what acted, as `Fast` has it from `steer` on, and the added steering.
-        """
-        z, task, car = self._state, told.task, self.plant.car
-        drive = read(z, Z.drive)
-        tick = float(z[Z.clock.tick])
-        driver = float(z[Z.driver])
-        slewing = slewed(drive.slewing, shares[1] * task.authority, task.slew)
-        extra = within_stop(slewing, driver, task.stop)
-        limit = 2.0 * car.T_max / (car.m * car.r)
-        a_x, integral = acceleration_command(tick, v_x, drive.integral, told.pace, limit)
-        to_l, to_r = distribute(shares[0] * task.yaw_scale, a_x, car, task.yaw_first)
-        F_w, N_w, N_x = wind_at(tick, told.wind)
-        mean, end = (told.motor.mean, told.steering.mean), (told.motor.end, told.steering.end)
-        steer = lagged(driver + extra, drive.delta_f, mean[1])
-        left, right = lagged(to_l, drive.T_l, mean[0]), lagged(to_r, drive.T_r, mean[0])
-        added = lagged(extra, drive.added, mean[1])
-        self.plant.step(Acting(steer, left, right, drive.F_d + F_w, drive.N_d + N_w, N_x), TICK)
-        z[Z.clock.tick] = tick + 1.0
-        ou, wheels = told.disturbance, self._normals(CHANNELS.wheels)
-        after = Drive(
-            lagged(to_l, drive.T_l, end[0]),
-            lagged(to_r, drive.T_r, end[0]),
-            lagged(driver + extra, drive.delta_f, end[1]),
-            integral,
-            ou.keep * drive.F_d + ou.fresh * ou.force * wheels[2],
-            ou.keep * drive.N_d + ou.fresh * ou.moment * wheels[3],
-            slewing,
-            lagged(extra, drive.added, end[1]),
-        )
-        write(z, after, Z.drive)
-        return steer, left, right, driver, a_x, added
-
-    def _driver(self, told: "_Told", motion: Motion) -> float:
-        """The driver's steering command at the tick just reached."""
-        z, task = self._state, told.task
-        if self._now.switches[FLAGS.steering] == DRIVER:
-            angle, person, path = float(z[Z.driver]), told.driver, told.path
-            return float(steered(angle, motion, path, _FLAT, told.target, person, task.stop))
-        programme = read(self._params, P.programme)
-        return float(steering_at(float(z[Z.clock.tick]), programme))
-
-    def _normals(self, channel: int) -> tuple[float, ...]:
-        clock = read(self._state, Z.clock)
-        keys = int(clock.key_low), int(clock.key_high)
-        return tuple(normals(*keys, int(clock.tick), channel))
-
-    def _sense(self, motion: Motion, acted: tuple[float, ...], row: int, count: int) -> int:
-        """The sensors at the tick just reached; returns how many packets there are now."""
-        force = self.plant.specific_force if self.plant.finite else (0.0, 0.0)
-        p, z, tick = self._params, self._state, float(self._state[Z.clock.tick])
-        chance = Chance(self._normals(CHANNELS.inertial), self._normals(CHANNELS.wheels))
-        noise, d_f = read(p, P.noise), float(p[P.car.d_f])
-        self.rows[row] = fast_row(motion, force, acted, d_f, noise, chance)
-        return (
-            int(sense_slow(p, z, motion, tick, 0, self.packets, count)) if due(z, tick) else count
-        )
-
-    def _failure(self, told: "_Told", motion: Motion, beta: float) -> int:
-        if not self.plant.finite:
-            return NOT_FINITE
-        if absolute(beta) > told.task.spin and motion.v_x > 0.0:  # backing up is no spin
-            return SPIN
-        follows = self._now.switches[FLAGS.steering] == DRIVER
-        way = path_offset(told.path, motion.s) if follows else 0.0
-        return OFF_ROAD if absolute(motion.y - way) > told.task.half_width else RUNNING
-
-    def _tell(
-        self, done: int, count: int, refs: tuple[float, float], obs: npt.NDArray[np.float32]
-    ) -> None:
-        """The observation; where every sample is asked for, the last stands for missing ones."""
-        switches, n = self._now.switches, done
-        if switches[FLAGS.all_samples]:
-            self.rows[done:] = self.rows[done - 1]
-            n = self.control_period
-        args = (self.rows, n, count, self.packets, refs, self._bounds, obs)
-        observe(self._params, self._state, switches, *args)
-
-
-class _Told(NamedTuple):
-    """The parts of the packed parameters that a tick reads."""
-
-    motor: Lag
-    steering: Lag
-    wind: Wind
-    pace: Pace
-    target: Target
-    disturbance: Disturbance
-    task: Task
-    driver: Driver
-    path: Path
-
-
-_FLAT = Road(0.0, 0.0, 1.0)
+    def _drive_on(self, fixed: Fixed, kind: Kind, share: float, turn: float) -> int:
+        """`step.drive_on` whose motion is the outside plant's; returns the ticks done."""
+        z, plant, task = self._state, self.plant, fixed.task
+        now = Moving(read(z, Z.motion), read(z, Z.drive), None, float(z[Z.driver]), fixed.car)
+        tick, cost, done, over = float(z[Z.clock.tick]), 0.0, 0, False
+        N_z, added = share * task.yaw_scale, turn * task.authority
+        while not over:
+            chance = chance_at(self._scratch, done)
+            control = _command(fixed, N_z, added, now, tick, chance)
+            acted = control.acted
+            # a quotient, not the product of `command`: its last bit is that of all drives so far
+            acted = acted._replace(effort=acted.moment / task.yaw_scale)
+            plant.step(Acting(acted.steer, acted.T_l, acted.T_r, *control.push), TICK)
+            motion, force = now.motion, (0.0, 0.0)
+            if plant.finite:
+                motion, force = plant.motion, plant.specific_force
+            ahead = at(self._scratch, WINDOW.ahead, done)
+            driver, seen = _sense(fixed, motion, force, acted, now.car, ahead, chance, kind)
+            seen = seen._replace(lost=not plant.finite)
+            now = Moving(motion, control.drive, None, driver, now.car)
+            write(self.rows[done], seen.row, FAST)
+            write(self._scratch, motion, WINDOW.track, done)
+            tick, cost, done = tick + 1.0, cost + seen.cost * TICK, done + 1
+            failed = seen.lost or seen.spun or seen.off
+            over = failed or tick >= task.duration or done == self.control_period
+        write(z, now.motion, Z.motion)
+        _write_end(z, self._report, now, seen, seen.beta, seen.refs, tick, cost, task.duration)
+        return done

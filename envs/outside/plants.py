@@ -36,7 +36,7 @@ STABLE = 1.5  # of the fastest eigenvalue times the step; Runge-Kutta's limit is
 
 
 class Acting(NamedTuple):
-    """What acts on the car during a step."""
+    """Inputs of the plant, constant during a step."""
 
     steer: float  # rad, front wheels
     T_l: float = 0.0  # N m, left rear motor
@@ -66,7 +66,7 @@ def _parameters() -> Any:
 
 @functools.cache
 def outside_vehicle() -> Vehicle:
-    """The BMW 320i as our `Vehicle`: what estimators and controllers are told of an outside plant.
+    """The BMW 320i as our `Vehicle`: the nominal vehicle of estimators and controllers.
 
     Cornering stiffness is the Magic Formula's slope p_Ky1 F_z at the tyre's standing load. Roll
     stiffness is that of springs and anti-roll bars on top of the tyres' vertical springs.
@@ -147,7 +147,7 @@ class OutsidePlant(ABC):
 
     @abstractmethod
     def felt(self, acting: Acting) -> tuple[float, float]:
-        """The specific force of the state x under what acts; may raise what the models raise."""
+        """The specific force of the state x under the inputs; raises what the models raise."""
 
     @property
     def finite(self) -> bool:

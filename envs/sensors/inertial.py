@@ -3,6 +3,10 @@
 from typing import Any, NamedTuple
 
 from ..backend.decorators import inlined
+from ..backend.primitives import anywhere, select
+from ..ticks import TICK
+from ..vehicle.dynamics import gravity_at
+from ..vehicle.vehicle import GRAVITY
 
 
 class Chance(NamedTuple):
@@ -10,6 +14,23 @@ class Chance(NamedTuple):
 
     inertial: Any
     wheels: Any
+
+
+@inlined
+def specific_force(before: Any, after: Any, road: Any, small_angle: int, roll: int) -> Any:
+    """(a_x, a_y) in m/s2, mean over a tick between two Motions: v', turning axes, gravity."""
+    turn_x = 0.5 * (before.gamma * before.v_y + after.gamma * after.v_y)
+    turn_y = 0.5 * (before.gamma * before.v_x + after.gamma * after.v_x)
+    turns_x = (small_angle == 0) | (roll == 1)  # tie-vision holds v_x; double-layer-gps (4)
+    a_x = (after.v_x - before.v_x) * (1.0 / TICK) - select(turns_x, turn_x, 0.0)
+    a_y = (after.v_y - before.v_y) * (1.0 / TICK) + turn_y
+    if roll:
+        a_y = a_y + 0.5 * GRAVITY * (before.phi + after.phi)  # double-layer-gps (5)
+    if anywhere((road.along != 0.0) | (road.across != 0.0)):
+        first = gravity_at(before, road, small_angle)
+        last = gravity_at(after, road, small_angle)
+        a_x, a_y = a_x + 0.5 * (first[0] + last[0]), a_y + 0.5 * (first[1] + last[1])
+    return a_x, a_y
 
 
 @inlined

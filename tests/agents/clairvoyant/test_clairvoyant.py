@@ -19,7 +19,7 @@ pytest.importorskip("osqp")
 from sideslip.agents import make_agent  # noqa: E402
 from sideslip.agents.clairvoyant import plan as clairvoyant  # noqa: E402
 from sideslip.agents.clairvoyant import shooting as clairvoyant_nonlinear  # noqa: E402
-from sideslip.agents.clairvoyant.foresight import Known, State, foresee  # noqa: E402
+from sideslip.agents.clairvoyant.foresight import Known, State, forecast_of  # noqa: E402
 from sideslip.agents.clairvoyant.plan import Replay, actions_of, ceiling, drive, plan, replay  # noqa: E402
 from sideslip.agents.clairvoyant.plant import advance  # noqa: E402
 from sideslip.agents.rollout import rollout  # noqa: E402
@@ -50,15 +50,15 @@ def test_a_symbolic_tick_is_the_envs(scenario: str, small_angle: bool, lags: boo
     }
     env = make(scenario, 0.2, 1, **changes)
     env.reset(seed=2)
-    foreseen = foresee(env.unwrapped)
+    forecast = forecast_of(env.unwrapped)
     w = ca.SX.sym("w", len(State._fields))
     u, known = ca.SX.sym("u"), ca.SX.sym("known", len(Known._fields))
-    step = advance(foreseen.fixed, State(*ca.vertsplit(w)), [u], Known(*ca.vertsplit(known)))
+    step = advance(forecast.fixed, State(*ca.vertsplit(w)), [u], Known(*ca.vertsplit(known)))
     tick = ca.Function("tick", [w, u, known], [ca.vertcat(*step.state)])
     actions = np.random.default_rng(0).uniform(-1.0, 1.0, (200, 1))
     run = drive(env, 2, actions).trajectory
     for k in range(200):
-        after = tick(run.states[k], run.actions[k], foreseen.known[:, k]).full()[:, 0]
+        after = tick(run.states[k], run.actions[k], forecast.known[:, k]).full()[:, 0]
         np.testing.assert_allclose(after, run.states[k + 1], rtol=1e-9, atol=1e-9)
 
 
@@ -75,33 +75,33 @@ def test_a_symbolic_tick_is_the_envs(scenario: str, small_angle: bool, lags: boo
 def test_a_symbolic_tick_is_the_envs_where_the_road_the_tyres_or_the_driver_act(
     changes: dict[str, Any],
 ) -> None:
-    """The driver is foreseen in the run of the actions, so that is the run that is compared."""
+    """The driver steers as in the run of the actions, so that is the run that is compared."""
     env = gymnasium.make(ID, scenario=changes | {"duration": 0.2}, control_period=1)
     env.reset(seed=2)
     actions = np.random.default_rng(0).uniform(-1.0, 1.0, (200, 1))
-    foreseen = foresee(env.unwrapped, 1, actions)
+    forecast = forecast_of(env.unwrapped, 1, actions)
     w = ca.SX.sym("w", len(State._fields))
     u, known = ca.SX.sym("u"), ca.SX.sym("known", len(Known._fields))
-    step = advance(foreseen.fixed, State(*ca.vertsplit(w)), [u], Known(*ca.vertsplit(known)))
+    step = advance(forecast.fixed, State(*ca.vertsplit(w)), [u], Known(*ca.vertsplit(known)))
     tick = ca.Function("tick", [w, u, known], [ca.vertcat(*step.state)])
     run = drive(env, 2, actions).trajectory
     for k in range(200):
-        after = tick(run.states[k], run.actions[k], foreseen.known[:, k]).full()[:, 0]
+        after = tick(run.states[k], run.actions[k], forecast.known[:, k]).full()[:, 0]
         np.testing.assert_allclose(after, run.states[k + 1], rtol=1e-9, atol=1e-9)
 
 
-def test_what_is_foreseen_is_what_the_car_meets() -> None:
+def test_the_forecast_is_what_the_car_meets() -> None:
     """The disturbances of a run with other actions are those that were listed."""
     env = make("gust", 0.5, 1)
     env.reset(seed=5)
-    foreseen = foresee(env.unwrapped)
+    forecast = forecast_of(env.unwrapped)
     state: Any = env.unwrapped
     snapshot = state.get_state()
     wind = read(snapshot["params"], P.wind)
     for k in range(500):
         z = state.get_state()["state"]
         force = z[Z.drive.F_d] + wind_at(float(k), wind)[0]
-        assert foreseen.known[Known._fields.index("F_d"), k] == force
+        assert forecast.known[Known._fields.index("F_d"), k] == force
         env.step(np.array([0.7], np.float32))
 
 
@@ -151,7 +151,7 @@ def test_steering_too() -> None:
     assert both.cost < 0.5 * alone.cost
     start = drive(env, 0, np.zeros((200, 2))).trajectory
     env.reset(seed=0)
-    planned = clairvoyant_nonlinear.solve(foresee(env.unwrapped), start).trajectory
+    planned = clairvoyant_nonlinear.solve(forecast_of(env.unwrapped), start).trajectory
     moved = np.diff(planned.states[:, State._fields.index("slewing")])
     assert np.abs(moved).max() < 0.8 * 0.01 * (1.0 + 1e-3)  # rad/s times the period
 
@@ -168,7 +168,7 @@ def test_a_plan_is_an_agent() -> None:
     np.testing.assert_array_equal(state[:, 0], [1.0, 8.0, 51.0])
 
 
-def test_an_unfinished_plan_says_so_and_the_better_run_stands(
+def test_an_unfinished_plan_has_its_status_and_the_better_run_stands(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setitem(clairvoyant_nonlinear._OPTIONS, "ipopt.max_iter", 1)
@@ -185,9 +185,9 @@ def test_an_unfinished_plan_says_so_and_the_better_run_stands(
 def test_a_failed_solve_gives_back_its_start() -> None:
     env = make("sine", 0.2)
     env.reset(seed=0)
-    foreseen = foresee(env.unwrapped)
+    forecast = forecast_of(env.unwrapped)
     start = drive(env, 0, np.full((20, 1), 0.25)).trajectory
-    lost = dataclasses.replace(foreseen, known=np.full_like(foreseen.known, np.nan))
+    lost = dataclasses.replace(forecast, known=np.full_like(forecast.known, np.nan))
     found = clairvoyant_nonlinear.solve(lost, start)
     assert not found.solved and found.status == "Invalid_Number_Detected"
     np.testing.assert_array_equal(found.trajectory.actions, start.actions)
@@ -198,10 +198,10 @@ def test_bad_input() -> None:
     with pytest.raises(ValueError, match=r"shape \(20, 1\), got \(3, 1\)"):
         plan(env, 0, np.zeros((3, 1)))
     with pytest.raises(ValueError, match="3 steps do not divide a control period of 10 ticks"):
-        foresee(env.unwrapped, 3)
+        forecast_of(env.unwrapped, 3)
     env.step(np.zeros(1, np.float32))
     with pytest.raises(ValueError, match="call reset"):
-        foresee(env.unwrapped)
+        forecast_of(env.unwrapped)
     for wrong in (np.zeros(5), np.zeros((5, 2)), np.full((5, 1), np.nan)):
         with pytest.raises(ValueError, match="a plan is finite numbers"):
             Replay(env, wrong)

@@ -13,11 +13,15 @@ from sideslip.agents.rollout import rollout
 from sideslip.envs import FAILURES
 from sideslip.envs.backend.arrays import read
 from sideslip.envs.engine.layout import Z
+from sideslip.envs.sensors.inertial import specific_force
+from sideslip.envs.vehicle.dynamics import Car, Motion, Push, Road, rk4
+from sideslip.envs.vehicle.tyres import FIALA, Inputs, load_of
 from sideslip.estimators import EstimateObservation
 
 pytest.importorskip("vehiclemodels")
-from sideslip.envs.outside.plants import Acting, outside_vehicle
+from sideslip.envs.outside.plants import OUTSIDE_PLANTS, Acting, OutsidePlant, outside_vehicle
 
+from ..helpers import bits
 from .cars import CALM, MODELS, STEP, V, driven, outside
 
 
@@ -47,6 +51,58 @@ def test_sensors_and_disturbances_draw_what_ours_draw(model: str) -> None:
     assert disturbances[0] == disturbances[1]
     assert 0.0 not in disturbances[0]
     assert ours.layout == env.layout
+
+
+class OwnPlant(OutsidePlant):
+    """Our own plant as an outside one: Fiala tyres, roll, inputs held over a tick."""
+
+    law = "vehicle_dynamics_std"  # loaded, not used
+    car: Car
+
+    def start(self, motion: Motion) -> None:
+        self.x = np.array(motion)
+
+    def derivative(self, x: Any, acting: Acting) -> Any:
+        raise NotImplementedError
+
+    @property
+    def motion(self) -> Motion:
+        return Motion(*self.x.tolist())
+
+    def felt(self, acting: Acting) -> tuple[float, float]:
+        raise NotImplementedError
+
+    def step(self, acting: Acting, h: float) -> None:
+        car = self.car._replace(mu=self.p.tire.p_dy1, mu_r=self.p.tire.p_dy1)
+        load = load_of(Inputs(*acting[:3]), car, 0, 1)
+        before, push, road = self.motion, Push(*acting[3:]), Road(0.0, 0.0, 1.0)
+        after = rk4(before, (load, load, load), push, car, road, h, 0, FIALA, 1)
+        self.specific_force = specific_force(before, after, road, 0, 1)
+        self.x = np.array(after)
+
+
+@pytest.mark.parametrize("base", ["random-steering", "double-lane-change", "gust"])
+def test_around_our_own_plant_it_is_our_own_environment(
+    base: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Commands, sensors, references, cost and the end of an episode are those of our own ticks."""
+    monkeypatch.setitem(OUTSIDE_PLANTS, "drift", OwnPlant)
+    scenario = {"base": base, "duration": 3.0, "lags": False, "wind_height": 0.0, "speed": 20.0}
+    scenario |= {"front_stiffness": 1.0, "rear_stiffness": 1.0}
+    arguments: dict[str, Any] = {"scenario": scenario, "steering": True, "reference": "model"}
+    vehicle = outside_vehicle().to_dict()
+    ours: Any = gym.make("sideslip/AfsYawFusion-v0", vehicle=vehicle, **arguments).unwrapped
+    env = outside("drift", **arguments)
+    assert bits(ours.reset(seed=5)) == bits(env.reset(seed=5))
+    over, rng = False, np.random.default_rng(1)
+    while not over:
+        action = rng.uniform(-1.0, 1.0, 2)
+        obs, reward, *ends, info = ours.step(action)
+        found, cost, *ended, facts = env.step(action)
+        assert (bits(obs), bits(ours.record), ends) == (bits(found), bits(env.record), ended)
+        assert (reward, info) == (pytest.approx(cost, rel=1e-13), pytest.approx(facts, rel=1e-13))
+        over = any(ends)
+    assert facts["t"] > 1.0
 
 
 @pytest.mark.parametrize("model", MODELS)
