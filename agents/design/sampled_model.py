@@ -150,7 +150,7 @@ def _tick_of_the_plane(vehicle: Vehicle, speed: float, purpose: Purpose) -> tupl
 
 
 def _weights(purpose: Purpose) -> Sequence[float]:
-    """Of the four that the cost judges, DESIGN section 4."""
+    """Of the four that the cost judges: docs/ARCHITECTURE.md, "Cost and score"."""
     return (
         1.0 / BETA_SCALE**2,
         0.0 if purpose.kind == ZERO_SLIP else 1.0 / GAMMA_SCALE**2,

@@ -1,0 +1,94 @@
+"""The documents: their examples run, with the edits that they show; what they point to exists."""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+FLOORS = ("envs", "estimators", "agents", "benchmarks")
+PLACE = re.compile(rf"`((?:{'|'.join((*FLOORS, 'tests', 'docs'))})/[\w/.-]*)`")
+NAME = re.compile(r"`sideslip((?:\.\w+)+)")
+LINK = re.compile(r"\]\((?!http)([^)#]+)")
+FENCE = re.compile(r"^```(python|diff)(?: (\S+))?\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+MOST_FILES = {"sensor": 5, "tyre law": 2, "filter": 1, "controller": 2, "scenario": 1, "metric": 2}
+"""Files to edit for an extension."""
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+def test_what_a_document_points_to_exists(document: Path) -> None:
+    text = document.read_text()
+    for place in PLACE.findall(text):
+        assert (ROOT / place).exists(), place
+    for target in LINK.findall(text):
+        assert (document.parent / target).exists(), target
+    for dotted in NAME.findall(text):
+        found: Any = import_module("sideslip")
+        path = "sideslip"
+        for part in dotted.strip(".").split("."):
+            path = f"{path}.{part}"
+            if not hasattr(found, part):
+                import_module(path)
+            found = getattr(found, part)
+
+
+def run(code: str, folder: Path, package: Path, **variables: str) -> str:
+    """Run code in a fresh interpreter and an empty folder; `package` holds `sideslip`."""
+    folder.mkdir()
+    environment = os.environ | {"PYTHONPATH": str(package), "MPLBACKEND": "Agg"} | variables
+    command = [sys.executable, "-W", "ignore", "-c", code]
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-3000:]
+    return done.stdout
+
+
+@pytest.mark.long
+def test_the_readmes_examples_run(tmp_path: Path) -> None:
+    """One after the other, as a reader types them."""
+    blocks = [code for kind, _, code in FENCE.findall((ROOT / "README.md").read_text())]
+    assert len(blocks) >= 3
+    run("\n".join(blocks), tmp_path / "empty", ROOT / "src")
+
+
+EXTENDING = "".join(path.read_text() for path in DOCUMENTS if path.name == "EXTENDING.md")
+SECTIONS = dict(section.split("\n", 1) for section in EXTENDING.split("\n## ")[1:])
+
+
+@pytest.mark.parametrize("title", SECTIONS)
+def test_an_extension_runs_in_a_copy_with_its_edits(title: str, tmp_path: Path) -> None:
+    """Without the compiler, so that nothing is compiled for it; the edits fit the files today."""
+    package = tmp_path / "copy" / "sideslip"
+    for floor in FLOORS:
+        ignored = shutil.ignore_patterns("__pycache__")
+        shutil.copytree(ROOT / floor, package / floor, ignore=ignored)
+    for face in ("__init__.py", "__main__.py"):
+        shutil.copy(ROOT / face, package)
+    edited, code = set(), []
+    for kind, place, text in FENCE.findall(SECTIONS[title]):
+        if kind == "python":
+            code.append(text)
+        else:
+            edited.add(place)
+            edit(package / place, text)
+    assert len(edited) <= MOST_FILES[title.removeprefix("A ")]
+    assert code
+    run("\n".join(code), tmp_path / "empty", package.parent, NUMBA_DISABLE_JIT="1")
+
+
+def edit(path: Path, diff: str) -> None:
+    """Apply a diff whose parts are divided by lines of @@; a new file is one part of + alone."""
+    text = path.read_text() if path.exists() else ""
+    for part in re.split(r"^@@.*\n", diff, flags=re.MULTILINE):
+        lines = part.splitlines()
+        old = "".join(f"{line[1:]}\n" for line in lines if line[:1] != "+")
+        new = "".join(f"{line[1:]}\n" for line in lines if line[:1] != "-")
+        assert text.count(old) == 1 or not (old or text), f"{path.name} has no\n{old}"
+        text = text.replace(old, new) if old else new
+    path.write_text(text)
