@@ -4,9 +4,10 @@
 if __name__ != "sideslip.envs":
     raise ImportError(f"this folder is the package sideslip.envs; it was imported as {__name__}")
 
-from .record import Log, Record, SlowSensor
+from .record import Log, Record
 from .scenarios.manoeuvres import SCENARIOS, scenario_from
 from .scenarios.scenario import Scenario
+from .sensors.link import SlowSensor
 from .stability import StabilityEnv
 from .task.failures import FAILURES
 from .task.observation import Entry

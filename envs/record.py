@@ -2,13 +2,14 @@
 
 import dataclasses
 import itertools
-import math
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from .sensors.link import SlowSensor
+from .sensors.slow import SLOW_NAMES, VALUES
 from .ticks import TICK
 
 Array = npt.NDArray[np.float64]
@@ -33,70 +34,20 @@ class Fast(NamedTuple):
 class Packet(NamedTuple):
     """Columns of a slow sensor's packet."""
 
-    sensor: int = 0  # CAMERA or GPS
+    sensor: int = 0  # its place in `sensors.slow.SLOW`
     captured: int = 1  # tick
     arrived: int = 2  # tick
     quality: int = 3  # 1 good; 0 do not use the course (too slow)
     sequence: int = 4
-    value: int = 5  # the first of six values
+    value: int = 5  # the first of VALUES
 
 
 FAST, PACKET = Fast(), Packet()
 FAST_UNITS = (
     "rad/s", "m/s2", "m/s2", "rad/s", "m/s", "m/s", "rad", "N m", "N m", "rad", "m/s2",
 )  # fmt: skip
-FAST_WIDTH, VALUES = len(FAST), 6
+FAST_WIDTH = len(FAST)
 PACKET_WIDTH = PACKET.value + VALUES
-
-CAMERA, GPS = 0, 1
-SLOW_NAMES = ("camera", "gps")
-SLOW_VALUES: dict[str, tuple[tuple[str, str], ...]] = {
-    "camera": (("psi", "rad"), ("y_l", "m")),
-    "gps": (
-        ("course", "rad"),
-        ("speed", "m/s"),
-        ("X", "m"),
-        ("Y", "m"),
-        ("hdop", "-"),
-        ("satellites", "-"),
-    ),
-}
-
-
-@dataclass(frozen=True)
-class SlowSensor:
-    """A slow sensor's clock and link, as estimators are told it; times in seconds.
-
-    A sample is captured every `period` from `phase` on (None: drawn at each reset; the running
-    env's `slow_sensors` tells the drawn one). Frame i arrives `delays[i % len(delays)]` plus a
-    random share of `jitter` later, unless it is lost (`loss`, a probability) or captured within
-    an outage. `duplicate` is the probability that it arrives a second time.
-    """
-
-    period: float
-    delays: tuple[float, ...] = (0.0,)
-    phase: float | None = 0.0
-    jitter: float = 0.0
-    loss: float = 0.0
-    duplicate: float = 0.0
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "delays", tuple(float(d) for d in self.delays))
-        if not TICK <= self.period < math.inf:
-            raise ValueError(f"a slow sensor's period must be at least one tick, got {self.period}")
-        if not self.delays or len(self.delays) > 4:
-            raise ValueError(f"expected one to four delays, got {self.delays}")
-        times = (*self.delays, self.jitter, self.phase or 0.0)
-        if not all(0.0 <= time < math.inf for time in times):
-            raise ValueError(f"{self}: delays, jitter and phase must be finite and not negative")
-        for name in ("loss", "duplicate"):
-            if not 0.0 <= getattr(self, name) <= 1.0:
-                raise ValueError(f"{name} is a probability, got {getattr(self, name)}")
-
-    @property
-    def longest_delay(self) -> float:
-        """The longest delay in seconds, jitter included."""
-        return max(self.delays) + self.jitter
 
 
 @dataclass

@@ -16,10 +16,11 @@ from .engine.reset import reset_vehicle
 from .engine.step import step_vehicle
 from .engine.views import motion_in, record_in, slow_in, vehicle_in
 from .engine.window import scratch_of
-from .record import FAST_WIDTH, PACKET_WIDTH, Record, SlowSensor
+from .record import FAST_WIDTH, PACKET_WIDTH, Record
 from .scenarios.draws import DRAWS_WIDTH
 from .scenarios.manoeuvres import scenario_from
 from .scenarios.scenario import Scenario
+from .sensors.link import SlowSensor
 from .task.failures import REFUSED, RUNNING
 from .task.info import REPORT, info_of
 from .task.observation import Entry
@@ -99,12 +100,11 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
         control_period: int = 10,
         reference: str = "zero-slip",
         fast: str = "summary",
-        camera: Mapping[str, Any] | None = None,
-        gps: Mapping[str, Any] | None = None,
         yaw_first: bool = True,
         steering: bool = False,
         on_bad_action: str = "raise",
         render_mode: str | None = None,
+        **slow: Mapping[str, Any] | None,
     ) -> None:
         if render_mode is not None:  # stable-baselines3 tries "rgb_array" and minds TypeError only
             raise TypeError(f"unknown render_mode {render_mode!r}; known: none")
@@ -118,11 +118,10 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
             control_period,
             reference,
             fast,
-            camera,
-            gps,
             yaw_first,
             steering,
             on_bad_action,
+            slow,
         )
         self.control_period, self.reference = int(control_period), reference
         self._now = self.setting.base

@@ -10,7 +10,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.linalg import block_diag
 
-from ..envs.record import FAST, FAST_WIDTH, PACKET_WIDTH, SLOW_NAMES, Log, Record, SlowSensor
+from ..envs.record import FAST, FAST_WIDTH, PACKET_WIDTH, Log, Record
+from ..envs.sensors.link import SlowSensor
+from ..envs.sensors.slow import SLOW_NAMES
 from .core.entry import advance_entry, receive_entry, step_entry
 from .core.memory import Counters
 from .core.run import begin_all

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..envs.record import SlowSensor
+from ..envs.sensors.link import SlowSensor
 from ..envs.ticks import TICK
 from ..envs.vehicle.vehicle import COMS, Vehicle, vehicle_from
 from .core.memory import FILTER

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...envs.record import FAST, Array, Log, SlowSensor
+from ...envs.record import FAST, Array, Log
 from ...envs.recordings.log_file import packet_rows
 from ...envs.sensors.gps import COURSE_SPEED
+from ...envs.sensors.link import SlowSensor
 
 _NOT_NEGATIVE = ("course_noise_deg", "delay")
 

@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from ...envs.record import Array, Log, SlowSensor
+from ...envs.record import Array, Log
+from ...envs.sensors.link import SlowSensor
 from ...envs.vehicle.vehicle import Vehicle
 from ...estimators.estimates import UnobservableWarning
 from ...estimators.make import make_estimator

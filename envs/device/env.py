@@ -15,8 +15,8 @@ from ..engine.layout import FLAGS, P
 from ..engine.packing import Template
 from ..engine.step import kind_of
 from ..engine.tick import Kind
-from ..record import SLOW_NAMES
 from ..sensors.link import Link
+from ..sensors.slow import SLOW_NAMES
 from ..task.failures import RUNNING
 from ..task.info import REPORT, Report
 from ..vector import StabilityVectorEnv

@@ -5,8 +5,9 @@ from typing import Any
 from ..backend.elementary import clip
 from ..backend.on_torch import on_tensors, torch
 from ..backend.primitives import select
-from ..engine.layout import SLOW
-from ..record import CAMERA, FAST, PACKET, VALUES
+from ..engine.layout import IN_SLOW
+from ..record import FAST, PACKET
+from ..sensors.slow import WIDTHS
 from ..task.cost import rest_of_cost
 from ..task.failures import BAD_ACTION, RUNNING
 from ..task.info import Report
@@ -58,14 +59,13 @@ class Telling:
         self, sensor: int, tick: Tensor, slow: Tensor, delivered: Delivered
     ) -> list[Tensor]:
         """Values, age and freshness of one sensor's newest sample."""
-        captured = slow[SLOW.captured]
+        captured = slow[IN_SLOW.captured]
         age = self._select(captured != NEVER, (tick - captured) * TICK, AGE_CAP)
         packets = delivered.packets
         place = torch.arange(len(packets), device=tick.device)[:, None]
-        newest = packets[:, PACKET.arrived] == slow[SLOW.arrived]  # neither late nor a duplicate
+        newest = packets[:, PACKET.arrived] == slow[IN_SLOW.arrived]  # neither late nor a duplicate
         fresh = (place < delivered.number) & (packets[:, PACKET.sensor] == sensor) & newest
-        first, width = SLOW.values[0], 2 if sensor == CAMERA else VALUES
-        values = slow[first : first + width].unbind(0)
+        values = [slow[i] for i in IN_SLOW.values[: WIDTHS[sensor]]]
         return [*values, age, fresh.any(0).to(tick.dtype)]
 
     def report(self, now: Now, duration: Tensor, count: Tensor) -> Tensor:

@@ -6,19 +6,16 @@ off the front what has arrived.
 """
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from ..backend.arrays import read
-from ..backend.elementary import exp
 from ..backend.on_torch import on_tensors, torch
 from ..backend.primitives import select
-from ..backend.random import CHANNELS, normals
-from ..engine.layout import SLOW, SLOW_WIDTH, P, Z
-from ..engine.packets import FAR
-from ..record import CAMERA, PACKET, PACKET_WIDTH, VALUES
-from ..sensors.camera import camera_sample
-from ..sensors.gps import gps_sample, sky_deviation
+from ..engine.layout import IN_SLOW, SLOW_WIDTH, P, Z
+from ..engine.packets import FAR, scene_of
+from ..record import PACKET, PACKET_WIDTH
 from ..sensors.link import Link, arrivals, most_under_way
+from ..sensors.slow import BLOCKS, VALUES, sample
 from ..ticks import NEVER
 from ..vehicle.dynamics import Motion
 
@@ -30,7 +27,6 @@ class Under(NamedTuple):
     """The slow sensors' part of the rows' state."""
 
     slow: Tensor  # (sensors, SLOW_WIDTH, N)
-    sky: Tensor  # (N,)
     queue: Tensor  # (room, PACKET_WIDTH, N), by arrival
 
 
@@ -72,80 +68,60 @@ class SlowSensors:
 
     def __init__(self, most: dict[int, Most], small_angle: int, dtype: torch.dtype) -> None:
         self.most, self._small_angle = most, small_angle
-        self._normals, self._arrivals, self._camera, self._gps = on_tensors(
-            dtype, normals, arrivals, camera_sample, gps_sample
+        self._sample, self._scene_of, self._arrivals, self._read, self._select = on_tensors(
+            dtype, sample, scene_of, arrivals, read, select
         )
-        self._sky, self._exp, self._select = on_tensors(dtype, sky_deviation, exp, select)
-        (self._read,) = on_tensors(dtype, read)
 
     def __call__(
         self, p: Tensor, keys: Tensor, under: Under, window: Window
     ) -> tuple[Under, Delivered]:
         """The slow sensors' state after an env-step, and what arrived in it."""
-        sensors, sky = [each.unbind(0) for each in under.slow.unbind(0)], under.sky
+        sensors = [list(each.unbind(0)) for each in under.slow.unbind(0)]
         new: list[Tensor] = []
         for sensor, most in self.most.items():
             for _ in range(most.frames):
-                sensors[sensor], sky, packets = self._capture(
-                    sensor, p, keys, sensors[sensor], sky, window
-                )
+                sensors[sensor], packets = self._capture(sensor, p, keys, sensors[sensor], window)
                 new += packets
         queue = in_order(torch.cat([under.queue, torch.stack(new)]))
         arrived = queue[:, PACKET.arrived]
         due = (arrived != NEVER) & (arrived <= window.last) & window.running
         count = due.sum(0)
-        slow = self._newest([list(each) for each in sensors], queue, due)
+        slow = self._newest(sensors, queue, due)
         left = taken_off(queue, count)[: len(under.queue)]
-        return Under(slow, sky, left), Delivered(queue, count)
+        return Under(slow, left), Delivered(queue, count)
 
     def _capture(
-        self, sensor: int, p: Tensor, keys: Tensor, slow: Any, sky: Tensor, window: Window
-    ) -> tuple[Any, Tensor, list[Tensor]]:
-        """The next frame of a sensor where it falls into the window: (the sensor's and the sky's
-        state then, its packets, of which those that are none never arrive)."""
+        self, sensor: int, p: Tensor, keys: Tensor, slow: Sequence[Tensor], window: Window
+    ) -> tuple[list[Tensor], list[Tensor]]:
+        """The next frame of a sensor where it falls into the window: (the sensor's state then, its
+        packets, of which those that are none never arrive)."""
         pick = self._select
-        frame, tick = slow[SLOW.frames], slow[SLOW.next_capture]
+        frame, tick = slow[IN_SLOW.frames], slow[IN_SLOW.next_capture]
         active = window.running & (tick > window.first) & (tick <= window.last)
         when = tick.to(torch.int64)
         j = (when - window.first.to(torch.int64) - 1).clamp(0, len(window.track) - 1)
         width = window.track.shape[1]
         place = j.expand(1, width, -1)
         motion = Motion(*window.track.gather(0, place)[0].unbind(0))
-        noise = self._read(p, P.noise)
         link = self._read(p, P.slow[sensor])
-        zero, one = torch.zeros_like(tick), torch.ones_like(tick)
-        if sensor == CAMERA:
-            road = self._read(p, P.road)
-            n = self._normals(keys[0], keys[1], when, CHANNELS.camera)
-            psi, y_l = self._camera(motion, road, p[P.car.l_pre], noise, n)
-            values, quality = (psi, y_l, zero, zero, zero, zero), one
-        else:
-            law = self._read(p, P.sky)
-            n = self._normals(keys[0], keys[1], when, CHANNELS.gps)
-            seen = self._normals(keys[0], keys[1], when, CHANNELS.sky)
-            sky = pick(active, self._sky(sky, law, link, tick, seen), sky)
-            *values, quality = self._gps(
-                motion,
-                p[P.car.ahead],
-                p[P.car.left],
-                self._exp(law.median + sky),
-                law.weight,
-                noise,
-                n,
-                self._small_angle,
-            )
-        block = CHANNELS.camera_link if sensor == CAMERA else CHANNELS.gps_link
+        scene = self._scene_of(p, motion, self._small_angle, keys, tick)
+        values, quality, drift = self._sample(sensor, scene, link, slow[IN_SLOW.drift])
+        sent = [
+            each if isinstance(each, Tensor) else torch.full_like(tick, each)
+            for each in (quality, frame, *values)
+        ]
         packets = []
-        both = self._arrivals(link, frame, tick, keys[0], keys[1], block)
+        both = self._arrivals(link, frame, tick, keys[0], keys[1], BLOCKS[sensor].link)
         for arrived in both[: self.most[sensor].copies]:
             due = pick(active, arrived, NEVER)
-            packets.append(
-                torch.stack((torch.full_like(tick, sensor), tick, due, quality, frame, *values))
-            )
-        following = (pick(active, frame + 1.0, frame), pick(active, tick + link.period, tick))
-        return (*following, *slow[2:]), sky, packets
+            packets.append(torch.stack((torch.full_like(tick, sensor), tick, due, *sent)))
+        after = list(slow)
+        after[IN_SLOW.frames] = pick(active, frame + 1.0, frame)
+        after[IN_SLOW.next_capture] = pick(active, tick + link.period, tick)
+        after[IN_SLOW.drift] = pick(active, drift, slow[IN_SLOW.drift])
+        return after, packets
 
-    def _newest(self, sensors: list[Any], queue: Tensor, due: Tensor) -> Tensor:
+    def _newest(self, sensors: list[list[Tensor]], queue: Tensor, due: Tensor) -> Tensor:
         """The sensors' state, as in `Under`, once the due packets were looked at in order."""
         pick = self._select
         for i in range(len(queue)):
@@ -153,15 +129,15 @@ class SlowSensors:
             for sensor in self.most:
                 slow = sensors[sensor]
                 better = due[i] & (packet[PACKET.sensor] == sensor)
-                better = better & (packet[PACKET.captured] > slow[SLOW.captured])
+                better = better & (packet[PACKET.captured] > slow[IN_SLOW.captured])
                 told = (
                     packet[PACKET.captured],
                     *packet[PACKET.value : PACKET.value + VALUES],
                     packet[PACKET.arrived],
                 )
-                for k, value in enumerate(told, SLOW.captured):
+                for k, value in enumerate(told, IN_SLOW.captured):
                     slow[k] = pick(better, value, slow[k])
-        return torch.stack([torch.stack(tuple(each)) for each in sensors])
+        return torch.stack([torch.stack(each) for each in sensors])
 
 
 def in_order(queue: Tensor) -> Tensor:
@@ -169,7 +145,7 @@ def in_order(queue: Tensor) -> Tensor:
     last."""
     whole = queue[:, :3].to(torch.int64)
     arrived = whole[:, PACKET.arrived]
-    key = (arrived << 32) + 2 * whole[:, PACKET.captured] + whole[:, PACKET.sensor]
+    key = (arrived << 32) + len(Z.slow) * whole[:, PACKET.captured] + whole[:, PACKET.sensor]
     key = torch.where(queue[:, PACKET.arrived] == NEVER, _LATE, key)
     place = torch.arange(len(queue), device=queue.device)[:, None]
     mine, other = key[:, None], key[None]
@@ -196,20 +172,19 @@ def read_packed(states: Tensor, room: int) -> Under:
     if bool((states[Z.under_way] > room).any()):
         raise ValueError(f"a state has more than {room} packets under way")
     slow = states[Z.slow[0].frames : Z.queue].reshape(len(Z.slow), SLOW_WIDTH, -1)
-    queue = states[Z.queue : Z.sky].reshape(-1, PACKET_WIDTH, states.shape[1])[:room].clone()
+    queue = states[Z.queue : Z.driver].reshape(-1, PACKET_WIDTH, states.shape[1])[:room].clone()
     place = torch.arange(room, device=queue.device)[:, None]
     queue[:, PACKET.arrived].masked_fill_(place >= states[Z.under_way], NEVER)
-    return Under(slow.clone(), states[Z.sky].clone(), in_order(queue))
+    return Under(slow.clone(), in_order(queue))
 
 
 def write_packed(under: Under, states: Tensor) -> None:
     """Write the slow sensors' part into packed states (STATE_WIDTH, N)."""
     count = states.shape[1]
     states[Z.slow[0].frames : Z.queue] = under.slow.reshape(-1, count)
-    states[Z.queue : Z.sky] = 0.0
+    states[Z.queue : Z.driver] = 0.0
     flat = under.queue.reshape(-1, count)
     states[Z.queue : Z.queue + len(flat)] = flat
-    states[Z.sky] = under.sky
     arrived = under.queue[:, PACKET.arrived]
     states[Z.under_way] = (arrived != NEVER).sum(0).to(states.dtype)
     states[Z.clock.next_due] = torch.where(arrived[0] == NEVER, FAR, arrived[0])

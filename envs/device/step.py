@@ -27,7 +27,6 @@ class Held(NamedTuple):
     tick: Tensor
     failure: Tensor
     slow: Tensor  # the fields of `Under`
-    sky: Tensor
     queue: Tensor
     over: Tensor  # (N,) of bool
     report: Tensor  # (len(Report), N)
@@ -35,7 +34,7 @@ class Held(NamedTuple):
     @property
     def under(self) -> Under:
         """The slow sensors' part."""
-        return Under(self.slow, self.sky, self.queue)
+        return Under(self.slow, self.queue)
 
 
 class Brought(NamedTuple):

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..record import Array, SlowSensor
+from ..record import Array
 from ..scenarios.checks import SHORTEST_GPS_PERIOD
 from ..scenarios.manoeuvres import scenario_from
 from ..scenarios.scenario import Scenario
-from ..sensors.link import IN_FLIGHT
-from ..sensors.sets import SENSOR_SETS, with_changes
+from ..sensors.link import IN_FLIGHT, SlowSensor
+from ..sensors.slow import SENSOR_SETS, with_changes
 from ..task.observation import Entry, observation_layout
 from ..ticks import ticks
 from ..vehicle.dynamics import Motion
@@ -60,11 +60,10 @@ class Setting:
     control_period: int
     reference: str
     fast: str
-    camera: Mapping[str, Any] | None
-    gps: Mapping[str, Any] | None
     yaw_first: bool
     steering: bool
     on_bad_action: str
+    slow_changes: Mapping[str, Mapping[str, Any] | None]
 
     def __post_init__(self) -> None:
         if self.sensors not in SENSOR_SETS:
@@ -84,8 +83,7 @@ class Setting:
     @property
     def slow(self) -> dict[str, SlowSensor]:
         """The slow sensors, with what replaces the set's."""
-        changes = {"camera": self.camera, "gps": self.gps}
-        return with_changes(SENSOR_SETS[self.sensors], changes)
+        return with_changes(SENSOR_SETS[self.sensors], self.slow_changes)
 
     @cached_property
     def layout(self) -> tuple[Entry, ...]:

@@ -8,9 +8,10 @@ import numpy.typing as npt
 from gymnasium.utils import seeding
 
 from ..arguments import options_of
-from ..record import FAST_WIDTH, PACKET_WIDTH, Array, Record, SlowSensor
+from ..record import FAST_WIDTH, PACKET_WIDTH, Array, Record
 from ..scenarios.draws import DRAWS_WIDTH
 from ..scenarios.scenario import Scenario
+from ..sensors.link import SlowSensor
 from ..task.info import REPORT
 from ..ticks import TICK
 from ..vehicle.vehicle import Vehicle

@@ -8,7 +8,7 @@ complete snapshot. `P` and `Z` are `Params` and `State` whose leaves are indices
 from typing import Annotated, Any, NamedTuple
 
 from ..backend.arrays import offsets
-from ..record import PACKET_WIDTH, SLOW_NAMES, VALUES
+from ..record import PACKET_WIDTH
 from ..scenarios.driver import Driver
 from ..scenarios.speed import Pace
 from ..scenarios.steering import STEERING_WIDTH
@@ -17,6 +17,7 @@ from ..scenarios.wind import Wind
 from ..sensors.gps import Sky
 from ..sensors.link import IN_FLIGHT, Link
 from ..sensors.noise import Noise
+from ..sensors.slow import SLOW, VALUES
 from ..task.reference import Target
 from ..vehicle.actuators import Lag
 from ..vehicle.dynamics import Car, Motion, Road
@@ -84,9 +85,10 @@ class Slow(NamedTuple):
     captured: Any  # tick of the newest delivered sample, NEVER before the first
     values: Annotated[tuple[Any, ...], VALUES]
     arrived: Any  # tick of its delivery
+    drift: Any  # what the sensor carries from sample to sample
 
 
-SLOW, SLOW_WIDTH = offsets(Slow)
+IN_SLOW, SLOW_WIDTH = offsets(Slow)
 
 
 class Params(NamedTuple):
@@ -99,12 +101,12 @@ class Params(NamedTuple):
     wind: Wind
     pace: Pace
     noise: Noise
-    slow: Annotated[tuple[Link, ...], len(SLOW_NAMES)]
+    slow: Annotated[tuple[Link, ...], len(SLOW)]
     target: Target
     disturbance: Disturbance
     task: Task
     programme: Annotated[tuple[Any, ...], STEERING_WIDTH]
-    sky: Sky
+    sky: Sky  # of the GPS
     driver: Driver
     path: Path
     change: Change
@@ -117,9 +119,8 @@ class State(NamedTuple):
     motion: Motion
     drive: Drive
     clock: Clock
-    slow: Annotated[tuple[Slow, ...], len(SLOW_NAMES)]
-    queue: Annotated[Any, 2 * IN_FLIGHT * PACKET_WIDTH]  # packets, columns as in `Packet`
-    sky: Any  # deviation of log HDOP from its median
+    slow: Annotated[tuple[Slow, ...], len(SLOW)]
+    queue: Annotated[Any, len(SLOW) * IN_FLIGHT * PACKET_WIDTH]  # packets, columns as in `Packet`
     driver: Any  # rad, the driver's steering command
     under_way: Any  # how many packets are in the queue
 

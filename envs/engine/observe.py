@@ -5,7 +5,8 @@ from typing import Any
 from ..backend.decorators import jit
 from ..backend.elementary import clip
 from ..backend.primitives import select
-from ..record import CAMERA, FAST, PACKET, VALUES
+from ..record import FAST, PACKET
+from ..sensors.slow import WIDTHS
 from ..task.info import REPORT
 from ..task.observation import AGE_CAP, SAMPLED
 from ..ticks import NEVER, TICK
@@ -45,9 +46,8 @@ def observe(
     tick = z[Z.clock.tick]
     for sensor in range(len(Z.slow)):
         at = Z.slow[sensor]
-        values = 2 if sensor == CAMERA else VALUES
         if p[P.slow[sensor].period] > 0.0:
-            for i in range(values):
+            for i in range(WIDTHS[sensor]):
                 obs[k] = clip(z[at.values[0] + i], bounds[0, k], bounds[1, k])
                 k += 1
             age = (tick - z[at.captured]) * TICK

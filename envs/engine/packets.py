@@ -7,13 +7,10 @@ from typing import Any
 
 from ..backend.arrays import read
 from ..backend.decorators import jit
-from ..backend.elementary import exp
 from ..backend.primitives import minimum
-from ..backend.random import CHANNELS, normals
-from ..record import CAMERA, GPS, PACKET, PACKET_WIDTH, VALUES
-from ..sensors.camera import camera_sample
-from ..sensors.gps import gps_sample, sky_deviation
+from ..record import PACKET, PACKET_WIDTH
 from ..sensors.link import arrivals
+from ..sensors.slow import BLOCKS, VALUES, Scene, sample
 from ..ticks import NEVER
 from .layout import P, Z
 
@@ -41,8 +38,7 @@ def _capture(z: Any, sensor: int, link: Any, tick: Any, key: Any, v: Any, q: Any
     """A frame of a slow sensor: queue it for its arrivals and set the clock on."""
     at = Z.slow[sensor]
     frame = z[at.frames]
-    block = CHANNELS.camera_link if sensor == CAMERA else CHANNELS.gps_link
-    first, second = arrivals(link, frame, tick, key[0], key[1], block)
+    first, second = arrivals(link, frame, tick, key[0], key[1], BLOCKS[sensor].link)
     if first != NEVER:
         _push(z, sensor, tick, first, q, frame, v)
     if second != NEVER:
@@ -61,7 +57,7 @@ def _deliver(z: Any, tick: Any, packets: Any, count: int) -> int:
             at = Z.queue + slot * PACKET_WIDTH
             arrived = z[at + PACKET.arrived]
             if arrived == tick:
-                rank = 2.0 * z[at + PACKET.captured] + z[at + PACKET.sensor]
+                rank = len(Z.slow) * z[at + PACKET.captured] + z[at + PACKET.sensor]
                 if rank < best_rank:
                     best, best_rank = at, rank
             else:
@@ -94,6 +90,13 @@ def due(z: Any, tick: Any) -> bool:
 
 
 @jit
+def scene_of(p: Any, motion: Any, small_angle: int, key: Any, tick: Any) -> Scene:
+    """What slow sensors measure at a tick."""
+    road, car, noise, sky = read(p, P.road), read(p, P.car), read(p, P.noise), read(p, P.sky)
+    return Scene(motion, road, car, noise, sky, small_angle, key[0], key[1], tick)
+
+
+@jit
 def sense_slow(
     p: Any, z: Any, motion: Any, tick: Any, small_angle: int, packets: Any, count: int
 ) -> int:
@@ -101,23 +104,13 @@ def sense_slow(
 
     Returns how many packets there are then.
     """
-    noise, key = read(p, P.noise), (int(z[Z.clock.key_low]), int(z[Z.clock.key_high]))
-    if tick == z[Z.slow[CAMERA].next_capture]:
-        link, road = read(p, P.slow[CAMERA]), read(p, P.road)
-        n = normals(key[0], key[1], int(tick), CHANNELS.camera)
-        psi, y_l = camera_sample(motion, road, p[P.car.l_pre], noise, n)
-        _capture(z, CAMERA, link, tick, key, (psi, y_l, 0.0, 0.0, 0.0, 0.0), 1.0)
-    if tick == z[Z.slow[GPS].next_capture]:
-        link, sky = read(p, P.slow[GPS]), read(p, P.sky)
-        n = normals(key[0], key[1], int(tick), CHANNELS.gps)
-        seen = normals(key[0], key[1], int(tick), CHANNELS.sky)
-        z[Z.sky] = sky_deviation(z[Z.sky], sky, link, tick, seen)
-        hdop = exp(sky.median + z[Z.sky])
-        course, speed, X, Y, hdop, satellites, quality = gps_sample(
-            motion, p[P.car.ahead], p[P.car.left], hdop, sky.weight, noise, n, small_angle
-        )
-        values = (course, speed, X, Y, hdop, satellites)
-        _capture(z, GPS, link, tick, key, values, quality)
+    key = (int(z[Z.clock.key_low]), int(z[Z.clock.key_high]))
+    for sensor in range(len(Z.slow)):
+        at = Z.slow[sensor]
+        if tick == z[at.next_capture]:
+            link, scene = read(p, P.slow[sensor]), scene_of(p, motion, small_angle, key, tick)
+            values, quality, z[at.drift] = sample(sensor, scene, link, z[at.drift])
+            _capture(z, sensor, link, tick, key, values, quality)
     if tick >= z[Z.clock.next_due]:
         count = _deliver(z, tick, packets, count)
     return count

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..record import Array, SlowSensor
+from ..record import Array
 from ..scenarios.driver import Driver
 from ..scenarios.scenario import Scenario
 from ..scenarios.speed import Pace
@@ -15,8 +15,9 @@ from ..scenarios.steering import STEERING_KINDS, STEERING_WIDTH
 from ..scenarios.tracks import path_of
 from ..scenarios.wind import Wind
 from ..sensors.gps import HDOP_LAWS, Sky
-from ..sensors.link import Link, link_of
+from ..sensors.link import Link, SlowSensor, link_of
 from ..sensors.noise import Noise
+from ..sensors.slow import SLOW_NAMES
 from ..task.reference import REFERENCES, target_of
 from ..ticks import FOREVER, TICK, ticks
 from ..vehicle.actuators import lag_of
@@ -143,7 +144,10 @@ def template_of(
     if scenario.roll:
         vehicle.check_roll()
     keep = math.exp(-TICK / scenario.disturbance_time)
-    gps = link_of(slow.get("gps"), scenario.gps_outage)
+    links = {
+        name: link_of(slow.get(name), getattr(scenario, f"{name}_outage", None))
+        for name in SLOW_NAMES
+    }
     params = Params(
         car=car_of(vehicle),
         road=_road_of(scenario),
@@ -152,7 +156,7 @@ def template_of(
         wind=Wind(0.0, 0.0, 0.0, 0.0, scenario.wind_height),  # the rest is drawn
         pace=_pace_of(scenario),
         noise=Noise()._replace(**scenario.noise),
-        slow=(link_of(slow.get("camera"), scenario.camera_outage), gps),
+        slow=tuple(links.values()),
         target=target_of(nominal),
         disturbance=Disturbance(
             force=scenario.disturbance_force,
@@ -171,7 +175,7 @@ def template_of(
             stop=vehicle.steering_stop,
         ),
         programme=(0.0,) * STEERING_WIDTH,  # drawn
-        sky=_sky_of(scenario, gps),
+        sky=_sky_of(scenario, links["gps"]),
         driver=Driver(
             preview=scenario.driver_preview,
             gain=scenario.driver_gain,

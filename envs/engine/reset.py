@@ -13,6 +13,7 @@ from ..scenarios.steering import DRIVER, steering_at, write_steering
 from ..scenarios.tracks import laid
 from ..sensors.inertial import Chance, fast_row
 from ..sensors.link import clock_phase
+from ..sensors.slow import first_drift
 from ..task.info import REPORT
 from ..task.reference import reference
 from ..ticks import FOREVER, NEVER, whole_ticks
@@ -84,7 +85,6 @@ def reset_vehicle(
             z[Z.motion[i]] = start[i]
     motion = read(z, Z.motion)
     _write_surroundings(p, d, motion.s, motion.v_x)
-    z[Z.sky] = p[P.sky.spread] * normals(key_low, key_high, 0, CHANNELS.sky)[1]
     n = normals(key_low, key_high, 0, CHANNELS.initial)
     road, target = read(p, P.road), read(p, P.target)
     steer = steering_at(0.0, read(p, P.programme))
@@ -102,6 +102,7 @@ def reset_vehicle(
         phase = clock_phase(link, key_low, key_high, sensor)
         z[at.next_capture] = select(link.period > 0.0, phase, NEVER)
         z[at.captured] = NEVER
+        z[at.drift] = first_drift(sensor, read(p, P.sky), key_low, key_high)
     small_angle = switches[FLAGS.small_angle]
     beta = sideslip_angle(motion.v_x, motion.v_y, small_angle)
     fast = normals(key_low, key_high, 0, CHANNELS.inertial)

@@ -5,7 +5,9 @@ from collections.abc import Callable, Sequence
 from typing import TypeVar, overload
 
 from ..backend.arrays import read
-from ..record import SLOW_NAMES, Array, Record, SlowSensor
+from ..record import Array, Record
+from ..sensors.link import SlowSensor
+from ..sensors.slow import SLOW_NAMES
 from ..ticks import TICK, ticks
 from ..vehicle.dynamics import Motion
 from ..vehicle.vehicle import Vehicle

@@ -5,19 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ..record import (
-    FAST,
-    FAST_WIDTH,
-    PACKET,
-    PACKET_WIDTH,
-    SLOW_NAMES,
-    Array,
-    Fast,
-    Log,
-    Record,
-    SlowSensor,
-)
+from ..record import FAST, FAST_WIDTH, PACKET, PACKET_WIDTH, Array, Fast, Log, Record
 from ..sensors.gps import COURSE_SPEED
+from ..sensors.link import SlowSensor
+from ..sensors.slow import SLOW_NAMES
 from ..ticks import TICK
 from .columns import COLUMNS, column_name, parse_mapping, read_quantities
 

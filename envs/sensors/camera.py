@@ -3,8 +3,16 @@
 from typing import Any
 
 from ..backend.decorators import jit
-from ..backend.elementary import wrap
+from ..backend.elementary import PI, wrap
+from ..backend.random import CHANNELS
 from ..vehicle.dynamics import curvature_at
+from .kind import Blocks, SlowKind, Value
+
+CAMERA_KIND = SlowKind(
+    "camera",
+    (Value("psi", "rad", PI), Value("y_l", "m", 200.0)),
+    Blocks(noise=CHANNELS.camera, link=CHANNELS.camera_link, drift=CHANNELS.camera),  # no drift
+)
 
 
 @jit

@@ -3,11 +3,25 @@
 from typing import Any, NamedTuple
 
 from ..backend.decorators import jit
-from ..backend.elementary import sincos, wrap
+from ..backend.elementary import PI, sincos, wrap
 from ..backend.primitives import floor, maximum, minimum, select, sqrt
+from ..backend.random import CHANNELS
 from ..vehicle.dynamics import sideslip_angle
 from ..vehicle.tyres import SLOW
+from .kind import Blocks, SlowKind, Value
 
+GPS_KIND = SlowKind(
+    "gps",
+    (
+        Value("course", "rad", PI),
+        Value("speed", "m/s", 100.0),
+        Value("X", "m", 1e5),
+        Value("Y", "m", 1e5),
+        Value("hdop", "-", 100.0),
+        Value("satellites", "-", 50.0),
+    ),
+    Blocks(noise=CHANNELS.gps, link=CHANNELS.gps_link, drift=CHANNELS.sky),
+)
 COURSE_SPEED = 1.0  # m/s; below it a course has quality 0
 HDOP_LAWS = {"constant": 0.0, "half": 0.5, "table": 1.0}
 """How much of the GPS's noise follows HDOP: its standard deviations are (1 + w (HDOP - 1)) times

@@ -1,14 +1,51 @@
 """A slow sensor's clock and link: when samples are captured, and when they arrive."""
 
+import math
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from ..backend.decorators import jit
 from ..backend.primitives import floor, select, whole
 from ..backend.random import CHANNELS, uniforms
-from ..record import SlowSensor
-from ..ticks import NEVER, ticks
+from ..ticks import NEVER, TICK, ticks
 
 IN_FLIGHT = 8  # packets of one sensor under way at once, duplicates included
+
+
+@dataclass(frozen=True)
+class SlowSensor:
+    """A slow sensor's clock and link, as estimators are told it; times in seconds.
+
+    A sample is captured every `period` from `phase` on (None: drawn at each reset; the running
+    env's `slow_sensors` tells the drawn one). Frame i arrives `delays[i % len(delays)]` plus a
+    random share of `jitter` later, unless it is lost (`loss`, a probability) or captured within
+    an outage. `duplicate` is the probability that it arrives a second time.
+    """
+
+    period: float
+    delays: tuple[float, ...] = (0.0,)
+    phase: float | None = 0.0
+    jitter: float = 0.0
+    loss: float = 0.0
+    duplicate: float = 0.0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "delays", tuple(float(d) for d in self.delays))
+        if not TICK <= self.period < math.inf:
+            raise ValueError(f"a slow sensor's period must be at least one tick, got {self.period}")
+        if not self.delays or len(self.delays) > 4:
+            raise ValueError(f"expected one to four delays, got {self.delays}")
+        times = (*self.delays, self.jitter, self.phase or 0.0)
+        if not all(0.0 <= time < math.inf for time in times):
+            raise ValueError(f"{self}: delays, jitter and phase must be finite and not negative")
+        for name in ("loss", "duplicate"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise ValueError(f"{name} is a probability, got {getattr(self, name)}")
+
+    @property
+    def longest_delay(self) -> float:
+        """The longest delay in seconds, jitter included."""
+        return max(self.delays) + self.jitter
 
 
 class Link(NamedTuple):

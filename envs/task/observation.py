@@ -2,9 +2,8 @@
 
 from typing import NamedTuple
 
-import numpy as np
-
-from ..record import FAST, FAST_UNITS, SLOW_NAMES, SLOW_VALUES
+from ..record import FAST, FAST_UNITS
+from ..sensors.slow import SLOW
 
 
 class Entry(NamedTuple):
@@ -20,16 +19,6 @@ SAMPLED = 6  # the first columns of a fast row are sensors; the policy sees last
 AGE_CAP = 10.0  # s
 
 _FAST_BOUNDS = (10.0, 50.0, 50.0, 10.0, 100.0, 100.0, 1.0, 2000.0, 2000.0, 1.0, 50.0)
-_SLOW_BOUNDS = {
-    "psi": float(np.pi),
-    "y_l": 200.0,
-    "course": float(np.pi),
-    "speed": 100.0,
-    "X": 1e5,
-    "Y": 1e5,
-    "hdop": 100.0,
-    "satellites": 50.0,
-}
 
 
 def observation_layout(slow: tuple[str, ...], n: int, fast: str) -> tuple[Entry, ...]:
@@ -47,13 +36,13 @@ def observation_layout(slow: tuple[str, ...], n: int, fast: str) -> tuple[Entry,
         column = getattr(FAST, name)
         bound = _FAST_BOUNDS[column]
         entries.append(Entry(name, FAST_UNITS[column], -bound, bound))
-    for sensor in SLOW_NAMES:
-        if sensor in slow:
-            for name, unit in SLOW_VALUES[sensor]:
-                bound = _SLOW_BOUNDS[name]
-                entries.append(Entry(f"{sensor}_{name}", unit, -bound, bound))
-            entries.append(Entry(f"{sensor}_age", "s", 0.0, AGE_CAP))
-            entries.append(Entry(f"{sensor}_fresh", "-", 0.0, 1.0))
+    for kind in SLOW:
+        if kind.name in slow:
+            for value in kind.values:
+                name = f"{kind.name}_{value.name}"
+                entries.append(Entry(name, value.unit, -value.bound, value.bound))
+            entries.append(Entry(f"{kind.name}_age", "s", 0.0, AGE_CAP))
+            entries.append(Entry(f"{kind.name}_fresh", "-", 0.0, 1.0))
     entries.append(Entry("beta_ref", "rad", -1.0, 1.0))
     entries.append(Entry("gamma_ref", "rad/s", -10.0, 10.0))
     return tuple(entries)

@@ -14,7 +14,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...envs.record import SLOW_NAMES, Record, SlowSensor
+from ...envs.record import Record
+from ...envs.sensors.link import SlowSensor
+from ...envs.sensors.slow import SLOW_NAMES
 from ...envs.ticks import TICK
 from ...envs.vehicle.linear import LinearModel, vision
 from ...envs.vehicle.vehicle import Vehicle

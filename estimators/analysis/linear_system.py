@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...envs.record import CAMERA, FAST_WIDTH, PACKET, PACKET_WIDTH
+from ...envs.record import FAST_WIDTH, PACKET, PACKET_WIDTH
+from ...envs.sensors.slow import CAMERA
 from ..core.delay import IGNORE
 from ..core.entry import advance_entry, receive_entry
 from ..core.intersample import SPREAD

@@ -19,7 +19,7 @@ literally at 1 ms) or by a first-order lag of the delay. ignore: late samples ar
 from typing import Any
 
 from ...envs.backend.decorators import jit
-from ...envs.record import GPS
+from ...envs.sensors.slow import GPS
 from .covariance import clone_covariance, measure_state
 from .memory import COUNTERS, SEEN, SLOW, WINDOW
 

@@ -3,7 +3,8 @@
 from typing import Any
 
 from ...envs.backend.decorators import jit
-from ...envs.record import FAST, GPS
+from ...envs.record import FAST
+from ...envs.sensors.slow import GPS
 from .covariance import measure_state, predict_covariance
 from .delay import LARSEN, keep_promises
 from .intersample import (

@@ -4,7 +4,8 @@ from typing import Any
 
 from ...envs.backend.decorators import jit
 from ...envs.backend.primitives import maximum, minimum, sqrt
-from ...envs.record import GPS, PACKET
+from ...envs.record import PACKET
+from ...envs.sensors.slow import GPS
 from .covariance import project, project_clone
 from .delay import CLONE
 

@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ...envs.record import PACKET_WIDTH, SLOW_NAMES
+from ...envs.record import PACKET_WIDTH
+from ...envs.sensors.slow import SLOW_NAMES
 
 CORE = 8  # room for the states of the model
 INPUTS = 4  # that drive it

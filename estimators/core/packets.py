@@ -6,7 +6,8 @@ import numpy as np
 
 from ...envs.backend.decorators import apart, jit
 from ...envs.backend.primitives import floor
-from ...envs.record import GPS, PACKET, PACKET_WIDTH
+from ...envs.record import PACKET, PACKET_WIDTH
+from ...envs.sensors.slow import GPS
 from .delay import BUFFER, DROPPED, find, known
 from .innovation import SATELLITES
 from .memory import COUNTERS, SLOW, WAITING

@@ -5,7 +5,8 @@ from typing import Any
 from ...envs.backend.decorators import jit
 from ...envs.backend.elementary import sincos
 from ...envs.backend.primitives import maximum
-from ...envs.record import GPS, PACKET
+from ...envs.record import PACKET
+from ...envs.sensors.slow import GPS
 from .innovation import HDOP, dilution
 from .memory import COUNTERS, WINDOW
 from .packets import receive_sample

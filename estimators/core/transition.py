@@ -4,7 +4,7 @@ from typing import Any
 
 from ...envs.backend.decorators import apart, jit
 from ...envs.backend.primitives import absolute, maximum
-from ...envs.record import GPS
+from ...envs.sensors.slow import GPS
 from ...envs.vehicle.linear import write_kinematic, write_lateral, write_roll
 from ...envs.vehicle.vehicle import GRAVITY
 from .memory import CORE, INPUTS

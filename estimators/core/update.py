@@ -7,7 +7,8 @@ import numpy as np
 from ...envs.backend.decorators import apart, jit
 from ...envs.backend.elementary import wrap
 from ...envs.backend.primitives import absolute, maximum
-from ...envs.record import GPS, PACKET
+from ...envs.record import PACKET
+from ...envs.sensors.slow import GPS
 from .covariance import measure_clone, measure_state
 from .delay import BUFFER, CONSTANT, HELD, LARSEN, keep_promises
 from .innovation import adapt, innovate, noise_of, project_row

@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from ...envs.record import SLOW_NAMES, SlowSensor
+from ...envs.sensors.link import SlowSensor
+from ...envs.sensors.slow import SLOW_NAMES
 from ..core.delay import CONSTANT, STORED
 from ..core.intersample import NONE, PSEUDO, SPREAD
 from ..core.transition import KINEMATIC, SLOWEST, VELOCITY_ROLL

@@ -3,7 +3,8 @@
 import math
 from typing import Any
 
-from ...envs.record import SLOW_NAMES, SlowSensor
+from ...envs.sensors.link import SlowSensor
+from ...envs.sensors.slow import SLOW_NAMES
 from ..core.delay import BUFFER, CONSTANT, IGNORE, LARSEN, RULES, STORED
 from ..core.memory import EVERY, FRAMES, RECENT, WIDTH, WINDOW
 

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...envs.record import CAMERA, FAST, GPS, SLOW_NAMES
+from ...envs.record import FAST
+from ...envs.sensors.slow import CAMERA, GPS, SLOW_NAMES
 from ...envs.vehicle.linear import roll
 from ...envs.vehicle.vehicle import Vehicle
 from ..core.transition import FORCES, KINEMATIC, LATERAL, ROLL, VELOCITY_ROLL, YAW

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from ...envs.backend.decorators import jit
 from ...envs.backend.primitives import absolute, maximum
-from ...envs.record import SLOW_NAMES
+from ...envs.sensors.slow import SLOW_NAMES
 from ..core.covariance import measure_clone, measure_state
 from ..core.delay import CLONE, DIRECT, DROPPED, IGNORE, find
 from ..core.intersample import NONE, PSEUDO, SPREAD

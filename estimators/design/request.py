@@ -3,7 +3,8 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from ...envs.record import SLOW_NAMES, SlowSensor
+from ...envs.sensors.link import SlowSensor
+from ...envs.sensors.slow import SLOW_NAMES
 from ..core.delay import RULES
 from ..filters import Filter
 from . import dual_rate as spread

@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 
-from ...envs.record import SlowSensor
+from ...envs.sensors.link import SlowSensor
 
 
 def whole_ticks(seconds: float, dt: float, what: str) -> int:

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...envs.record import FAST_WIDTH, PACKET_WIDTH, Log, Record, SlowSensor
+from ...envs.record import FAST_WIDTH, PACKET_WIDTH, Log, Record
+from ...envs.sensors.link import SlowSensor
 from ...envs.ticks import TICK
 from ...envs.vehicle.vehicle import COMS, Vehicle, vehicle_from
 from ..core.memory import FILTER, Counters

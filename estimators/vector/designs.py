@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ...envs.record import SlowSensor
+from ...envs.sensors.link import SlowSensor
 from ...envs.vehicle.vehicle import Vehicle
 from ..estimator import Estimator
 from ..make import make_estimator

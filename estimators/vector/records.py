@@ -7,7 +7,8 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv, VectorEnv
 
-from ...envs.record import FAST_WIDTH, PACKET_WIDTH, SlowSensor
+from ...envs.record import FAST_WIDTH, PACKET_WIDTH
+from ...envs.sensors.link import SlowSensor
 from ...envs.task.observation import Entry
 from ...envs.vehicle.vehicle import Vehicle
 from ..wrappers.estimate import base_of

@@ -12,13 +12,12 @@ from sideslip.envs.record import (
     FAST,
     FAST_UNITS,
     FAST_WIDTH,
+    PACKET,
     PACKET_WIDTH,
-    SLOW_NAMES,
-    SLOW_VALUES,
-    VALUES,
     Fast,
     concatenate,
 )
+from sideslip.envs.sensors.slow import SLOW, VALUES
 from sideslip.envs.ticks import TICK
 from sideslip.envs.vehicle.dynamics import Motion, Push, Road, rk4
 from sideslip.envs.vehicle.tyres import LINEAR as LINEAR_TYRES
@@ -156,8 +155,7 @@ def test_packets_of_picks_one_sensor() -> None:
 def test_columns_have_units_and_fit() -> None:
     assert len(FAST_UNITS) == FAST_WIDTH == len(Fast._fields)
     assert list(FAST) == list(range(FAST_WIDTH))
-    assert set(SLOW_VALUES) == set(SLOW_NAMES)
-    assert all(len(values) <= VALUES for values in SLOW_VALUES.values())
+    assert max(len(kind.values) for kind in SLOW) == VALUES == PACKET_WIDTH - PACKET.value
     env = StabilityEnv()
     env.reset(seed=0)
     assert env.record.present == Fast._fields

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 from scipy.linalg import expm, solve_triangular
 
-from sideslip.envs.record import FAST, FAST_WIDTH, PACKET, PACKET_WIDTH, SLOW_NAMES, Record
+from sideslip.envs.record import FAST, FAST_WIDTH, PACKET, PACKET_WIDTH, Record
+from sideslip.envs.sensors.slow import SLOW_NAMES
 from sideslip.envs.vehicle.linear import vision
 from sideslip.envs.vehicle.vehicle import COMS
 

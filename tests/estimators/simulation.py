@@ -10,16 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import lfilter
 
-from sideslip.envs.record import (
-    FAST,
-    FAST_WIDTH,
-    PACKET,
-    PACKET_WIDTH,
-    SLOW_NAMES,
-    Log,
-    Record,
-    SlowSensor,
-)
+from sideslip.envs.record import FAST, FAST_WIDTH, PACKET, PACKET_WIDTH, Log, Record
+from sideslip.envs.sensors.link import SlowSensor
+from sideslip.envs.sensors.slow import SLOW_NAMES
 from sideslip.envs.vehicle.linear import LinearModel, vision
 from sideslip.envs.vehicle.vehicle import COMS, GRAVITY, Vehicle
 

@@ -5,7 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.envs.record import FAST, FAST_WIDTH, PACKET, PACKET_WIDTH, Log, Record, SlowSensor
+from sideslip.envs.record import FAST, FAST_WIDTH, PACKET, PACKET_WIDTH, Log, Record
+from sideslip.envs.sensors.link import SlowSensor
 from sideslip.estimators import FILTERS, make_estimator
 from sideslip.estimators.core.memory import COUNTERS
 from tests.estimators.simulation import CAMERA, FIG7, GPS, simulate

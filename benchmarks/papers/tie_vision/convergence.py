@@ -10,7 +10,7 @@ import numpy as np
 from scipy.linalg import solve_discrete_are
 
 from ....envs.scenarios.draws import KMH
-from ....envs.sensors.sets import CAMERA_33_30
+from ....envs.sensors.slow import CAMERA_33_30
 from ....envs.vehicle.linear import vision
 from ....envs.vehicle.vehicle import COMS
 from ....estimators.design import kalman

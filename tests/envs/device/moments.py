@@ -85,7 +85,7 @@ def in_flight(states: np.ndarray) -> list[np.ndarray]:
     """Each row's packets under way, by arrival."""
     found = []
     for state in states:
-        queue = state[Z.queue : Z.sky].reshape(-1, PACKET_WIDTH)[: int(state[Z.under_way])]
+        queue = state[Z.queue : Z.driver].reshape(-1, PACKET_WIDTH)[: int(state[Z.under_way])]
         found.append(
             queue[np.lexsort(queue[:, [PACKET.sensor, PACKET.captured, PACKET.arrived]].T)]
         )
@@ -96,7 +96,7 @@ def largest_error(one: dict[str, Any], other: dict[str, Any]) -> float:
     """The largest difference of two snapshots' numbers; what counts must be equal."""
     for name in ("over", "ticks_done", "delivered", "switches"):
         np.testing.assert_array_equal(one[name], other[name], name)
-    outside = np.r_[0 : Z.queue, Z.sky : STATE_WIDTH]
+    outside = np.r_[0 : Z.queue, Z.driver : STATE_WIDTH]
     pairs = [(one[name], other[name]) for name in ("obs", "params", "reports")]
     pairs += [(one["states"][:, outside], other["states"][:, outside])]
     pairs += list(zip(in_flight(one["states"]), in_flight(other["states"]), strict=True))

@@ -10,8 +10,8 @@ from sideslip.envs.backend.arrays import offsets, read, write
 from sideslip.envs.backend.decorators import jit
 from sideslip.envs.engine.layout import (
     FLAGS,
+    IN_SLOW,
     PARAMS_WIDTH,
-    SLOW,
     SLOW_WIDTH,
     STATE_WIDTH,
     P,
@@ -20,7 +20,7 @@ from sideslip.envs.engine.layout import (
 from sideslip.envs.record import PACKET_WIDTH
 from sideslip.envs.sensors.link import IN_FLIGHT
 
-QUEUE = 2 * IN_FLIGHT * PACKET_WIDTH
+QUEUE = len(Z.slow) * IN_FLIGHT * PACKET_WIDTH
 
 
 def leaves(part: Any) -> Iterator[int]:
@@ -32,7 +32,7 @@ def leaves(part: Any) -> Iterator[int]:
 
 
 @pytest.mark.parametrize(
-    ("part", "width"), [(P, PARAMS_WIDTH), (SLOW, SLOW_WIDTH), (FLAGS, len(FLAGS))]
+    ("part", "width"), [(P, PARAMS_WIDTH), (IN_SLOW, SLOW_WIDTH), (FLAGS, len(FLAGS))]
 )
 def test_every_number_has_a_place_of_its_own(part: Any, width: int) -> None:
     assert list(leaves(part)) == list(range(width))

@@ -6,9 +6,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from sideslip.envs.record import FAST, GPS, PACKET
+from sideslip.envs.record import FAST, PACKET
 from sideslip.envs.recordings.columns import COLUMNS, column_name, parse_mapping
 from sideslip.envs.recordings.log_file import read_log
+from sideslip.envs.sensors.slow import GPS
 
 from .drives import drive, saved
 

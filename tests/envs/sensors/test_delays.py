@@ -8,10 +8,10 @@ import pytest
 from scipy import stats
 
 from sideslip.envs import SlowSensor, StabilityEnv
-from sideslip.envs.record import CAMERA, GPS, PACKET
+from sideslip.envs.record import PACKET
 from sideslip.envs.scenarios.checks import SHORTEST_GPS_PERIOD
 from sideslip.envs.sensors.link import IN_FLIGHT, link_of
-from sideslip.envs.sensors.sets import SENSOR_SETS
+from sideslip.envs.sensors.slow import CAMERA, GPS, SENSOR_SETS
 
 from ..helpers import IDS, LINEAR, packets, play, unwrapped
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from sideslip.envs import Record, SlowSensor, StabilityEnv
-from sideslip.envs.record import FAST, PACKET, SLOW_NAMES, SLOW_VALUES, Fast
-from sideslip.envs.sensors.sets import SENSOR_SETS
+from sideslip.envs.record import FAST, PACKET, Fast
+from sideslip.envs.sensors.slow import SENSOR_SETS, SLOW, SLOW_NAMES
 from sideslip.envs.task.observation import AGE_CAP, SAMPLED
 from sideslip.envs.ticks import TICK
 
@@ -36,8 +36,8 @@ def expected(
                 seen[sensor] = packet[PACKET.captured], packet[PACKET.value :]
                 fresh = 1.0
         captured, newest = seen.get(sensor, (-np.inf, np.zeros(4)))
-        names = [name for name, _ in SLOW_VALUES[sensor]]
-        values |= {f"{sensor}_{name}": newest[i] for i, name in enumerate(names)}
+        kind = SLOW[SLOW_NAMES.index(sensor)]
+        values |= {f"{sensor}_{each.name}": newest[i] for i, each in enumerate(kind.values)}
         values[f"{sensor}_age"] = min((record.ticks[-1] - captured) * TICK, AGE_CAP)
         values[f"{sensor}_fresh"] = fresh
     return values | {name: info[name] for name in ("beta_ref", "gamma_ref")}

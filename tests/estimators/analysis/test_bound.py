@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.envs.record import SlowSensor
+from sideslip.envs.sensors.link import SlowSensor
 from sideslip.estimators import make_estimator
 from sideslip.estimators.analysis.bound import bound, riccati
 from tests.estimators.simulation import CAMERA, FIG7, GPS, error, simulate

@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.envs.record import PACKET, Log, Record, SlowSensor
+from sideslip.envs.record import PACKET, Log, Record
+from sideslip.envs.sensors.link import SlowSensor
 from sideslip.estimators import make_estimator, smooth
 from tests.estimators.core.test_conditioning import CASES
 from tests.estimators.simulation import CAMERA, FIG7, GPS, Drive, simulate

@@ -4,7 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from sideslip.envs.record import FAST, FAST_WIDTH, PACKET, PACKET_WIDTH, Record, SlowSensor
+from sideslip.envs.record import FAST, FAST_WIDTH, PACKET, PACKET_WIDTH, Record
+from sideslip.envs.sensors.link import SlowSensor
 
 HUGE = 1e300  # finite, and no int64
 

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.envs.record import PACKET, Log, Record, SlowSensor
+from sideslip.envs.record import PACKET, Log, Record
+from sideslip.envs.sensors.link import SlowSensor
 from sideslip.estimators import make_estimator
 from tests.estimators.dense import GYRO, Posterior, arrivals, inputs, speeds
 

@@ -11,7 +11,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from sideslip.envs.record import FAST_WIDTH, PACKET_WIDTH, SLOW_NAMES, SlowSensor
+from sideslip.envs.record import FAST_WIDTH, PACKET_WIDTH
+from sideslip.envs.sensors.link import SlowSensor
+from sideslip.envs.sensors.slow import SLOW_NAMES
 from sideslip.estimators import FILTERS, Estimator, UnobservableWarning, make_estimator
 from sideslip.estimators.design.error_map import MARGINAL
 from tests.estimators.simulation import CAMERA, GPS

@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.envs.record import FAST, PACKET, Record, SlowSensor
+from sideslip.envs.record import FAST, PACKET, Record
+from sideslip.envs.sensors.link import SlowSensor
 from sideslip.envs.vehicle.linear import vision
 from sideslip.envs.vehicle.vehicle import COMS
 from sideslip.estimators import FILTERS, make_estimator

@@ -6,7 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.envs.record import PACKET, SLOW_NAMES, Record, SlowSensor
+from sideslip.envs.record import PACKET, Record
+from sideslip.envs.sensors.link import SlowSensor
+from sideslip.envs.sensors.slow import SLOW_NAMES
 from sideslip.estimators import make_estimator
 from tests.estimators.core.fuzz import KINDS, good_packets, mixed, record_of
 

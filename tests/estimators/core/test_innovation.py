@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, kstest
 
-from sideslip.envs.record import CAMERA as CAMERA_CODE
-from sideslip.envs.record import PACKET, Record, SlowSensor
+from sideslip.envs.record import PACKET, Record
+from sideslip.envs.sensors.link import SlowSensor
+from sideslip.envs.sensors.slow import CAMERA as CAMERA_CODE
 from sideslip.estimators import make_estimator
 from tests.estimators.simulation import Drive, simulate
 

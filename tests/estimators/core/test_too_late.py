@@ -5,7 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.envs.record import FAST, FAST_WIDTH, PACKET, PACKET_WIDTH, Record, SlowSensor
+from sideslip.envs.record import FAST, FAST_WIDTH, PACKET, PACKET_WIDTH, Record
+from sideslip.envs.sensors.link import SlowSensor
 from sideslip.estimators import make_estimator
 from sideslip.estimators.core.memory import EVERY, RECENT, WINDOW
 from tests.estimators.simulation import CAMERA, FIG7

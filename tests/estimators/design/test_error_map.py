@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.envs.record import FAST, FAST_WIDTH, PACKET_WIDTH, SlowSensor
+from sideslip.envs.record import FAST, FAST_WIDTH, PACKET_WIDTH
+from sideslip.envs.sensors.link import SlowSensor
 from sideslip.envs.vehicle.vehicle import COMS
 from sideslip.estimators import UnobservableWarning, make_estimator
 from sideslip.estimators.design.error_map import error_map, spectral_radius

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from sideslip.envs.record import SlowSensor
+from sideslip.envs.sensors.link import SlowSensor
 from sideslip.envs.vehicle.linear import course, velocity_and_roll, vision
 from sideslip.envs.vehicle.vehicle import COMS, PASSENGER_CAR
 from sideslip.estimators import make_estimator

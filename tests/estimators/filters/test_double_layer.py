@@ -5,7 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.envs.record import FAST, FAST_WIDTH, PACKET, PACKET_WIDTH, SlowSensor
+from sideslip.envs.record import FAST, FAST_WIDTH, PACKET, PACKET_WIDTH
+from sideslip.envs.sensors.link import SlowSensor
 from sideslip.envs.vehicle.vehicle import COMS, GRAVITY
 from sideslip.estimators import make_estimator
 from sideslip.estimators.design.periodic import design

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
 
-from sideslip.envs.record import PACKET, SlowSensor
+from sideslip.envs.record import PACKET
+from sideslip.envs.sensors.link import SlowSensor
 from sideslip.estimators import DualRate, make_estimator
 from sideslip.estimators.design.dual_rate import frame_map, shares_of
 from tests.estimators.filters.literal import COURSE, T, car, due, excited, gain, inputs, pushed, zoh

@@ -5,7 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.envs.record import FAST, PACKET, SlowSensor
+from sideslip.envs.record import FAST, PACKET
+from sideslip.envs.sensors.link import SlowSensor
 from sideslip.estimators import make_estimator
 from tests.estimators.filters.literal import (
     T,

@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium.vector import SyncVectorEnv
 
 import sideslip  # noqa: F401  registers the environments
-from sideslip.envs.sensors.sets import CAMERA_33_30, GPS_5_HZ
+from sideslip.envs.sensors.slow import CAMERA_33_30, GPS_5_HZ
 from sideslip.estimators import FILTERS, make_estimator
 from sideslip.estimators.vector.estimate import EstimateObservation
 from sideslip.estimators.wrappers.estimate import EstimateObservation as Single

@@ -1,0 +1,74 @@
+"""The table of slow sensors: what follows from a row of it."""
+
+import numpy as np
+import pytest
+
+from sideslip.envs import StabilityEnv
+from sideslip.envs.backend.random import CHANNELS, uniforms
+from sideslip.envs.record import PACKET
+from sideslip.envs.sensors.slow import (
+    BLOCKS,
+    SENSOR_SETS,
+    SLOW,
+    SLOW_NAMES,
+    VALUES,
+    WIDTHS,
+    blocks_at,
+)
+from sideslip.envs.task.observation import observation_layout
+
+pytestmark = pytest.mark.plain
+
+
+def test_no_two_uses_share_random_numbers() -> None:
+    """A sensor's three blocks may be one where it makes no use of the others."""
+    of_slow = [n for own in (*BLOCKS, *map(blocks_at, range(20))) for n in sorted(set(own))]
+    of_others = [CHANNELS.inertial, CHANNELS.wheels, CHANNELS.initial, CHANNELS.scenario]
+    assert len(set(of_slow + of_others)) == len(of_slow + of_others)
+
+
+def test_sensors_that_were_there_keep_their_random_words() -> None:
+    assert SLOW_NAMES[:2] == ("camera", "gps")
+    assert [BLOCKS[0].noise, BLOCKS[0].link] == [2, 4]
+    assert list(BLOCKS[1]) == [3, 5, 8]
+
+
+@pytest.mark.parametrize("sensors", SENSOR_SETS)
+def test_the_observation_has_each_sensors_values_in_the_order_of_the_table(sensors: str) -> None:
+    present = tuple(SENSOR_SETS[sensors])
+    names = [entry.name for entry in observation_layout(present, 10, "summary")]
+    expected = [
+        f"{kind.name}_{name}"
+        for kind in SLOW
+        if kind.name in present
+        for name in (*(value.name for value in kind.values), "age", "fresh")
+    ]
+    first = names.index(expected[0])
+    assert names[first : first + len(expected)] == expected
+    assert len(names) == len(set(names))
+    bounds = {entry.name: entry for entry in observation_layout(present, 10, "summary")}
+    for kind in SLOW:
+        for value in kind.values if kind.name in present else ():
+            entry = bounds[f"{kind.name}_{value.name}"]
+            assert (entry.unit, entry.low, entry.high) == (value.unit, -value.bound, value.bound)
+
+
+def test_a_packet_is_filled_up_with_zeros() -> None:
+    env = StabilityEnv("fusion", control_period=500)
+    env.reset(seed=0)
+    env.step([0.2])
+    seen = set()
+    for packet in env.record.packets:
+        sensor = int(packet[PACKET.sensor])
+        seen.add(sensor)
+        values = packet[PACKET.value :]
+        assert len(values) == VALUES
+        assert np.all(values[: WIDTHS[sensor]] != 0.0)
+        assert np.all(values[WIDTHS[sensor] :] == 0.0)
+    assert seen == {0, 1}
+
+
+def test_sensors_lose_packets_independently() -> None:
+    """Each link has numbers of its own."""
+    lost = [[uniforms(1, 2, tick, blocks.link)[1] for tick in range(400)] for blocks in BLOCKS]
+    assert abs(np.corrcoef(lost)[0, 1]) < 0.15
