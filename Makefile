@@ -11,7 +11,7 @@ INSTALL := PIP_CONSTRAINT=constraints.txt PIP_BUILD_CONSTRAINT=constraints.txt \
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
-.PHONY: help bench bench-full test test-all coverage lint types wheel clean
+.PHONY: help bench bench-full test test-all test-stock coverage lint types wheel clean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1\t\2/p' Makefile | expand -t 18
@@ -31,6 +31,9 @@ test-all: .venv/ready-all ## the same with the long tests
 	$(PYTEST) -n $(WORKERS)
 	$(PYTEST) --doctest-modules src/sideslip
 	NUMBA_DISABLE_JIT=1 $(PYTEST) -n $(WORKERS) -m plain
+
+test-stock: .venv/ready-all ## the smoke tests without our compiler: numba compiles by itself, as its other versions do
+	SIDESLIP_STOCK_NUMBA=1 $(PYTEST) -n $(WORKERS) -m smoke
 
 coverage: .venv/ready-all ## lines reached by the tests marked plain, without compilation
 	NUMBA_DISABLE_JIT=1 $(BIN)/coverage run -m pytest --confcutdir=tests -m plain

@@ -4,17 +4,16 @@
 
 numba by itself runs LLVM's whole pipeline and emits machine code for every function a kernel calls,
 with everything below it, level by level. Here a function that another one calls is a `Part`: its
-LLVM text is kept as numba lowered it. What Python calls links the parts below it, and is optimised
-and emitted then; that alone is kept on disk.
+LLVM text stays as numba lowered it. What Python calls links the parts below it, and is optimised
+and emitted then; that alone is cached on disk.
+
+All this uses numba's insides, which change: `decorators` does without where they are others.
 """
 
 import contextlib
 import gc
 import hashlib
 import logging
-import multiprocessing
-import os
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -32,13 +31,10 @@ from numba.core.registry import CPUDispatcher
 from numba.core.sigutils import normalize_signature
 from numba.core.typing import make_concrete_template
 
-from .cache import Kept, environment_names, link_environments
-
-QUIET = "SIDESLIP_QUIET"
-"""The environment variable that keeps `tell` from writing to standard error."""
+from . import kernel_file
+from .cache import notice
 
 _logger = logging.getLogger("sideslip.compiler")
-_told: list[str] = []
 _spent = [0.0]  # CPU-s on kernels so far, to tell a kernel's own from those it waited for
 
 
@@ -46,7 +42,7 @@ class Part(JITCodeLibrary):
     """The LLVM text of one function, neither optimised nor linked with those that it calls."""
 
     def finalize(self) -> None:
-        """Nothing but a note of what keeps it from the disk."""
+        """Note what cannot be cached on disk, and nothing else."""
         self._raise_if_finalized()
         self._finalize_dynamic_globals()
         self._finalized = True
@@ -81,8 +77,8 @@ class _Bare:
 class _Apart:
     """A kernel that callers find as machine code: nothing is linked into them."""
 
-    def __init__(self, kernel: "Kernel", args: tuple[types.Type, ...]) -> None:
-        self.needed = kernel.py_func.__module__, kernel.py_func.__name__, args
+    def __init__(self, path: Path | None) -> None:
+        self.path = path
         self._reload_init: set[str] = set()
 
     def _ensure_finalized(self) -> None:
@@ -105,8 +101,8 @@ class _ApartPipeline(_PartPipeline):
         counts functions and types as they come."""
 
         def mangler(name: str, types: Any, **_: Any) -> str:
-            told = hashlib.sha256(str(tuple(types)).encode()).hexdigest()[:16]
-            return str(default_mangler(f"{name}_{told}", ()))
+            digest = hashlib.sha256(str(tuple(types)).encode()).hexdigest()[:16]
+            return str(default_mangler(f"{name}_{digest}", ()))
 
         self.state.targetctx = self.state.targetctx.subtarget(mangler=mangler)
         return super().compile_extra(func)
@@ -121,8 +117,8 @@ class _PartCompiler(_FunctionCompiler):
 class Kernel(CPUDispatcher):
     """A compiled function: a dispatcher of numba whose callees are parts.
 
-    kept: the folder on disk, or None. apart: callers do not take its text in but call its machine
-    code; so must a function of a module be that several kernels call and that is long itself.
+    folder: that of its files on disk, or None. apart: callers do not take its text in but call its
+    machine code; so must a function of a module be that several kernels call and that is long.
     """
 
     def __init__(
@@ -131,12 +127,11 @@ class Kernel(CPUDispatcher):
         locals: Any = None,
         targetoptions: Any = None,
         pipeline_class: Any = Compiler,
-        kept: str | None = None,
+        folder: Path | None = None,
         apart: bool = False,
     ) -> None:
         super().__init__(py_func, locals, targetoptions, pipeline_class)
-        self.kept = None if kept is None else Kept(kept)
-        self.apart = apart
+        self.folder, self.apart = folder, apart
         self.parts: dict[Any, Any] = {}
         self._part_compiler = _PartCompiler(
             py_func,
@@ -152,7 +147,7 @@ class Kernel(CPUDispatcher):
             if args not in self.parts:
                 if self.apart:
                     self.compile(args)
-                    part = self.overloads[args]._replace(library=_Apart(self, args))
+                    part = self.overloads[args]._replace(library=_Apart(self._path(args)))
                 else:
                     part = self._part_compiler.compile(args, None)
                 part = part._replace(entry_point=part.library)  # the key of its code for callers
@@ -185,19 +180,31 @@ class Kernel(CPUDispatcher):
                 self.add_overload(self._found(args))
             return self.overloads[args].entry_point
 
+    def _key(self, args: tuple[types.Type, ...]) -> str:
+        return kernel_file.key_of(self.py_func, args, self.targetctx.codegen())
+
+    def _path(self, args: tuple[types.Type, ...]) -> Path | None:
+        if self.folder is None:
+            return None
+        return kernel_file.path_of(self.folder, self.py_func, self._key(args))
+
     def _found(self, args: tuple[types.Type, ...]) -> Any:
-        if self.kept is None:
+        path, key = self._path(args), self._key(args)
+        if path is None:
             return self._built(args)[0]
-        path = self.kept.path(self.py_func, args, self.targetctx.codegen())
-        found = self.kept.load(path, args, self.targetctx)
+        found = kernel_file.load(path, key, self.py_func, args, self.targetctx)
         if found is None:
-            found, *told = self._built(args)
-            self.kept.save(path, found, *told)
+            found, environments, needs = self._built(args)
+            nameless = self.apart and str(found.signature.return_type) not in kernel_file.RETURNS
+            if None not in needs and not nameless:
+                names = [(each.parent.name, each.name) for each in needs]
+                kernel_file.save(path, key, found, environments, names)
         return found
 
-    def _built(self, args: tuple[types.Type, ...]) -> tuple[Any, list[Any], list[Any]]:
-        """What `_linked` returns, compiled while the user is told."""
-        tell(self.kept.folder.parent if self.kept else None)
+    def _built(self, args: tuple[types.Type, ...]) -> tuple[Any, dict[str, Any], list[Any]]:
+        """What `_linked` returns, compiled while the user waits."""
+        where = f"cached in {self.folder.parent}" if self.folder else "not cached"
+        notice("compiling", f"compiling kernels for this machine ({where}) ...", logging.INFO)
         start, nested = time.process_time(), _spent[0]
         with _without_collection():
             result = _linked(
@@ -221,28 +228,25 @@ def _without_collection() -> Iterator[None]:
             gc.enable()
 
 
-def _linked(part: Any) -> tuple[Any, list[Any], list[Any]]:
-    """A part with everything below it, optimised and emitted; all their environments; what it needs
-    of kernels that stand apart."""
+def _linked(part: Any) -> tuple[Any, dict[str, Any], list[Path | None]]:
+    """A part with everything below it, optimised and emitted; all their environments; the files of
+    the kernels apart that it calls."""
     target = part.target_context
     library = target.codegen().create_library(part.library.name)
     library.enable_object_caching()
     own, *callees = _with_callees(part.library)
     library.add_llvm_module(own._final_module.clone())  # where others find the function by name
     library._reload_init.update(own._reload_init)
-    needed = [each.needed for each in callees if isinstance(each, _Apart)]
+    needs = [each.path for each in callees if isinstance(each, _Apart)]
     for each in callees:
         if not isinstance(each, _Apart):
             library.add_linking_library(_Bare(each) if isinstance(each, Part) else each)
     target.create_cpython_wrapper(library, part.fndesc, part.environment, part.call_helper)
     entry = target.get_executable(library, part.fndesc, part.environment)
-    environments = [
-        environment
-        for environment in map(lookup_environment, environment_names(library))
-        if environment is not None
-    ]
-    link_environments(library, environments)
-    return part._replace(library=library, entry_point=entry), environments, needed
+    found = {each: lookup_environment(each) for each in kernel_file.environment_names(library)}
+    environments = {name: each for name, each in found.items() if each is not None}
+    kernel_file.link_environments(library, environments)
+    return part._replace(library=library, entry_point=entry), environments, needs
 
 
 def _with_callees(library: Any) -> list[Any]:
@@ -261,20 +265,3 @@ def _with_callees(library: Any) -> list[Any]:
 
     visit(library)
     return list(reversed(done))
-
-
-def tell(folder: Path | None) -> None:
-    """Say once in a process that kernels are being compiled, where the user waits for it.
-
-    A line on standard error; a record of the logger `sideslip.compiler` instead where the program
-    has set up logging; nothing in worker processes or with SIDESLIP_QUIET set.
-    """
-    where = f"kept in {folder}" if folder else "not kept"
-    text = f"sideslip: compiling kernels for this machine ({where}) ..."
-    if _told or os.environ.get(QUIET):
-        return
-    _told.append(text)
-    if _logger.hasHandlers():
-        _logger.info(text)
-    elif multiprocessing.parent_process() is None:
-        print(text, file=sys.stderr, flush=True)

@@ -4,15 +4,20 @@ The equations of sideslip are plain scalar functions over tuples. `jit` compiles
 rebuilds the very same functions for Python floats, NumPy arrays or any other table of primitives.
 """
 
+import functools
+import os
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numba
 
-from .cache import _LAYERS, _kept_folder
-from .compiler import Kernel
+from .cache import LAYERS, kernel_folder, notice
+
+STOCK = "SIDESLIP_STOCK_NUMBA"
+"""The environment variable with which numba compiles by itself."""
 
 _PREFIX = __name__.removesuffix("envs.backend.decorators")
+_SUPPORTED = "0.68"  # numba's version whose insides `compiler` uses
 
 config: Any = numba.config
 F = TypeVar("F", bound=Callable[..., Any])
@@ -44,7 +49,7 @@ def inlined(function: F) -> F:
 def apart(function: F) -> F:
     """The same, with machine code of its own that callers call: what is long and called seldom.
 
-    It is made and kept once, not in each kernel that calls it.
+    It is made and cached once, not in each kernel that calls it.
     """
     return _compiled(function, apart=True)
 
@@ -52,13 +57,39 @@ def apart(function: F) -> F:
 def _compiled(function: F, apart: bool = False, **more: bool) -> F:
     if config.DISABLE_JIT:
         return function
+    kernel = _kernel()
+    if kernel is None:
+        stock: Any = numba.njit(error_model="numpy", forceinline="forceinline" in more)
+        return cast(F, stock(function))
     layer = function.__module__.removeprefix(_PREFIX).partition(".")[0]
-    ours = function.__module__.startswith(_PREFIX) and layer in _LAYERS
-    kept = _kept_folder(layer) if ours else None  # the stamp knows of no other sources
-    told: dict[str, Any] = {"nopython": True, "boundscheck": None}
-    told |= {"error_model": "numpy", "fastmath": False, "forceinline": False}
-    told |= {"_nrt": layer not in ("envs", "estimators")} | more
-    return Kernel(function, targetoptions=told, kept=kept, apart=apart)  # type: ignore[return-value]
+    ours = function.__module__.startswith(_PREFIX) and layer in LAYERS
+    folder = kernel_folder(layer) if ours else None  # the stamp knows of no other sources
+    options: dict[str, Any] = {"nopython": True, "boundscheck": None}
+    options |= {"error_model": "numpy", "fastmath": False, "forceinline": False}
+    options |= {"_nrt": layer not in ("envs", "estimators")} | more
+    return cast(F, kernel(function, targetoptions=options, folder=folder, apart=apart))
+
+
+@functools.cache
+def _kernel() -> Any:
+    """The class of our compiler's functions, None where numba compiles by itself.
+
+    It does so on request, and where our compiler was not made for its version: the same numbers.
+    """
+    if os.environ.get(STOCK):
+        reason = f"{STOCK} is set"
+    elif not numba.__version__.startswith(f"{_SUPPORTED}."):
+        reason = f"our compiler is made for {_SUPPORTED}"
+    else:
+        try:
+            from .compiler import Kernel
+
+            return Kernel
+        except (ImportError, AttributeError) as error:
+            reason = f"our compiler cannot use it: {error}"
+    text = "compiles by itself: longer, in every process, and for the same numbers"
+    notice("stock", f"numba {numba.__version__} {text} ({reason})")
+    return None
 
 
 @jit

@@ -1,20 +1,54 @@
 """Files that are there whole or not at all."""
 
+import contextlib
 import os
+import stat
+import uuid
+from collections.abc import Iterator
 from pathlib import Path
+from typing import BinaryIO
+
+_OPEN = ("/dev/std", "/dev/fd/", "/proc/")  # what a process has open, by name
 
 
-def write_whole(path: Path, content: bytes) -> None:
-    """Write a file or nothing: the bytes go to a neighbour first, which is then renamed.
+@contextlib.contextmanager
+def whole(path: Path | str) -> Iterator[BinaryIO]:
+    """A binary file to write, which takes the place of `path` at the end, or none does on an error.
 
-    Whoever is killed meanwhile leaves an older file as it was.
+    Whoever is killed meanwhile leaves an older file as it was. Links are followed, an older file's
+    mode and owner stay; a pipe, a device or an open file such as /dev/stdout is written as it is.
     """
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        with part.open("wb") as file:
-            file.write(content)
+        old = os.stat(path)
+    except FileNotFoundError:
+        old = None
+    if old and (not stat.S_ISREG(old.st_mode) or os.path.abspath(path).startswith(_OPEN)):
+        with open(path, "ab") as file:
+            yield file
+        return
+    with replaced(Path(os.path.realpath(path))) as file:
+        yield file
+        if old:
+            with contextlib.suppress(PermissionError):
+                os.fchown(file.fileno(), old.st_uid, old.st_gid)
+            os.fchmod(file.fileno(), stat.S_IMODE(old.st_mode))
+
+
+@contextlib.contextmanager
+def replaced(path: Path, mode: int = 0o666) -> Iterator[BinaryIO]:
+    """The same for a plain file or a link, which is replaced itself; `mode` as the umask has it."""
+    part = path.with_name(f".{path.name[:200]}.{uuid.uuid4().hex}.part")
+    try:
+        with open(part, "xb", opener=lambda name, flags: os.open(name, flags, mode)) as file:
+            yield file
             file.flush()
             os.fsync(file.fileno())
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)
+
+
+def write_whole(path: Path | str, content: bytes) -> None:
+    """Write a file or nothing."""
+    with whole(path) as file:
+        file.write(content)

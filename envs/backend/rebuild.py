@@ -4,7 +4,7 @@ import types
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from numba.core.dispatcher import Dispatcher
+from numba.extending import is_jitted
 
 from .arrays import read
 from .decorators import F
@@ -25,7 +25,7 @@ def plain(function: F, table: Mapping[str, Callable[..., Any]] | None = None) ->
 
 
 def _rebuild(function: Any, table: dict[str, Any], done: dict[Any, Any]) -> Any:
-    source = function.py_func if isinstance(function, Dispatcher) else function
+    source = function.py_func if is_jitted(function) else function
     if source.__name__ in table and source.__module__ in _TABLED:
         return table[source.__name__]
     if source in done:
@@ -34,11 +34,11 @@ def _rebuild(function: Any, table: dict[str, Any], done: dict[Any, Any]) -> Any:
     rebuilt = types.FunctionType(source.__code__, names, source.__name__, source.__defaults__)
     done[source] = rebuilt
     for name in source.__code__.co_names:
-        callee = names.get(name)
+        callee: Any = names.get(name)
         ours = isinstance(callee, types.FunctionType) and (callee.__module__ or "").startswith(
             __name__.rpartition(".envs")[0]
         )
-        if isinstance(callee, Dispatcher) or ours:
+        if is_jitted(callee) or ours:
             names[name] = _rebuild(callee, table, done)
     del names["__name__"]  # by which torch.compile would look the names up in the module itself
     return rebuilt

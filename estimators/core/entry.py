@@ -5,7 +5,7 @@ from typing import Any
 
 import numba
 import numpy as np
-from numba.core.dispatcher import Dispatcher
+from numba.extending import is_jitted
 
 from ...envs.record import PACKET_WIDTH
 from .memory import FILTER
@@ -18,7 +18,7 @@ def entry(function: Any, *example: Any) -> Any:
     numba finds out the types of the arguments at every call, which costs more than a filter's
     step; this is the call without it, so arguments must have exactly these types and layouts.
     """
-    if not isinstance(function, Dispatcher):
+    if not is_jitted(function):
         return function
     return function.compile(tuple(map(numba.typeof, example)))
 

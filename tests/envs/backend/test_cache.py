@@ -1,4 +1,4 @@
-"""Compiled kernels on disk: kept once, loaded bit for bit, and their absence is no trouble."""
+"""Compiled kernels on disk: cached once, loaded bit for bit; their absence is no trouble."""
 
 import os
 import subprocess
@@ -10,6 +10,7 @@ import numba
 import numpy as np
 import pytest
 
+from sideslip.envs.backend import kernel_file
 from sideslip.envs.backend.compiler import Kernel
 
 MODULE = '''
@@ -17,14 +18,17 @@ MODULE = '''
 
 import math
 import sys
+from pathlib import Path
 
 import numpy as np
 
 from sideslip.envs.backend.compiler import Kernel
 
+FOLDER = Path(sys.argv[1])
+
 
 def kernel(function, apart=False):
-    return Kernel(function, targetoptions={"nopython": True}, kept=sys.argv[1], apart=apart)
+    return Kernel(function, targetoptions={"nopython": True}, folder=FOLDER, apart=apart)
 
 
 @kernel
@@ -88,16 +92,20 @@ EXPECTED = [(0.5 * np.sqrt(10.5)).hex(), "offset is not negative"]
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    (tmp_path / "kernels").mkdir()
+    (tmp_path / "kernels").mkdir(mode=0o700)
     (tmp_path / "tiny.py").write_text(MODULE)
     return tmp_path / "kernels"
 
 
 def start(folder: Path, code: str = USE, **variables: str) -> subprocess.Popen[str]:
-    kept = {name: value for name, value in os.environ.items() if not name.startswith("NUMBA_")}
+    others = {
+        name: value
+        for name, value in os.environ.items()
+        if not name.startswith(("NUMBA_", "SIDESLIP_"))
+    }
     return subprocess.Popen(
         [sys.executable, "-W", "error", "-c", "from tiny import *\n" + code, str(folder)],
-        env=kept | {"PYTHONPATH": f"{folder.parent}{os.pathsep}{SOURCE}"} | variables,
+        env=others | {"PYTHONPATH": f"{folder.parent}{os.pathsep}{SOURCE}"} | variables,
         cwd=folder.parent,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -111,19 +119,18 @@ SOURCE = Path(__file__).resolve().parents[3] / "src"
 def run(folder: Path, code: str = USE, **variables: str) -> tuple[list[str], str]:
     """The lines that a process prints, and what it writes to standard error."""
     process = start(folder, code, **variables)
-    said, complained = process.communicate(timeout=100)
+    printed, complained = process.communicate(timeout=100)
     assert process.returncode == 0, complained
-    return said.splitlines(), complained
+    return printed.splitlines(), complained
 
 
 def test_a_second_process_loads_what_the_first_compiled(folder: Path) -> None:
-    first, told = run(folder)
+    first, notices = run(folder)
     assert first == EXPECTED
-    assert told.count("compiling") == 1  # one line, whatever the number of kernels
+    assert notices.count("compiling") == 1  # one line, whatever the number of kernels
     files = {path: path.read_bytes() for path in folder.iterdir()}
     assert [path.name.partition("-")[0] for path in files] == ["tiny.total"]  # no callee
-    second, told = run(folder)
-    assert second == EXPECTED and told == ""
+    assert run(folder) == (EXPECTED, "")
     assert {path: path.read_bytes() for path in folder.iterdir()} == files
 
 
@@ -146,9 +153,12 @@ def test_expressions_of_whole_arrays_come_back(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("left", [0, 31, 1000, -1], ids=["empty", "digest", "cut", "last byte"])
-def test_a_damaged_file_is_compiled_again(left: int, tmp_path: Path) -> None:
+def test_a_damaged_file_is_compiled_again(
+    left: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def kernel() -> Any:
-        return Kernel(_tripled, targetoptions={"nopython": True}, kept=str(tmp_path))
+        monkeypatch.setattr(kernel_file, "_linked", {})  # as in a process of its own
+        return Kernel(_tripled, targetoptions={"nopython": True}, folder=tmp_path)
 
     assert kernel()(2.0) == 6.0
     (path,) = tmp_path.iterdir()
@@ -188,8 +198,7 @@ def test_processes_that_start_at_once(folder: Path) -> None:
         printed = process.communicate(timeout=100)[0]
         assert process.returncode == 0 and printed.splitlines() == EXPECTED
     assert len(list(folder.iterdir())) == 1
-    said, told = run(folder)
-    assert said == EXPECTED and told == ""
+    assert run(folder) == (EXPECTED, "")
 
 
 def test_signatures_compiled_at_once_do_not_take_each_others_files(folder: Path) -> None:
@@ -203,7 +212,7 @@ def test_signatures_compiled_at_once_do_not_take_each_others_files(folder: Path)
 
 
 @pytest.mark.parametrize("obstacle", ["missing", "file", "full"])
-def test_a_kernel_that_cannot_be_kept_is_compiled(
+def test_a_kernel_that_cannot_be_written_is_compiled(
     obstacle: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = tmp_path / "kernels"
@@ -212,13 +221,11 @@ def test_a_kernel_that_cannot_be_kept_is_compiled(
     elif obstacle == "full":
         folder.mkdir()
 
-        def full(self: Path, data: bytes) -> int:
-            with open(self, "wb") as file:
-                file.write(data[:100])
+        def full(descriptor: int) -> None:
             raise OSError(28, "No space left on device")
 
-        monkeypatch.setattr(Path, "write_bytes", full)
-    kernel: Any = Kernel(_tripled, targetoptions={"nopython": True}, kept=str(folder))
+        monkeypatch.setattr(os, "fsync", full)
+    kernel: Any = Kernel(_tripled, targetoptions={"nopython": True}, folder=folder)
     assert kernel(2.0) == 6.0
     assert not folder.is_dir() or not list(folder.iterdir())  # nothing half written is left
 
@@ -252,18 +259,18 @@ def test_a_function_compiled_by_numba_itself_may_call_a_kernel(apart: bool) -> N
 SETUP = "import logging; logging.basicConfig(level=logging.INFO, format='LOG %(message)s')\n"
 
 
-def test_who_waits_is_told(folder: Path) -> None:
+def test_a_line_says_that_kernels_are_compiled(folder: Path) -> None:
     """On standard error, or by the program's own logging; not with SIDESLIP_QUIET."""
-    say = "halved(2.0); halved(3)"
-    told = run(folder, say)[1].splitlines()
-    assert len(told) == 1 and str(folder.parent) in told[0]
+    call = "halved(2.0); halved(3)"
+    lines = run(folder, call)[1].splitlines()
+    assert len(lines) == 1 and str(folder.parent) in lines[0]
     for path in folder.iterdir():
         path.unlink()
-    told = run(folder, SETUP + say)[1].splitlines()
-    assert [line.split()[1] for line in told] == ["sideslip:", "compiled", "compiled"]
+    lines = run(folder, SETUP + call)[1].splitlines()
+    assert [line.split()[1] for line in lines] == ["sideslip:", "compiled", "compiled"]
     for path in folder.iterdir():
         path.unlink()
-    assert run(folder, say, SIDESLIP_QUIET="1")[1] == ""
+    assert run(folder, call, SIDESLIP_QUIET="1")[1] == ""
 
 
 def test_workers_say_nothing(folder: Path) -> None:

@@ -14,6 +14,7 @@ from sideslip.envs import backend
 from sideslip.envs.backend import cache
 
 PACKAGE = cache._PACKAGE
+kernel_folder = cache.kernel_folder.__wrapped__  # asked anew each time
 FOLDERS = ("envs", "estimators", "agents", "benchmarks")
 
 
@@ -30,10 +31,14 @@ def copy(tmp_path: Path) -> Path:
 
 def run(code: str, home: Path, **variables: str) -> str:
     """Run code on the package in `home` with every warning an error; returns what it prints."""
-    kept = {name: value for name, value in os.environ.items() if not name.startswith("NUMBA_")}
+    others = {
+        name: value
+        for name, value in os.environ.items()
+        if not name.startswith(("NUMBA_", "SIDESLIP_"))
+    }
     return subprocess.run(
         [sys.executable, "-W", "error", "-c", code],
-        env=kept | {"PYTHONPATH": str(home.parent)} | variables,
+        env=others | {"PYTHONPATH": str(home.parent)} | variables,
         cwd=home.parent,
         check=True,
         capture_output=True,
@@ -101,16 +106,16 @@ def test_old_versions_are_pruned_but_not_in_a_folder_of_the_users_own(
         monkeypatch.delenv(variable, raising=False)
         base = tmp_path / variable
         kernels = base / "sideslip" / "kernels" if variable == "XDG_CACHE_HOME" else base
-        for age in range(cache._KEPT_CACHES + 3):
+        for age in range(cache._VERSIONS + 3):
             old = kernels / f"version-{age}"
             old.mkdir(parents=True)
             os.utime(old, (1e9 - age, 1e9 - age))
         monkeypatch.setenv(variable, str(base))
-        assert cache._cache_folder() == str(kernels / cache.source_stamp())
+        assert kernel_folder() == kernels / cache.source_stamp()
         left = {path.name for path in kernels.iterdir()} - {cache.source_stamp()}
-        # our own newest folder is one of those kept
-        kept = cache._KEPT_CACHES + (-1 if variable == "XDG_CACHE_HOME" else 3)
-        assert left == {f"version-{age}" for age in range(kept)}
+        # our own newest folder is one of those that stay
+        stay = cache._VERSIONS + (-1 if variable == "XDG_CACHE_HOME" else 3)
+        assert left == {f"version-{age}" for age in range(stay)}
 
 
 def test_compiling_leaves_numbas_own_settings_alone() -> None:
@@ -142,16 +147,16 @@ def test_a_folder_that_can_only_be_read_is_read(
 ) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     folder = tmp_path / cache.source_stamp("envs")
-    assert cache._cache_folder("envs") == str(folder)  # made
+    assert kernel_folder("envs") == folder  # made
 
     def refuse(*_: object, **__: object) -> None:
         raise PermissionError("read-only")
 
     monkeypatch.setattr(Path, "mkdir", refuse)
     monkeypatch.setattr(os, "utime", refuse)
-    assert cache._cache_folder("envs") == str(folder)
+    assert kernel_folder("envs") == folder
     folder.rmdir()
-    assert cache._cache_folder("envs") is None
+    assert kernel_folder("envs") is None
 
 
 def test_a_folder_that_another_process_prunes_meanwhile_is_no_trouble(
@@ -161,4 +166,4 @@ def test_a_folder_that_another_process_prunes_meanwhile_is_no_trouble(
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     gone = [tmp_path / "gone"]
     monkeypatch.setattr(Path, "iterdir", lambda path: iter(gone))
-    assert cache._cache_folder("envs") is not None
+    assert kernel_folder("envs") is not None
