@@ -116,9 +116,8 @@ def changed(car: Any, change: Any, now: Any) -> Any:
 @jit
 def standing_load(drive: Any, car: Any, kind: Kind) -> Any:
     """The Load of the actuators as they are now."""
-    return load_of(
-        Inputs(drive.delta_f, drive.T_l, drive.T_r), car, kind.small_angle, kind.shifting
-    )
+    inputs = Inputs(drive.delta_f, drive.T_l, drive.T_r)
+    return load_of(inputs, car, kind.small_angle, kind.shifting)
 
 
 @jit
@@ -207,21 +206,14 @@ def _loads(fixed: Fixed, control: Control, now: Moving, kind: Kind) -> Any:
 
 @inlined
 def sense(
-    fixed: Fixed,
-    motion: Any,
-    accel: Any,
-    acted: Acted,
-    car: Any,
-    ahead: Any,
-    chance: Chance,
-    kind: Kind,
+    fixed: Fixed, motion: Any, accel: Any, acted: Acted, ahead: Any, chance: Chance, kind: Kind
 ) -> tuple[Any, Seen]:
     """(the driver's command, what is Seen) at the end of a tick that led to a motion.
 
     accel: (a_x, a_y) in m/s2, specific forces. The others are as in `advance`.
     """
     task = fixed.task
-    row = fast_row(motion, accel, acted, car.d_f, fixed.noise, chance)
+    row = fast_row(motion, accel, acted, fixed.car.d_f, fixed.noise, chance)
     v = 0.5 * (row[FAST.wheel_left] + row[FAST.wheel_right])
     beta = sideslip_angle(motion.v_x, motion.v_y, kind.small_angle)
     if kind.follows:
@@ -274,7 +266,7 @@ def advance(
     before, car, road = now.motion, now.car, fixed.road
     motion = rk4(before, loads, control.push, car, road, TICK, small_angle, law, roll)
     accel = specific_force(before, motion, road, small_angle, roll)
-    driver, seen = sense(fixed, motion, accel, control.acted, car, ahead, chance, kind)
+    driver, seen = sense(fixed, motion, accel, control.acted, ahead, chance, kind)
     return Moving(motion, control.drive, loads[2], driver, car), seen
 
 

@@ -127,7 +127,7 @@ class OutsideEnv(StabilityEnv):
             if plant.finite:
                 motion, force = plant.motion, plant.specific_force
             ahead = at(self._scratch, WINDOW.ahead, done)
-            driver, seen = _sense(fixed, motion, force, acted, now.car, ahead, chance, kind)
+            driver, seen = _sense(fixed, motion, force, acted, ahead, chance, kind)
             seen = seen._replace(lost=not plant.finite)
             now = Moving(motion, control.drive, None, driver, now.car)
             write(self.rows[done], seen.row, FAST)
