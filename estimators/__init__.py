@@ -1,16 +1,14 @@
-"""Sideslip estimators: filters for fast, slow and late sensors.
+"""Sideslip estimators: filters for fast, slow and late sensors, and the door for your own.
 
-`make_estimator` builds one by name; `EstimateObservation` puts it around an environment.
+`make_estimator` builds one by name; `EstimateObservation` puts it around an environment, and its
+namesake in `vector` around all rows of a vector env. Both take a user's own estimator as well:
+`EstimatorLike` is what that needs, `register_estimator` gives it a name.
 
-Where to start reading: `papers` has the table of filters; `make` turns a row of it into one, asking
-`options` and `wish` what the user wants and `rules` what that means in numbers. `models` and
-`transition` say which states it has and how they move, `delay` and `intersample` are its rules.
-`core` is what runs at every tick on a filter's `memory`: `step` predicts and takes the fast rows,
-`arrivals` and `measure` the packets, `layers` tells a second layer. Gains come from `covariance` at
-every step or, for a schedule that repeats, from `periodic`, `placed` and `spread`, in the textbook
-equations of `kalman`; `stability` refuses what diverges. `estimator` and `wrappers` are the faces,
-`dual_rate` that of any linear system, `smoother` tells the truth of a log offline, `bound` is the
-ceiling.
+Where things are: `filters` is the catalogue, one row a filter; `make` builds a row's filter with
+`design` (options, models, gains) and returns an `Estimator`. `core` is what runs at every tick,
+compiled, on a filter's memory. `wrappers` and `vector` put filters around environments. `protocol`
+and `registry` are for users' own. `analysis` has the error bound, the smoother and `DualRate`.
+May import `envs`; nothing of `agents` or `benchmarks`.
 """
 
 from .analysis.linear_system import DualRate
@@ -18,7 +16,8 @@ from .analysis.smoother import smooth
 from .estimates import Estimates, UnobservableWarning
 from .estimator import Estimator
 from .filters import FILTERS
-from .make import make_estimator
+from .make import make_estimator, register_estimator
+from .protocol import EstimatorFactory, EstimatorLike
 from .wrappers.estimate import EstimateObservation
 
 __all__ = [
@@ -27,7 +26,10 @@ __all__ = [
     "EstimateObservation",
     "Estimates",
     "Estimator",
+    "EstimatorFactory",
+    "EstimatorLike",
     "UnobservableWarning",
     "make_estimator",
+    "register_estimator",
     "smooth",
 ]

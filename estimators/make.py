@@ -1,9 +1,9 @@
 """`make_estimator`: from a row of the table and options to a filter."""
 
-import difflib
+import functools
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 
@@ -20,19 +20,31 @@ from .design.schedule import Schedule
 from .design.tunings import TUNINGS
 from .estimator import Estimator
 from .filters import FILTERS
+from .protocol import EstimatorFactory, ForeignEstimator, label_of
+from .registry import Registry
+
+
+@overload
+def make_estimator(name: str, **arguments: Any) -> Estimator: ...
+
+
+@overload
+def make_estimator(name: EstimatorFactory, **arguments: Any) -> Estimator | ForeignEstimator: ...
 
 
 def make_estimator(
-    name: str,
+    name: str | EstimatorFactory,
     *,
     vehicle: Vehicle | str | Mapping[str, Any] = COMS,
     sensors: Mapping[str, SlowSensor] | None = None,
     dt: float = TICK,
     speed: float | None = None,
     **options: Any,
-) -> Estimator:
+) -> Estimator | ForeignEstimator:
     """Build an estimator by name (`sideslip.estimators.FILTERS` lists them).
 
+    name: of `FILTERS`; or a registered name, an entry point "package.module:Name" or a factory,
+    which is called with the arguments below: what it builds comes as a `ForeignEstimator`.
     vehicle: what the filter is told. sensors: the slow sensors that are there, "camera" and "gps".
     dt: seconds of a tick. speed: m/s if it is held; None measures it with the front wheels.
 
@@ -75,13 +87,18 @@ def make_estimator(
         that exclude each other, a filter that diverges.
     TypeError: unknown option.
     """
-    if name not in FILTERS:
-        close = difflib.get_close_matches(name, FILTERS, 1)
-        hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(FILTERS)}"
-        raise ValueError(f"unknown estimator {name!r}; {hint}")
-    row, there = FILTERS[name], dict(sensors or {})
+    there = dict(sensors or {})
     if not dt > 0.0:
-        raise ValueError(f"{name}: a tick of {dt!r} s")
+        raise ValueError(f"{label_of(name)}: a tick of {dt!r} s")
+    if not (isinstance(name, str) and name in FILTERS):
+        factory = ESTIMATORS.load(name) if isinstance(name, str) else name
+        built = factory(vehicle=vehicle_from(vehicle), sensors=there, dt=dt, speed=speed, **options)
+        return (
+            built
+            if isinstance(built, Estimator)
+            else ForeignEstimator(built, label_of(name), dt, there)
+        )
+    row = FILTERS[name]
     told = Options(name, options)
     used = slow_sensors(name, row, there, told)
     wish = wish_of(name, row, used, told)
@@ -138,3 +155,19 @@ def make_estimator(
     )
     estimator.check(checked)
     return estimator
+
+
+ESTIMATORS = Registry(
+    "estimator", {name: functools.partial(make_estimator, name) for name in FILTERS}
+)
+"""Every estimator that has a name: the package's own and those that were registered."""
+
+
+def register_estimator(name: str, factory: EstimatorFactory | str) -> None:
+    """Give an estimator of your own a name that works wherever an estimator's name does.
+
+    factory: as `EstimatorFactory`, or "package.module:Name", which is imported when first asked
+    for. A name is known in this process alone; worker processes and `sideslip`'s command line take
+    the entry point itself for a name. Raises as `Registry.register`.
+    """
+    ESTIMATORS.register(name, factory)

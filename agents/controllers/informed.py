@@ -12,8 +12,8 @@ from ...envs.vehicle.tyres import SLOW
 from ...envs.vehicle.vehicle import GRAVITY, Vehicle
 from ...estimators.vector import estimate as vector
 from ...estimators.vector.truth import TruthObservation as VectorTruthObservation
-from ...estimators.wrappers.estimate import TRUTH, EstimateObservation
-from ...estimators.wrappers.truth import STIFFNESSES, TruthObservation
+from ...estimators.wrappers.estimate import EstimateObservation
+from ...estimators.wrappers.truth import STIFFNESSES, TRUTH, TruthObservation
 from ..env_facts import AnyEnv
 from .base import Array
 from .lqr import IN, Lqr

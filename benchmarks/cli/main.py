@@ -75,13 +75,13 @@ def list_names() -> None:
     from ...agents.learned.files import shipped
     from ...envs.scenarios.manoeuvres import SCENARIOS
     from ...envs.vehicle.vehicle import VEHICLES
-    from ...estimators.filters import FILTERS
+    from ...estimators.make import ESTIMATORS
 
     for title, names in {
         "environments": [name for name in gym.registry if name.startswith("sideslip/")],
         "scenarios": list(SCENARIOS),
         "vehicles": list(VEHICLES),
-        "estimators": list(FILTERS),
+        "estimators": list(ESTIMATORS),
         "agents": list(AGENTS),
         "policies": shipped(),
         "suites": list(SUITES),
@@ -92,8 +92,8 @@ def list_names() -> None:
 @app.command()
 def run(
     env_id: Annotated[str, typer.Argument(help="An environment's id.")] = "sideslip/YawVision-v0",
-    agent: Annotated[str, typer.Option(help="An agent's name, a policy's or its path.")] = "none",
-    estimator: Annotated[str | None, typer.Option(help="An estimator's name.")] = None,
+    agent: Annotated[str, typer.Option(help="A name, a policy's path, module:Name.")] = "none",
+    estimator: Annotated[str | None, typer.Option(help="A name or module:Name.")] = None,
     scenario: Annotated[str | None, typer.Option(help="A scenario's name.")] = None,
     seed: Annotated[int, typer.Option(help="Seed of the episode.")] = 0,
     control_period: Annotated[int, typer.Option(help="Ticks of 1 ms.")] = 10,

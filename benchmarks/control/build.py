@@ -53,7 +53,8 @@ class TrueState(VectorWrapper[Any, Any, Any, Any, Any]):
 
 def outputs_for(estimator: str) -> tuple[str, ...]:
     """What controllers are told of an estimate: beta, gamma, and disturbances if it has them."""
-    return ("beta", "gamma", *_DISTURBANCES.get(FILTERS[estimator].disturbances, ()))
+    row = FILTERS.get(estimator)  # a user's own has none
+    return ("beta", "gamma", *_DISTURBANCES.get(row.disturbances if row else "", ()))
 
 
 def estimate_options(cell: Cell) -> dict[str, Any]:

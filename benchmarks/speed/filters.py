@@ -10,7 +10,7 @@ from ...agents.rollout import rollout
 from ...envs.record import PACKET, Record
 from ...estimators.estimator import Estimator
 from ...estimators.make import make_estimator
-from ...estimators.vector.batch import make_batch
+from ...estimators.vector.make import make_batch
 from ..harness.results import Row, Suite, Table
 from ..tuning.task import Drive, told_by
 from .filterpy_rival import OURS, Rival, four_states, six_states

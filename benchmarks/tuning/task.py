@@ -21,7 +21,7 @@ from ...envs.record import Log
 from ...estimators.estimates import UnobservableWarning
 from ...estimators.estimator import Estimator
 from ...estimators.filters import FILTERS
-from ...estimators.make import make_estimator
+from ...estimators.make import ESTIMATORS, make_estimator
 from ..estimation import EXPERIMENTS, SETTLED
 from ..harness.parallel import run_cases
 
@@ -92,8 +92,7 @@ def make_task(
     if seeds < 1:
         raise ValueError(f"seeds must be at least 1, got {seeds}")
     held = dict(options or {})
-    if estimator not in FILTERS:
-        make_estimator(estimator)  # says which name is meant
+    ESTIMATORS.load(estimator)  # or ValueError
     env_id, told, filter_ = _fitting(estimator, scenario, env_id, held)
     states = filter_.names
     if target not in states:
@@ -143,10 +142,15 @@ def build(estimator: str, told: Mapping[str, Any], options: Mapping[str, Any]) -
         return make_estimator(estimator, **told, **options)
 
 
+def _unstable(estimator: str) -> dict[str, bool]:
+    """The option of ours to be built whatever their error does; a user's own has none."""
+    return {"allow_unstable": True} if estimator in FILTERS else {}
+
+
 def _takes(estimator: str, option: str, held: Mapping[str, Any], told: Mapping[str, Any]) -> bool:
     """Whether the estimator has an option; whether the number suits is another matter."""
     try:
-        build(estimator, told, {"allow_unstable": True, **held, option: 1e-3})
+        build(estimator, told, {**_unstable(estimator), **held, option: 1e-3})
     except TypeError:
         return False
     except ValueError:
@@ -167,7 +171,7 @@ def _fitting(
         env.reset(seed=FIRST_SEED)
         told = told_by(env.unwrapped)
         try:
-            return name, told, build(estimator, told, {"allow_unstable": True, **held})
+            return name, told, build(estimator, told, {**_unstable(estimator), **held})
         except ValueError as error:
             refused.setdefault(str(error), name)
     why = "; ".join(f"{name}: {text}" for text, name in refused.items())

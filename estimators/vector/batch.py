@@ -1,6 +1,7 @@
 """Many filters of one kind at work side by side, each with its own memory and covariance."""
 
 import copy
+import functools
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -9,75 +10,72 @@ import numpy.typing as npt
 
 from ...envs.record import FAST_WIDTH, PACKET_WIDTH, Log, Record
 from ...envs.sensors.link import SlowSensor
-from ...envs.ticks import TICK
-from ...envs.vehicle.vehicle import COMS, Vehicle, vehicle_from
 from ..core.memory import FILTER, Counters
 from ..estimates import Estimates
-from ..estimator import Estimator
-from .designs import Designs, Told
+from ..wrappers.arguments import Setup
+from .designs import Build, Designs
 from .kernel import batch_entry, nothing_observed
 
 Array = npt.NDArray[np.float64]
 Whole = npt.NDArray[np.int64]
 Sensors = Mapping[str, SlowSensor]
-Car = Vehicle | str | Mapping[str, Any]
 
 
 class BatchEstimator:
-    """N filters of one name; built by `make_batch`.
+    """N filters of one name in one compiled call; built by `make_batch`.
 
-    `batch[i]` is the `Estimator` at work in row i: it shares that row's memory. `filters` (N, L)
-    are the records of all filters and their layers. Filters that are told the same, but for the
-    phases of clocks, share one table of gains.
+    `batch[i]` is the `Estimator` at work in row i: it shares that row's memory. `filters`
+    (N, layers) are the records of all filters. `names`, `units`: of their states. Filters of equal
+    setups, but for the phases of clocks, share one table of gains.
 
     Raises ValueError if the filters have different states.
     """
 
-    def __init__(
-        self, name: str, told: Sequence[Told], dt: float, options: Mapping[str, Any]
-    ) -> None:
+    def __init__(self, name: str, setups: Sequence[Setup], dt: float, build: Build) -> None:
         self.name, self.dt = name, dt
-        self._designs = Designs(name, dt, options)
-        self._told: list[Told] = list(told)
-        self._of: list[Any] = [None] * len(told)  # each row's design
-        first = self._designs.built(told[0])
+        self._designs = Designs(build)
+        self._setups: list[Setup] = list(setups)
+        self._of: list[Any] = [None] * len(setups)  # each row's design
+        first = self._designs.built(setups[0])
         self.names, self.units = first.names, first.units
-        self.filters = np.zeros((len(told), len(first.filters)), FILTER).view(np.recarray)
-        self._unread = nothing_observed(len(told))
-        self.tell(range(len(told)), told)
+        self.filters = np.zeros((len(setups), len(first.filters)), FILTER).view(np.recarray)
+        self.configure(range(len(setups)), setups)
 
     def __len__(self) -> int:
         return len(self.filters)
 
-    def __getitem__(self, i: int) -> Estimator:
+    def __getitem__(self, i: int) -> Any:
         design = self._of[i]
         estimator = copy.copy(self._designs[design])
-        estimator.sensors = {name: self._told[i].sensors[name] for name in estimator.sensors}
+        estimator.sensors = {name: self._setups[i].sensors[name] for name in estimator.sensors}
         estimator.filters, estimator.gains = self.filters[i], self._designs.gains(design)
         return estimator
 
-    def __iter__(self) -> Iterator[Estimator]:
+    def __iter__(self) -> Iterator[Any]:
         return (self[i] for i in range(len(self)))
 
-    def tell(self, rows: Iterable[int], told: Iterable[Told]) -> None:
-        """Tell some rows' filters what their cars are, to be reset then.
+    def configure(self, rows: Iterable[int], setups: Iterable[Setup]) -> None:
+        """Fit the filters of some rows to their setups; to be reset then.
 
-        A filter that is told more than other phases is built anew.
+        A filter whose setup differs in more than the phases of its clocks is built anew.
         """
         changed = False
-        for i, each in zip(rows, told, strict=True):
-            self._told[i], design = each, each.design
+        for i, each in zip(rows, setups, strict=True):
+            self._setups[i], design = each, each.design
             if design == self._of[i]:
                 continue
             built = self._designs.built(each)
-            if built.names != self.names:
-                raise ValueError(
-                    f"{self.name}: the filters of a batch have the same states, row 0 has "
-                    f"{', '.join(self.names)} and row {i} {', '.join(built.names)}"
-                )
+            self._check_states(i, built.names)
             self._of[i], self.filters[i], changed = design, built.filters, True
         if changed:
             self._places = self._designs.place(self._of)
+
+    def _check_states(self, i: int, names: tuple[str, ...]) -> None:
+        if names != self.names:
+            raise ValueError(
+                f"{self.name}: the filters of a batch have the same states, row 0 has "
+                f"{', '.join(self.names)} and row {i} {', '.join(names)}"
+            )
 
     def reset(
         self,
@@ -90,8 +88,8 @@ class BatchEstimator:
         sensors: slow sensors whose clocks have a new phase, of all filters or a list (N,).
         """
         for i in _rows_of(mask, len(self)):
-            told = sensors if sensors is None or isinstance(sensors, Mapping) else sensors[i]
-            self[i].reset(told, first)
+            own = sensors if sensors is None or isinstance(sensors, Mapping) else sensors[i]
+            self[i].reset(own, first)
 
     def step(
         self,
@@ -100,7 +98,7 @@ class BatchEstimator:
         counts: npt.ArrayLike | None = None,
         rows: npt.ArrayLike | None = None,
     ) -> None:
-        """Take each filter's fast rows (N, k, FAST_WIDTH) and packets (N, room, PACKET_WIDTH).
+        """Take each filter's fast rows (N, k, FAST_WIDTH) and packets (N, capacity, PACKET_WIDTH).
 
         counts, rows: (N,), how many of each filter's packets and rows are there (all if None; a
         filter with none of either stands still). Raises ValueError for other shapes.
@@ -116,6 +114,16 @@ class BatchEstimator:
         )
         self.take(None, fast, rows, packets, counts, *self._unread)
 
+    @functools.cached_property
+    def _unread(self) -> tuple[Any, ...]:
+        return nothing_observed(len(self))
+
+    def run(self, sources: Sequence[Log | Record]) -> list[Estimates]:
+        """`Estimator.run` of each filter on a record of its own."""
+        if len(sources) != len(self):
+            raise ValueError(f"{self.name}: {len(self)} filters, got {len(sources)} records")
+        return [self[i].run(source) for i, source in enumerate(sources)]
+
     def take(
         self,
         mask: npt.NDArray[np.bool_] | None,
@@ -127,7 +135,7 @@ class BatchEstimator:
     ) -> None:
         """`step` of the filters of a mask without any checks of C-contiguous arrays.
 
-        observed: what `observe_batch` takes after `counts`.
+        observed: what `kernel.observe_batch` takes after `counts`.
         """
         done = np.full(len(self), -1) if mask is None else np.where(mask, -1, rows)
         memory = self.filters, self._designs.pool, self._places, done
@@ -140,18 +148,12 @@ class BatchEstimator:
         for i in wanted.values():
             self[i].design_missing()
 
-    def run(self, sources: Sequence[Log | Record]) -> list[Estimates]:
-        """`Estimator.run` of each filter on a record of its own."""
-        if len(sources) != len(self):
-            raise ValueError(f"{self.name}: {len(self)} filters, got {len(sources)} records")
-        return [self[i].run(source) for i, source in enumerate(sources)]
-
     def get_state(self) -> Any:
         """A snapshot that `set_state` continues from, bit for bit."""
         return self.filters.copy()
 
     def set_state(self, snapshot: Any) -> None:
-        """Go back to a snapshot of this batch or of one built with the same arguments."""
+        """Go back to a snapshot of this batch or of one with the same setups."""
         self.filters[:] = snapshot
 
     @property
@@ -167,45 +169,11 @@ class BatchEstimator:
     @property
     def counts(self) -> dict[str, Whole]:
         """All counters by name, each (N,)."""
-        told = [each.counts for each in self]
-        return {name: np.array([each[name] for each in told]) for name in Counters._fields}
+        counts = [each.counts for each in self]
+        return {name: np.array([each[name] for each in counts]) for name in Counters._fields}
 
     def __repr__(self) -> str:
         return f"<{len(self)} x {self.name}: {', '.join(self.names)}>"
-
-
-def make_batch(
-    name: str,
-    count: int,
-    *,
-    vehicle: Car | Sequence[Car] = COMS,
-    sensors: Sensors | Sequence[Sensors] | None = None,
-    dt: float = TICK,
-    speed: float | Sequence[float | None] | None = None,
-    **options: Any,
-) -> BatchEstimator:
-    """Build `count` filters by name; the arguments are those of `make_estimator`.
-
-    vehicle, sensors and speed may each be a list of `count`: one for each filter. Raises what
-    `make_estimator` raises, and ValueError for a list of another length.
-    """
-    if count < 1:
-        raise ValueError(f"{name}: a batch has at least one filter, got {count}")
-    cars = _each("vehicle", vehicle, count, (Vehicle, str, Mapping))
-    clocks = _each("sensors", sensors or {}, count, (Mapping,))
-    speeds = _each("speed", speed, count, (int, float, np.number, type(None)))
-    told = [Told(vehicle_from(c), s, v) for c, s, v in zip(cars, clocks, speeds, strict=True)]
-    batch = BatchEstimator(name, told, dt, options)
-    batch.reset(None, clocks)
-    return batch
-
-
-def _each(what: str, value: Any, count: int, alone: tuple[type, ...]) -> list[Any]:
-    if isinstance(value, alone):
-        return [value] * count
-    if len(value) != count:
-        raise ValueError(f"{what}: one or a list of {count}, got {len(value)}")
-    return list(value)
 
 
 def _rows_of(mask: npt.ArrayLike | None, count: int) -> list[int]:
@@ -224,8 +192,8 @@ def _check_shape(what: str, array: Array, count: int, width: int) -> None:
         raise ValueError(f"{what} have shape ({count}, k, {width}), got {array.shape}")
 
 
-def _how_many(what: str, value: npt.ArrayLike, count: int, room: int) -> Whole:
+def _how_many(what: str, value: npt.ArrayLike, count: int, largest: int) -> Whole:
     numbers = np.ascontiguousarray(np.broadcast_to(np.asarray(value, np.int64), (count,)))
-    if numbers.min() < 0 or numbers.max() > room:
-        raise ValueError(f"{what} are 0 to {room}, got {numbers.min()} to {numbers.max()}")
+    if numbers.min() < 0 or numbers.max() > largest:
+        raise ValueError(f"{what} are 0 to {largest}, got {numbers.min()} to {numbers.max()}")
     return numbers

@@ -1,39 +1,23 @@
 """The few different filters of a batch: each is designed once, their gains lie in one pool."""
 
-import dataclasses
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ...envs.sensors.link import SlowSensor
-from ...envs.vehicle.vehicle import Vehicle
 from ..estimator import Estimator
-from ..make import make_estimator
+from ..wrappers.arguments import AnyEstimator, Setup
 
 Array = npt.NDArray[np.float64]
-
-
-class Told(NamedTuple):
-    """What a filter is told of its car."""
-
-    vehicle: Vehicle
-    sensors: Mapping[str, SlowSensor]
-    speed: float | None = None
-
-    @property
-    def design(self) -> Any:
-        """A key that is equal for filters that differ in the phases of their clocks alone."""
-        clocks = [(name, dataclasses.replace(s, phase=0.0)) for name, s in self.sensors.items()]
-        return self.vehicle, tuple(sorted(clocks)), self.speed
+Build = Callable[[Setup], AnyEstimator]
 
 
 class Designs:
-    """Estimators of one name by what they were told, and the pool of their gains."""
+    """Estimators of ours by the design of their setups, and the pool of their gains."""
 
-    def __init__(self, name: str, dt: float, options: Mapping[str, Any]) -> None:
-        self._name, self._dt, self._options = name, dt, dict(options)
+    def __init__(self, build: Build) -> None:
+        self._build = build
         self._built: dict[Any, Estimator] = {}
         self._places: dict[Any, tuple[int, ...]] = {}
         self.pool = np.zeros(0)
@@ -41,18 +25,17 @@ class Designs:
     def __getitem__(self, design: Any) -> Estimator:
         return self._built[design]
 
-    def built(self, told: Told) -> Estimator:
-        """The estimator for this, built unless it is at hand."""
-        design = told.design
+    def built(self, setup: Setup) -> Estimator:
+        """The estimator for this, built unless it is at hand.
+
+        Raises TypeError where a factory that built a filter of ours builds something else.
+        """
+        design = setup.design
         if design not in self._built:
-            self._built[design] = make_estimator(
-                self._name,
-                vehicle=told.vehicle,
-                sensors=told.sensors,
-                dt=self._dt,
-                speed=told.speed,
-                **self._options,
-            )
+            found = self._build(setup)
+            if not isinstance(found, Estimator):
+                raise TypeError(f"a batch is of filters of ours or of none, got {found!r} as well")
+            self._built[design] = found
         return self._built[design]
 
     def gains(self, design: Any) -> Array:

@@ -13,15 +13,14 @@ from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
 from ...envs.task.observation import Entry
-from ...envs.vehicle.vehicle import Vehicle, vehicle_from
-from ..wrappers.estimate import TRUTH, usual_estimator
+from ...envs.vehicle.vehicle import Vehicle
+from ..wrappers.arguments import Arguments, Setup, Source
 from ..wrappers.estimate import EstimateObservation as Single
 from ..wrappers.outputs import BETA, NEES, outputs_of
-from ..wrappers.truth import as_built, tell_stiffness
-from .batch import BatchEstimator
-from .designs import Told
-from .records import Batch, BatchedRecords, SyncRecords, records_of, true_vehicles
-from .spec import twin_spec
+from ..wrappers.truth import as_built, set_stiffness
+from .make import batch_of
+from .records import BatchedRecords, Records, SyncRecords, records_of, state_of, true_vehicles
+from .spec import vector_spec
 
 Observations = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
@@ -31,12 +30,13 @@ Step = tuple[Observations, Any, Any, Any, dict[str, Any]]
 class EstimateObservation(
     VectorWrapper[Observations, Any, Observations, Any, Any], RecordConstructorArgs
 ):
-    """Runs an estimator on each car's record and appends what it says to the observations.
+    """Runs an estimator on each car's record and appends its states to the observations.
 
-    The vector twin of `sideslip.estimators.EstimateObservation`, with the same arguments: every
-    row gets the bits that the single wrapper would give it. It must be the innermost wrapper;
-    others of its kind may be stacked, each with its own `name`. It works on `SyncVectorEnv` and
-    on a vector env that offers what `records.Batched` says.
+    `sideslip.estimators.EstimateObservation` of all rows, with the same arguments: every row gets
+    the bits that the single wrapper would give it. It must be the innermost wrapper; others of its
+    class may be stacked, each with its own `name`. It works on `SyncVectorEnv` and on a vector env
+    that offers what `records.Batched` lists. A factory is called once for each row, and again
+    where a row's car changes; one object cannot serve them all.
 
     A row whose episode ended starts a new one with a fresh filter: in the next step, or within
     the step that ended it, where the old filter first takes the last record into `final_obs`. As
@@ -45,14 +45,15 @@ class EstimateObservation(
     `layout` describes a row; `estimator` is the `BatchEstimator` at work. `spec` names the single
     wrapper: `gym.make_vec(spec)` builds environments that are wrapped one by one.
 
-    Raises TypeError if it is not the innermost wrapper or the records are out of reach; ValueError
-    for an unknown output, where names would stand twice, or without autoreset.
+    Raises TypeError if it is not the innermost wrapper, the records are out of reach or the
+    estimator is an object; ValueError for an unknown output, where names would stand twice, or
+    without autoreset.
     """
 
     def __init__(
         self,
         env: VectorEnv[Any, Any, Any],
-        estimator: str | None = None,
+        estimator: Source | None = None,
         outputs: Sequence[str] = ("beta", "gamma"),
         std: bool = True,
         replace: bool = False,
@@ -61,33 +62,30 @@ class EstimateObservation(
         name: str | None = None,
     ) -> None:
         self._records = _records_below(env)
-        if estimator is None:
-            estimator = usual_estimator(self._records.told([0])[0].sensors)
-        car = vehicle.to_dict() if isinstance(vehicle, Vehicle) else vehicle
-        RecordConstructorArgs.__init__(
-            self,
-            estimator=estimator,
-            outputs=list(outputs),
-            std=bool(std),
-            replace=bool(replace),
-            vehicle=dict(car) if isinstance(car, Mapping) else car,
-            options=dict(options or {}),
-            name=name,
+        clocks = self._records.setups([0])[0].sensors
+        self._arguments = arguments = Arguments(
+            estimator, outputs, std, replace, vehicle, options, name, clocks
         )
+        if arguments.object is not None:
+            raise TypeError(
+                f"one {arguments.label} cannot estimate {env.num_envs} rows: pass its class, "
+                "another factory or a name"
+            )
+        RecordConstructorArgs.__init__(self, **arguments.recorded)
         VectorWrapper.__init__(self, env)
         mode = env.metadata.get("autoreset_mode")
         if mode not in (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP):
             raise ValueError(f"the vector env must reset rows itself; its autoreset_mode is {mode}")
         self._same_step = mode == AutoresetMode.SAME_STEP
-        self._truth = isinstance(vehicle, str) and vehicle == TRUTH
-        self._vehicle = None if vehicle is None or self._truth else vehicle_from(vehicle)
-        told = self._told(range(env.num_envs))
-        self._built = told[0].vehicle
-        self.estimator = BatchEstimator(estimator, told, self._records.dt, options or {})
+        setups = self._setups(range(env.num_envs))
+        self._built = setups[0].vehicle
+        dt = self._records.dt
+        self.estimator = batch_of(arguments.source, setups, dt, arguments.options)
         inner = () if replace else getattr(env, "layout", self._records.layout)
-        self._says = outputs_of(estimator, self.estimator.names, outputs, std, name, inner)
-        self.layout: tuple[Entry, ...] = self._says.layout
-        low, high = self._says.bounds
+        states = self.estimator.names
+        self._outputs = outputs_of(arguments.label, states, outputs, std, name, inner)
+        self.layout: tuple[Entry, ...] = self._outputs.layout
+        low, high = self._outputs.bounds
         self.single_observation_space = gym.spaces.Box(low, high, dtype=np.float32)
         self.observation_space = batch_space(self.single_observation_space, env.num_envs)
         self._out = np.zeros((env.num_envs, len(self.layout)), np.float32)
@@ -96,7 +94,7 @@ class EstimateObservation(
     @property
     def spec(self) -> EnvSpec | None:  # type: ignore[override]  # as in VectorWrapper
         """The env's with the single wrapper; JSON-able, None where the env has none."""
-        return twin_spec(self.env.spec, Single, self._saved_kwargs)
+        return vector_spec(self.env.spec, Single, self._saved_kwargs)
 
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
@@ -128,7 +126,7 @@ class EstimateObservation(
             if isinstance(self._records, BatchedRecords):  # it refuses before it steps any row
                 self._ended = before
             raise
-        self._ended = ended = np.logical_or(terminated, truncated)
+        ended = np.logical_or(terminated, truncated)
         if not self._same_step:
             self._restart(before)
         elif ended.any():
@@ -136,70 +134,103 @@ class EstimateObservation(
             self._restart(ended)
         everyone = np.ones(self.num_envs, np.bool_)
         self._observe(self._records.newest(), obs, infos, everyone, self._out)
+        self._ended = ended
         return self._out.copy(), rewards, terminated, truncated, infos
 
-    def _told(self, rows: Sequence[int]) -> list[Told]:
-        told = self._records.told(rows)
-        if self._truth:
+    def get_state(self) -> dict[str, Any]:
+        """A snapshot of env and estimators that `set_state` continues from, bit for bit.
+
+        Raises TypeError where the vector env makes none.
+        """
+        return {
+            "env": state_of(self.env),
+            "estimator": self.estimator.get_state(),
+            "out": self._out.copy(),
+            "ended": None if self._ended is None else self._ended.copy(),
+        }
+
+    def set_state(self, snapshot: Mapping[str, Any]) -> None:
+        """Go back to a snapshot of this env or of one built with the same arguments."""
+        env: Any = self.env
+        env.set_state(snapshot["env"])
+        self._configure(range(self.num_envs))
+        self.estimator.set_state(snapshot["estimator"])
+        self._out[:], ended = snapshot["out"], snapshot["ended"]
+        self._ended = None if ended is None else ended.copy()
+
+    def _setups(self, rows: Sequence[int]) -> list[Setup]:
+        """What the estimators of some rows are built for."""
+        setups = self._records.setups(rows)
+        if self._arguments.truth:
             cars = true_vehicles(self.unwrapped, rows)
-            return [each._replace(vehicle=car) for each, car in zip(told, cars, strict=True)]
-        if self._vehicle is None:
-            return told
-        return [each._replace(vehicle=self._vehicle) for each in told]
+            return [each._replace(vehicle=car) for each, car in zip(setups, cars, strict=True)]
+        if self._arguments.vehicle is None:
+            return setups
+        return [each._replace(vehicle=self._arguments.vehicle) for each in setups]
+
+    def _configure(self, rows: Sequence[int]) -> None:
+        """Fit the estimators of some rows to the cars of their present episodes."""
+        setups = self._setups(rows)
+        if not self._arguments.truth:
+            self.estimator.configure(rows, setups)
+            return
+        first = self.estimator[0]
+        cars = [as_built(first, self._built, each.vehicle) for each in setups]
+        built = zip(setups, cars, strict=True)
+        self.estimator.configure(rows, [each._replace(vehicle=car) for each, car in built])
+        for i, each in zip(rows, setups, strict=True):
+            set_stiffness(self.estimator[i], each.vehicle)
 
     def _restart(self, mask: Mask) -> None:
         """Reset the estimators of some rows with the clocks of their new episodes."""
         rows = np.flatnonzero(mask).tolist()
         if rows:
-            told = self._told(rows)
-            if not self._truth:
-                self.estimator.tell(rows, told)
-            else:
-                first = self.estimator[0]
-                plain = [as_built(first, self._built, each.vehicle) for each in told]
-                cars = zip(told, plain, strict=True)
-                self.estimator.tell(rows, [each._replace(vehicle=car) for each, car in cars])
-                for i, each in zip(rows, told, strict=True):
-                    tell_stiffness(self.estimator[i], each.vehicle)
+            self._configure(rows)
             self.estimator.reset(mask)
 
     def _finish(self, infos: dict[str, Any], ended: Mask) -> None:
         """Take the last record of the rows that ended into their `final_obs` and `final_info`."""
-        obs, out = np.zeros((self.num_envs, self._says.kept), np.float32), np.zeros_like(self._out)
-        if self._says.kept > 0:
+        inner, out = self._outputs.inner, np.zeros_like(self._out)
+        obs = np.zeros((self.num_envs, inner), np.float32)
+        if inner > 0:
             obs[ended] = np.stack(infos["final_obs"][ended])
         self._observe(self._records.final(ended), obs, infos["final_info"], ended, out)
         for i in np.flatnonzero(ended):
             infos["final_obs"][i] = out[i].copy()
 
     def _observe(
-        self, batch: Batch, obs: Observations, infos: dict[str, Any], mask: Mask, out: Observations
+        self,
+        records: Records,
+        obs: Observations,
+        infos: dict[str, Any],
+        mask: Mask,
+        out: Observations,
     ) -> None:
-        """Take the records of some rows; write their observations and what `infos` tells."""
-        says, N = self._says, self.num_envs
+        """Take the records of some rows; write their observations and their part of `infos`."""
+        outputs, N = self._outputs, self.num_envs
         beta, gamma = infos.get("beta"), infos.get("gamma")
         known = beta is not None and gamma is not None
         truth = (beta, gamma) if known else (np.zeros(N), np.zeros(N))
-        said = np.zeros((N, 3))
+        summary = np.zeros((N, 3))
         self.estimator.take(
             mask,
-            *batch,
+            *records,
             np.ascontiguousarray(obs, np.float32),
-            says.kept,
-            says.plan,
-            says.limits,
+            outputs.inner,
+            outputs.plan,
+            outputs.limits,
             *truth,
             out,
-            said,
+            summary,
         )
-        for key, place in says.keys:
+        for key, place in outputs.keys:
             if place == NEES and not known:
                 continue
-            values, told = said[:, place].copy(), mask.copy()
-            if place == NEES:  # some rows' truth may be untold
-                told &= infos.get("_beta", True)
-                values[~told] = 0.0
-            infos[key], infos[f"_{key}"] = values, told
+            values, present = summary[:, place].copy(), mask.copy()
+            if place == NEES:  # the truth of some rows may be missing
+                present &= infos.get("_beta", True)
+                values[~present] = 0.0
+            infos[key], infos[f"_{key}"] = values, present
             if place == BETA:
                 self._records.annotate(key, values, mask)
 

@@ -33,19 +33,19 @@ def observe_batch(
     packets: Any,
     counts: Any,
     obs: Any,
-    kept: int,
+    inner: int,
     plan: Any,
     limits: Any,
     beta: Any,
     gamma: Any,
     out: Any,
-    said: Any,
+    summary: Any,
 ) -> int:
     """`observe` for every filter that has not done its rows; returns how many still have not.
 
     filters: (N, L). places: (N, 4), see `gains_of`. done: (N,) rows done, -1 where a filter has
-    not started. fast: (N, k, FAST_WIDTH). packets: (N, room, PACKET_WIDTH). All others but kept,
-    plan and limits have one row for each filter, too.
+    not started. fast: (N, k, FAST_WIDTH). packets: (N, capacity, PACKET_WIDTH). All others but
+    inner, plan and limits have one row for each filter, too.
     """
     waiting = 0
     for i in range(len(filters)):
@@ -59,13 +59,13 @@ def observe_batch(
                 counts[i],
                 maximum(done[i], 0),
                 obs[i],
-                kept,
+                inner,
                 plan,
                 limits,
                 beta[i],
                 gamma[i],
                 out[i],
-                said[i],
+                summary[i],
             )
             waiting += 1 if done[i] < rows[i] else 0
     return waiting

@@ -11,19 +11,19 @@ from ...envs.record import FAST_WIDTH, PACKET_WIDTH
 from ...envs.sensors.link import SlowSensor
 from ...envs.task.observation import Entry
 from ...envs.vehicle.vehicle import Vehicle
+from ..wrappers.arguments import Setup, setup_of
 from ..wrappers.estimate import base_of
-from .designs import Told
 
 Array = npt.NDArray[np.float64]
 Whole = npt.NDArray[np.int64]
 
 
-class Batch(NamedTuple):
+class Records(NamedTuple):
     """The records of N cars' newest step."""
 
     fast: Array  # (N, k, FAST_WIDTH)
     rows: Whole  # (N,), how many of them are there
-    packets: Array  # (N, room, PACKET_WIDTH)
+    packets: Array  # (N, capacity, PACKET_WIDTH)
     counts: Whole  # (N,)
 
 
@@ -57,22 +57,22 @@ class BatchedRecords:
         self.layout: tuple[Entry, ...] = env.layout
         self.dt: float = env.dt
 
-    def newest(self) -> Batch:
+    def newest(self) -> Records:
         """Of the newest step, or of tick 0 where a car was reset."""
         env = self._env
         return _contiguous(env.rows, env.ticks_done, env.packets, env.delivered)
 
-    def final(self, ended: npt.NDArray[np.bool_]) -> Batch:
+    def final(self, ended: npt.NDArray[np.bool_]) -> Records:
         """Of the last step of the episodes that ended in this step."""
         env = self._env
         return _contiguous(
             env.final_rows, env.final_ticks_done, env.final_packets, env.final_delivered
         )
 
-    def told(self, rows: Sequence[int]) -> list[Told]:
-        """What the estimators of some rows are told, by the env."""
+    def setups(self, rows: Sequence[int]) -> list[Setup]:
+        """What the env offers to the estimators of some rows."""
         env = self._env
-        return [Told(env.nominal[i], env.slow_sensors[i], env.held_speed[i]) for i in rows]
+        return [Setup(env.nominal[i], env.slow_sensors[i], env.held_speed[i]) for i in rows]
 
     def annotate(self, key: str, values: Array, mask: npt.NDArray[np.bool_]) -> None:
         """Numbers to draw: a batch is not drawn."""
@@ -91,45 +91,41 @@ class SyncRecords:
         self.dt: float = self._bases[0].dt
         N = len(self._bases)
         ticks = max(len(base.rows) for base in self._bases)
-        room = max(len(base.packets) for base in self._bases)
-        self._batch = Batch(
+        capacity = max(len(base.packets) for base in self._bases)
+        self._records = Records(
             np.zeros((N, ticks, FAST_WIDTH)),
             np.zeros(N, np.int64),
-            np.zeros((N, room, PACKET_WIDTH)),
+            np.zeros((N, capacity, PACKET_WIDTH)),
             np.zeros(N, np.int64),
         )
 
-    def newest(self) -> Batch:
+    def newest(self) -> Records:
         """Of the newest step, or of tick 0 where a car was reset."""
-        fast, rows, packets, counts = self._batch
+        fast, rows, packets, counts = self._records
         for i, base in enumerate(self._bases):
             n, m = base.ticks_done, base.delivered
             fast[i, :n], packets[i, :m] = base.rows[:n], base.packets[:m]
             rows[i], counts[i] = n, m
-        return self._batch
+        return self._records
 
-    def final(self, ended: npt.NDArray[np.bool_]) -> Batch:
+    def final(self, ended: npt.NDArray[np.bool_]) -> Records:
         """Of the last step of the episodes that ended in this step."""
-        fast, rows, packets, counts = self._batch
+        fast, rows, packets, counts = self._records
         for i in np.flatnonzero(ended):
             base = self._bases[i]
             n, m = base.final_ticks_done, base.final_delivered
             fast[i, :n], packets[i, :m] = base.final_rows[:n], base.final_packets[:m]
             rows[i], counts[i] = n, m
-        return self._batch
+        return self._records
 
-    def told(self, rows: Sequence[int]) -> list[Told]:
-        """What the estimators of some rows are told, by their environments."""
-        bases = [self._bases[i] for i in rows]
-        return [
-            Told(base.nominal, base.slow_sensors, getattr(base, "held_speed", None))
-            for base in bases
-        ]
+    def setups(self, rows: Sequence[int]) -> list[Setup]:
+        """What the environments of some rows offer to their estimators."""
+        return [setup_of(self._bases[i]) for i in rows]
 
     def annotate(self, key: str, values: Array, mask: npt.NDArray[np.bool_]) -> None:
         """Numbers to draw beside the truth."""
-        for base, value, told in zip(self._bases, values.tolist(), mask, strict=True):
-            if told:
+        for base, value, drawn in zip(self._bases, values.tolist(), mask, strict=True):
+            if drawn:
                 base.annotate(**{key: value})
 
 
@@ -141,13 +137,13 @@ def true_vehicles(base: Any, rows: Sequence[int]) -> list[Vehicle]:
     if isinstance(base, SyncVectorEnv):
         return [base.envs[i].unwrapped.vehicle for i in rows]  # type: ignore[attr-defined]
     if not hasattr(base, "vehicle"):
-        raise TypeError(f"{type(base).__name__} does not tell which vehicles its rows drive")
+        raise TypeError(f"{type(base).__name__} does not offer which vehicles its rows drive")
     return [base.vehicle[i] for i in rows]
 
 
-def _contiguous(fast: Any, rows: Any, packets: Any, counts: Any) -> Batch:
+def _contiguous(fast: Any, rows: Any, packets: Any, counts: Any) -> Records:
     """Arrays as compiled code takes them, copied only where they are not."""
-    return Batch(
+    return Records(
         np.ascontiguousarray(fast, np.float64),
         np.ascontiguousarray(rows, np.int64),
         np.ascontiguousarray(packets, np.float64),
@@ -176,3 +172,13 @@ def records_of(env: VectorEnv[Any, Any, Any]) -> SyncRecords | BatchedRecords:
             f"{type(env).__name__} has no {', '.join(missing)}"
         )
     return BatchedRecords(env)
+
+
+def state_of(env: Any) -> Any:
+    """The snapshot of a vector env, wrapped or not; TypeError where it makes none."""
+    if not hasattr(env, "get_state"):
+        raise TypeError(
+            f"{type(env).__name__} makes no snapshots; the vector env that gym.make_vec builds "
+            "without a vectorization_mode does"
+        )
+    return env.get_state()

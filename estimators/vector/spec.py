@@ -8,7 +8,7 @@ from gymnasium.envs.registration import EnvSpec, VectorizeMode, WrapperSpec
 from gymnasium.vector import AutoresetMode
 
 
-def twin_spec(spec: EnvSpec | None, single: Any, kwargs: Mapping[str, Any]) -> EnvSpec | None:
+def vector_spec(spec: EnvSpec | None, single: Any, kwargs: Mapping[str, Any]) -> EnvSpec | None:
     """The spec of a vector env whose rows wear the wrapper `single(**kwargs)`; None without one.
 
     JSON-able. `gym.make_vec` of it makes environments that are wrapped one by one: it puts no
@@ -18,8 +18,8 @@ def twin_spec(spec: EnvSpec | None, single: Any, kwargs: Mapping[str, Any]) -> E
         return None
     spec = copy.deepcopy(spec)
     entry = f"{single.__module__}:{single.__name__}"
-    twin = WrapperSpec(single.class_name(), entry, copy.deepcopy(dict(kwargs)))
-    spec.additional_wrappers += (twin,)
+    wrapper = WrapperSpec(single.class_name(), entry, copy.deepcopy(dict(kwargs)))
+    spec.additional_wrappers += (wrapper,)
     if spec.kwargs.get("vectorization_mode") == VectorizeMode.VECTOR_ENTRY_POINT.value:
         spec.kwargs["vectorization_mode"] = VectorizeMode.SYNC.value
         spec.kwargs.pop("info", None)

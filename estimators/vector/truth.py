@@ -1,6 +1,6 @@
 """TruthObservation for vector environments."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -13,8 +13,8 @@ from gymnasium.vector.utils import batch_space
 
 from ..wrappers.truth import STIFFNESSES, parameters_of, truth_entries
 from ..wrappers.truth import TruthObservation as Single
-from .records import true_vehicles
-from .spec import twin_spec
+from .records import state_of, true_vehicles
+from .spec import vector_spec
 
 Observations = npt.NDArray[np.float32]
 
@@ -22,14 +22,15 @@ Observations = npt.NDArray[np.float32]
 class TruthObservation(
     VectorWrapper[Observations, Any, Observations, Any, Any], RecordConstructorArgs
 ):
-    """The vector twin of `sideslip.estimators.truth.TruthObservation`, with the same bits.
+    """`sideslip.estimators.wrappers.truth.TruthObservation` of all rows, with the same bits.
 
-    It stands outside of `sideslip.estimators.vector.EstimateObservation`. A row is told its new
-    car with the first observation of an episode; `final_obs` holds the old one's. `spec` names the
-    single wrapper: `gym.make_vec(spec)` builds environments that are wrapped one by one.
+    It stands outside of `sideslip.estimators.vector.EstimateObservation`. A row has the parameters
+    of its new car from the first observation of an episode on; `final_obs` holds the old one's.
+    `spec` names the single wrapper: `gym.make_vec(spec)` builds environments that are wrapped one
+    by one.
 
-    Raises TypeError where the env tells no layout or no vehicles, ValueError for an unknown name
-    or one that stands twice.
+    Raises TypeError where the env has no layout or no vehicles, ValueError for an unknown name or
+    one that stands twice.
     """
 
     def __init__(
@@ -39,7 +40,7 @@ class TruthObservation(
         VectorWrapper.__init__(self, env)
         if not hasattr(env, "layout"):
             raise TypeError(
-                f"{type(env).__name__} tells no layout; wrap it in "
+                f"{type(env).__name__} has no layout; wrap it in "
                 "sideslip.estimators.vector.EstimateObservation first"
             )
         self._parameters = tuple(parameters)
@@ -54,7 +55,7 @@ class TruthObservation(
     @property
     def spec(self) -> EnvSpec | None:  # type: ignore[override]  # as in VectorWrapper
         """The env's with the single wrapper; JSON-able, None where the env has none."""
-        return twin_spec(self.env.spec, Single, self._saved_kwargs)
+        return vector_spec(self.env.spec, Single, self._saved_kwargs)
 
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
@@ -79,6 +80,17 @@ class TruthObservation(
             self._read(self._ended)
         self._ended = ended
         return np.hstack([obs, self._values]), rewards, terminated, truncated, infos
+
+    def get_state(self) -> dict[str, Any]:
+        """A snapshot that `set_state` continues from; TypeError where the env makes none."""
+        own = {"values": self._values.copy(), "ended": self._ended.copy()}
+        return own | {"env": state_of(self.env)}
+
+    def set_state(self, snapshot: Mapping[str, Any]) -> None:
+        """Go back to a snapshot of this env or of one built with the same arguments."""
+        env: Any = self.env
+        env.set_state(snapshot["env"])
+        self._values, self._ended = snapshot["values"].copy(), snapshot["ended"].copy()
 
     def _read(self, mask: npt.NDArray[np.bool_]) -> None:
         rows = np.flatnonzero(mask)

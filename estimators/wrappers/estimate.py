@@ -1,6 +1,6 @@
-"""EstimateObservation: an estimator's view beside, or instead of, the raw observation."""
+"""EstimateObservation: an estimator's states beside, or instead of, the raw observation."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -10,47 +10,52 @@ from gymnasium.utils import RecordConstructorArgs
 from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker
 
 from ...envs.task.observation import Entry
-from ...envs.vehicle.vehicle import Vehicle, vehicle_from
+from ...envs.vehicle.vehicle import Vehicle
 from ..estimator import Estimator
-from ..make import make_estimator
+from .arguments import AnyEstimator, Arguments, Setup, Source, setup_of
 from .kernel import observe_entry
-from .outputs import BETA, outputs_of
-from .truth import as_built, tell_stiffness
+from .outputs import BETA, outputs_of, write
+from .truth import as_built, set_stiffness
 
 _MAY_STAND_BETWEEN = (PassiveEnvChecker, OrderEnforcing)
-# stable-baselines3's make_vec_env and rl-zoo put it directly around the environment. It only keeps
-# count, and is known by name: this module loads nothing of theirs.
+# stable-baselines3's make_vec_env and rl-zoo put it directly around the environment. It only counts
+# and is known by name: this module loads nothing of theirs.
 _MONITOR = ("stable_baselines3.common.monitor", "Monitor")
-TRUTH = "truth"  # in place of a vehicle: the one that is driven
 _OFFERED = ("rows", "ticks_done", "packets", "delivered", "slow_sensors", "nominal", "layout")
 
 
 class EstimateObservation(
     gym.Wrapper[npt.NDArray[np.float32], Any, npt.NDArray[np.float32], Any], RecordConstructorArgs
 ):
-    """Runs an estimator on the car's record and appends what it says to the observation.
+    """Runs an estimator on the car's record and appends its states to the observation.
 
     It must be the innermost wrapper: the estimator sees every tick of every step. Others of its
-    kind may be stacked, each with its own `name`; stable-baselines3's `Monitor` may be inside.
+    class may be stacked, each with its own `name`; stable-baselines3's `Monitor` may be inside.
 
-    estimator: a name of `make_estimator`; None: `usual_estimator` of the env's sensors. outputs:
-    states to append, each as `<state>_hat`, then, if `std`, each one's standard deviation as
-    `<state>_std`. replace: the observation is these alone. vehicle: what the estimator is told (a
-    preset, a mapping; default the env's nominal; "truth": the true car of each episode, as it is at
-    the reset). options: of `make_estimator`. name: put before every name as `<name>_`.
+    estimator: a name of `make_estimator`, an entry point "package.module:Name", a factory (see
+    `EstimatorFactory`) or an object (see `EstimatorLike`), which is reset at every episode but
+    hears of no other car; None: `usual_estimator` of the env's sensors. outputs: states to append,
+    each as `<state>_hat`, then, if `std`, each one's standard deviation as `<state>_std`. replace:
+    the observation is these alone. vehicle: as the estimator believes it to be (a preset, a
+    mapping; default the env's nominal; "truth": the true car of each episode, as it is at the
+    reset). options: of `make_estimator`. name: put before every name as `<name>_`.
 
     `info` gains `beta_hat` and `beta_std` where the estimator has beta and, if beta or gamma is
     among the outputs, `nees`: their normalised estimation error squared, divided by their number.
-    `layout` describes the whole observation; `estimator` is the estimator at work.
+    An estimate that is not finite is passed on, so that controllers and the env see the failure.
+    `layout` describes the whole observation; `estimator` is the estimator at work, around a user's
+    own as a `ForeignEstimator`. In `spec` a factory that can be imported stands as its entry point;
+    `spec.to_json()` refuses others and objects with TypeError.
 
-    Raises TypeError if it is not the innermost wrapper or the env has no record; ValueError for an
-    unknown output, or where names would stand twice.
+    Raises TypeError if it is not the innermost wrapper, the env has no record or the estimator is
+    none; ValueError for an unknown output, where names would stand twice, or for an object with a
+    vehicle or options.
     """
 
     def __init__(
         self,
         env: gym.Env[Any, Any],
-        estimator: str | None = None,
+        estimator: Source | None = None,
         outputs: Sequence[str] = ("beta", "gamma"),
         std: bool = True,
         replace: bool = False,
@@ -59,56 +64,38 @@ class EstimateObservation(
         name: str | None = None,
     ) -> None:
         self._base = base_of(env)
-        if estimator is None:
-            estimator = usual_estimator(self._base.slow_sensors)
-        car = vehicle.to_dict() if isinstance(vehicle, Vehicle) else vehicle
-        RecordConstructorArgs.__init__(
-            self,
-            estimator=estimator,
-            outputs=list(outputs),
-            std=bool(std),
-            replace=bool(replace),
-            vehicle=dict(car) if isinstance(car, Mapping) else car,
-            options=dict(options or {}),
-            name=name,
+        clocks = self._base.slow_sensors
+        self._arguments = Arguments(
+            estimator, outputs, std, replace, vehicle, options, name, clocks
         )
+        RecordConstructorArgs.__init__(self, **self._arguments.recorded)
         gym.Wrapper.__init__(self, env)
-        self._kind, self._options = estimator, dict(options or {})
-        self._truth = isinstance(vehicle, str) and vehicle == TRUTH
-        self._vehicle = None if vehicle is None or self._truth else vehicle_from(vehicle)
-        self._told: Any = None
-        self.estimator: Estimator = self._current_estimator()
+        self._setup: Setup | None = None
+        self.estimator: AnyEstimator = self._configured()
         inner: tuple[Entry, ...] = () if replace else env.get_wrapper_attr("layout")
-        self._says = outputs_of(estimator, self.estimator.names, outputs, std, name, inner)
-        self.layout: tuple[Entry, ...] = self._says.layout
-        low, high = self._says.bounds
+        states, label = self.estimator.names, self._arguments.label
+        self._outputs = outputs_of(label, states, outputs, std, name, inner)
+        self.layout: tuple[Entry, ...] = self._outputs.layout
+        low, high = self._outputs.bounds
         self.observation_space = gym.spaces.Box(low, high, dtype=np.float32)
         self._width = len(self.layout)
-        self._said = np.zeros(3)
+        self._summary = np.zeros(3)
 
-    def _current_estimator(self) -> Estimator:
-        """The estimator for what the env tells now; the one at hand where nothing changed."""
-        base = self._base
-        vehicle = base.nominal if self._vehicle is None else self._vehicle
-        if self._truth:
-            vehicle = base.vehicle
-            if self._told is not None:
-                vehicle = as_built(self.estimator, self._told[0], vehicle)
-        speed = getattr(base, "held_speed", None)
-        clocks = {name: (s.period, s.delays, s.jitter) for name, s in base.slow_sensors.items()}
-        told = vehicle, clocks, speed
-        if told != self._told:
-            self.estimator = make_estimator(
-                self._kind,
-                vehicle=vehicle,
-                sensors=base.slow_sensors,
-                dt=base.dt,
-                speed=speed,
-                **self._options,
-            )
-            self._told = told
-        if self._truth:
-            tell_stiffness(self.estimator, base.vehicle)
+    def _configured(self) -> AnyEstimator:
+        """The estimator for the env's present setup; the one at hand where nothing changed."""
+        base, arguments, before = self._base, self._arguments, self._setup
+        setup = setup_of(base)
+        if arguments.vehicle is not None:
+            setup = setup._replace(vehicle=arguments.vehicle)
+        elif arguments.truth:
+            car = base.vehicle
+            fits = car if before is None else as_built(self.estimator, before.vehicle, car)
+            setup = setup._replace(vehicle=fits)
+        if before is None or setup.design != before.design:
+            self.estimator, self._setup = arguments.build(setup, base.dt), setup
+            self._ours = isinstance(self.estimator, Estimator)
+        if arguments.truth:
+            set_stiffness(self.estimator, base.vehicle)
         return self.estimator
 
     def reset(
@@ -116,7 +103,7 @@ class EstimateObservation(
     ) -> tuple[npt.NDArray[np.float32], dict[str, Any]]:
         """Reset the env, then the estimator with this episode's clocks, and take tick 0."""
         obs, info = self.env.reset(seed=seed, options=options)
-        self._current_estimator().reset(self._base.slow_sensors)
+        self._configured().reset(self._base.slow_sensors)
         return self._observed(obs, info), info
 
     def step(self, action: Any) -> tuple[npt.NDArray[np.float32], Any, bool, bool, dict[str, Any]]:
@@ -132,14 +119,20 @@ class EstimateObservation(
     def set_state(self, snapshot: Mapping[str, Any]) -> None:
         """Go back to a snapshot of this env or of one built with the same arguments."""
         self.env.get_wrapper_attr("set_state")(snapshot["env"])
-        self._current_estimator().set_state(snapshot["estimator"])
+        self._configured().set_state(snapshot["estimator"])
 
     def _observed(
         self, obs: npt.NDArray[np.float32], info: dict[str, Any]
     ) -> npt.NDArray[np.float32]:
-        base, estimator, says = self._base, self.estimator, self._says
-        out, said, rows, done = np.empty(self._width, np.float32), self._said, base.ticks_done, 0
-        while True:
+        """The estimator takes the newest step; the observation with its outputs, (width,)."""
+        base, outputs, summary = self._base, self._outputs, self._summary
+        estimator: Any = self.estimator
+        out, rows, done = np.empty(self._width, np.float32), base.ticks_done, 0
+        last = outputs.inner, outputs.plan, outputs.limits, info["beta"], info["gamma"]
+        if not self._ours:
+            estimator.step(base.rows[:rows], base.packets[: base.delivered])
+            write(estimator, obs, *last, out, summary)
+        while self._ours:
             done = observe_entry()(
                 estimator.filters,
                 estimator.gains,
@@ -149,28 +142,19 @@ class EstimateObservation(
                 base.delivered,
                 done,
                 obs,
-                says.kept,
-                says.plan,
-                says.limits,
-                info["beta"],
-                info["gamma"],
+                *last,
                 out,
-                said,
+                summary,
             )
-            if done == rows:
+            if done == rows:  # which a refused action leaves at none
                 break
             estimator.design_missing()
-        values = said.tolist()
-        for key, place in says.keys:
+        values = summary.tolist()
+        for key, place in outputs.keys:
             info[key] = values[place]
             if place == BETA:
                 base.annotate(**{key: values[place]})
         return out
-
-
-def usual_estimator(slow_sensors: Iterable[str]) -> str:
-    """The estimator where none is named: `dakf` where there is a GPS, else `exact-kf`."""
-    return "dakf" if "gps" in slow_sensors else "exact-kf"
 
 
 def base_of(env: gym.Env[Any, Any]) -> Any:

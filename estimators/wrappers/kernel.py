@@ -49,26 +49,26 @@ def observe(
     count: int,
     start: int,
     obs: Any,
-    kept: int,
+    inner: int,
     plan: Any,
     limits: Any,
     beta: float,
     gamma: float,
     out: Any,
-    said: Any,
+    summary: Any,
 ) -> int:
-    """`advance`, then the first `kept` entries of obs and the outputs into out.
+    """`advance`, then the first `inner` entries of obs and the outputs into out.
 
     plan: (m, 3), each output's state, counted through the layers, whether it is wrapped and which
-    truth it has (`outputs.TRUTHS`). limits: (m,). out: kept + m entries, or kept + 2 m with
-    standard deviations. said: the first state, its standard deviation and the nees. Returns the
+    truth it has (`outputs.TRUTHS`). limits: (m,). out: inner + m entries, or inner + 2 m with
+    standard deviations. summary: the first state, its standard deviation and the nees. Returns the
     rows done, as `advance` does.
     """
-    X, nis = fast[:0], said[:0]  # nothing to be filled
+    X, nis = fast[:0], summary[:0]  # nothing to be filled
     done = advance(filters, gains, fast, rows, packets, count, start, X, X, nis)
     if done < rows:
         return done
-    for i in range(kept):
+    for i in range(inner):
         out[i] = obs[i]
     m, beta_at, gamma_at = len(plan), -1, -1
     for i in range(m):
@@ -80,16 +80,16 @@ def observe(
         value = f.x[state]
         if plan[i, 1] == 1:
             value = wrap(value)
-        out[kept + i] = _clipped(value, limits[i])
-        if len(out) > kept + m:
-            out[kept + m + i] = _clipped(deviation(f, gains, state), limits[i])
+        out[inner + i] = _clipped(value, limits[i])
+        if len(out) > inner + m:
+            out[inner + m + i] = _clipped(deviation(f, gains, state), limits[i])
         if plan[i, 2] == 1:
             beta_at = state
         elif plan[i, 2] == 2:
             gamma_at = state
     f = filters[0]
-    said[0], said[1] = f.x[0], deviation(f, gains, 0)
-    said[2] = _nees(f, gains, beta_at, gamma_at, beta, gamma)
+    summary[0], summary[1] = f.x[0], deviation(f, gains, 0)
+    summary[2] = _nees(f, gains, beta_at, gamma_at, beta, gamma)
     return done
 
 

@@ -7,8 +7,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ...envs.backend.elementary import wrap
+from ...envs.backend.primitives import ARRAYS
+from ...envs.backend.rebuild import plain
 from ...envs.task.observation import Entry
 from ..design.models import UNITS
+from ..protocol import EstimatorLike, deviations
+
+Array = npt.NDArray[np.float64]
 
 BOUNDS = {
     "beta": np.pi / 2.0,
@@ -31,23 +37,26 @@ BOUNDS = {
     "N_d": 1e5,
 }
 """Estimates are clipped here, headings are wrapped."""
+OTHER_BOUND = 1e6  # of a state that only a user's estimator has
 
 TRUTHS = {"beta": 1, "gamma": 2}  # states whose truth stands in the info
-BETA, STD, NEES = 0, 1, 2  # places of what `observe` says
+BETA, STD, NEES = 0, 1, 2  # places in the summary of a step
 _WRAPPED = ("psi", "psi_late")
+_wrap = plain(wrap, ARRAYS)
 
 
 @dataclass(frozen=True)
 class Outputs:
     """The entries of a wrapped observation.
 
-    layout: all of them; the first `kept` are the inner observation's. plan, limits: as `observe`
-    takes them. keys: of `info`, each with its place in what `observe` said: beta and its standard
-    deviation where the filter estimates it, the nees where the truth of an output is known.
+    layout: all of them; the first `inner` are the inner observation's. plan, limits: as `observe`
+    takes them. keys: of `info`, each with its place in the summary that `observe` fills: beta and
+    its standard deviation where the filter estimates it, the nees where the truth of an output is
+    known.
     """
 
     layout: tuple[Entry, ...]
-    kept: int
+    inner: int
     plan: npt.NDArray[np.int64]
     limits: npt.NDArray[np.float64]
     keys: tuple[tuple[str, int], ...]
@@ -74,8 +83,9 @@ def outputs_of(
         if output not in states:
             raise ValueError(f"{estimator} has no state {output!r}; it has: {', '.join(states)}")
     before = "" if name is None else f"{name}_"
-    hats = [Entry(f"{before}{s}_hat", UNITS[s], -BOUNDS[s], BOUNDS[s]) for s in outputs]
-    stds = [Entry(f"{before}{s}_std", UNITS[s], 0.0, BOUNDS[s]) for s in outputs]
+    known = [(s, UNITS.get(s, "-"), BOUNDS.get(s, OTHER_BOUND)) for s in outputs]
+    hats = [Entry(f"{before}{s}_hat", unit, -bound, bound) for s, unit, bound in known]
+    stds = [Entry(f"{before}{s}_std", unit, 0.0, bound) for s, unit, bound in known]
     layout = (*inner, *hats, *(stds if std else ()))
     names = [each.name for each in layout]
     twice = sorted({each for each in names if names.count(each) > 1})
@@ -83,12 +93,43 @@ def outputs_of(
         raise ValueError(f"{', '.join(twice)} would stand twice; give this wrapper a name=...")
     truths = [TRUTHS.get(s, 0) for s in outputs]
     columns = [states.index(s) for s in outputs], [s in _WRAPPED for s in outputs], truths
-    keys = [("beta_hat", BETA), ("beta_std", STD)] if states[0] == "beta" else []
+    keys = [("beta_hat", BETA), ("beta_std", STD)] if "beta" in states else []
     keys += [("nees", NEES)] if any(truths) else []
     return Outputs(
         layout,
         len(inner),
         np.array(columns, np.int64).T.copy(),
-        np.array([BOUNDS[s] for s in outputs]).astype(np.float32).astype(np.float64),
+        np.array([bound for *_, bound in known]).astype(np.float32).astype(np.float64),
         tuple((before + key, place) for key, place in keys),
     )
+
+
+def write(
+    estimator: EstimatorLike,
+    obs: npt.NDArray[np.float32],
+    inner: int,
+    plan: npt.NDArray[np.int64],
+    limits: Array,
+    beta: float,
+    gamma: float,
+    out: npt.NDArray[np.float32],
+    summary: Array,
+) -> None:
+    """What `kernel.observe` writes of a filter of ours, of a user's; the arguments are the same.
+
+    Raises as `ForeignEstimator.x`.
+    """
+    x, P = np.asarray(estimator.x), np.asarray(estimator.P)
+    std, states, m = deviations(P), plan[:, 0], len(plan)
+    out[:inner] = obs[:inner]
+    with np.errstate(invalid="ignore"):
+        values = np.where(plan[:, 1] == 1, _wrap(x[states]), x[states])
+    out[inner : inner + m] = np.clip(values, -limits, limits)
+    if len(out) > inner + m:
+        out[inner + m :] = np.clip(std[states], -limits, limits)
+    first = estimator.names.index("beta") if "beta" in estimator.names else 0
+    judged = plan[plan[:, 2] > 0]
+    e = x[judged[:, 0]] - np.where(judged[:, 2] == 1, beta, gamma)
+    S = P[np.ix_(judged[:, 0], judged[:, 0])]
+    nees = e @ np.linalg.solve(S, e) / len(e) if len(e) and np.linalg.det(S) > 0.0 else 0.0
+    summary[:] = x[first], std[first], nees

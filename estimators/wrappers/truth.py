@@ -1,7 +1,7 @@
-"""TruthObservation: parameters of the true car beside the observation, for who is told them."""
+"""TruthObservation: parameters of the true car beside the observation."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -12,7 +12,9 @@ from gymnasium.utils import RecordConstructorArgs
 from ...envs.task.observation import Entry
 from ...envs.vehicle.vehicle import Vehicle
 from ..estimator import Estimator
+from ..protocol import ForeignEstimator
 
+TRUTH = "truth"  # in place of a vehicle: the one that is driven
 STIFFNESSES = ("front_stiffness", "rear_stiffness")
 LARGEST = 1e7  # of any parameter of a vehicle, SI
 
@@ -42,12 +44,12 @@ def parameters_of(vehicle: Vehicle, parameters: Sequence[str]) -> npt.NDArray[np
     return np.array([getattr(vehicle, name) for name in parameters], np.float32)
 
 
-def as_built(estimator: Estimator, built: Vehicle, vehicle: Vehicle) -> Vehicle:
+def as_built(estimator: Estimator | ForeignEstimator, built: Vehicle, vehicle: Vehicle) -> Vehicle:
     """The car to build an estimator for, so that the one at hand serves wherever it can.
 
-    Where gains follow P nothing is designed from the stiffnesses: `tell_stiffness` will do.
+    Where gains follow P nothing is designed from the stiffnesses: `set_stiffness` will do.
     """
-    if estimator.filters[0].periodic:
+    if isinstance(estimator, ForeignEstimator) or estimator.filters[0].periodic:
         return vehicle
     return vehicle.replace(
         name=built.name,
@@ -57,10 +59,11 @@ def as_built(estimator: Estimator, built: Vehicle, vehicle: Vehicle) -> Vehicle:
     )
 
 
-def tell_stiffness(estimator: Estimator, vehicle: Vehicle) -> None:
-    """Let a filter have a car's stiffnesses from its next reset on."""
-    for f in estimator.filters:
-        f.car[4], f.car[5] = vehicle.front_stiffness, vehicle.rear_stiffness
+def set_stiffness(estimator: Estimator | ForeignEstimator, vehicle: Vehicle) -> None:
+    """Give a filter a car's stiffnesses from its next reset on; one of a user's own has them."""
+    if isinstance(estimator, Estimator):
+        for f in estimator.filters:
+            f.car[4], f.car[5] = vehicle.front_stiffness, vehicle.rear_stiffness
 
 
 class TruthObservation(
@@ -68,7 +71,7 @@ class TruthObservation(
 ):
     """Appends parameters of the car that is driven, as they are at the reset.
 
-    No sensor tells these: it makes the informed controller, with which others are compared, and
+    No sensor measures these: it makes the informed controller, with which others are compared, and
     stands outside of any `EstimateObservation`.
 
     parameters: names of `Vehicle`'s, appended as `true_<name>` in their units. `layout` describes
@@ -97,3 +100,12 @@ class TruthObservation(
         """One env-step."""
         obs, reward, terminated, truncated, info = self.env.step(action)
         return np.concatenate([obs, self._values]), reward, terminated, truncated, info
+
+    def get_state(self) -> dict[str, Any]:
+        """A snapshot of the env and the parameters that `set_state` continues from."""
+        return {"env": self.env.get_wrapper_attr("get_state")(), "values": self._values.copy()}
+
+    def set_state(self, snapshot: Mapping[str, Any]) -> None:
+        """Go back to a snapshot of this env or of one built with the same arguments."""
+        self.env.get_wrapper_attr("set_state")(snapshot["env"])
+        self._values = snapshot["values"].copy()

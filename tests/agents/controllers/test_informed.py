@@ -81,7 +81,7 @@ def test_a_filter_told_at_the_reset_is_one_that_is_built_for_the_car() -> None:
 
 
 def test_periodic_gains_are_designed_for_the_true_car() -> None:
-    env = EstimateObservation(
+    env: Any = EstimateObservation(
         gym.make("sideslip/YawVision-v0"), "multirate-kf", vehicle="truth", std=False
     )
     first = env.estimator
@@ -173,11 +173,11 @@ def test_bad_input() -> None:
     with pytest.raises(ValueError, match="true_mass would stand twice"):
         TruthObservation(TruthObservation(env, ["mass"]), ["mass"])
     rows = SyncVectorEnv([lambda: gym.make(FUSION)])
-    with pytest.raises(TypeError, match="tells no layout"):
+    with pytest.raises(TypeError, match="has no layout"):
         VectorTruthObservation(rows)
     kinds = ("coms", "passenger-car")
     cars = SyncVectorEnv([functools.partial(gym.make, FUSION, vehicle=kind) for kind in kinds])
-    with pytest.raises(ValueError, match="row 1 was told another nominal vehicle"):
+    with pytest.raises(ValueError, match="row 1 has another nominal vehicle"):
         make_agent("feedforward", cars)
 
 

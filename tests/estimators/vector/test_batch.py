@@ -11,8 +11,9 @@ import pytest
 from sideslip.envs import COMS, Log, SlowSensor
 from sideslip.envs.record import FAST, FAST_WIDTH, PACKET, PACKET_WIDTH
 from sideslip.estimators import FILTERS, make_estimator
-from sideslip.estimators.vector.batch import BatchEstimator, make_batch
-from sideslip.estimators.vector.designs import Told
+from sideslip.estimators.vector.batch import BatchEstimator
+from sideslip.estimators.vector.make import make_batch
+from sideslip.estimators.wrappers.arguments import Setup
 from tests.estimators.simulation import CAMERA, FIG7, GPS, KMH, simulate
 
 pytestmark = pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning")
@@ -135,7 +136,7 @@ def test_a_row_that_is_told_something_new_is_the_filter_for_that() -> None:
     later = simulate(dataclasses.replace(FIG7, duration=0.3), {"camera": uneven}, 9)
     batch = make_batch("multirate-kf", 2, sensors=[log.slow for log in logs], speed=SPEED)
     feed(batch, logs, 10, 0, 150)
-    batch.tell([1], [Told(COMS, later.slow, SPEED)])
+    batch.configure([1], [Setup(COMS, later.slow, SPEED)])
     batch.reset([False, True])
     fast, packets = later.record.fast[:100], later.record.packets
     for k in range(0, 100, 10):

@@ -190,7 +190,7 @@ def test_snapshots_and_copies_continue_bit_for_bit() -> None:
 
 def test_a_reset_tells_the_filter_the_drawn_clock() -> None:
     env: Any = gym.make(VISION, camera={"phase": None})
-    wrapped = EstimateObservation(env, "exact-kf")
+    wrapped: Any = EstimateObservation(env, "exact-kf")
     phases = set()
     for seed in range(8):
         wrapped.reset(seed=seed)

@@ -1,0 +1,163 @@
+"""What an estimator is to the package: the protocol, and the checked face of a user's own."""
+
+import copy
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from ..envs.record import PACKET, Log, Record
+from ..envs.sensors.link import SlowSensor
+from .design.models import UNITS
+from .estimates import Estimates
+
+Array = npt.NDArray[np.float64]
+
+
+class EstimatorLike(Protocol):
+    """A filter that `EstimateObservation` can run: one of `make_estimator`, or a user's own.
+
+    Nothing is inherited from: a class with these five members will do. After `reset` and after
+    every `step`, `x` and `P` are the estimate at the tick of the last fast row.
+    """
+
+    @property
+    def names(self) -> Sequence[str]:
+        """Of the n states; "beta" and "gamma" are the sideslip angle and the yaw rate.
+
+        States with a name of `design.models.UNITS` are in that unit; others have the unit "-".
+        """
+
+    @property
+    def x(self) -> npt.ArrayLike:
+        """The estimate, (n,). NaN means that the filter failed: it is passed on, never hidden."""
+
+    @property
+    def P(self) -> npt.ArrayLike:
+        """Its covariance, (n, n); a diagonal one where only standard deviations are known."""
+
+    def reset(self, sensors: Mapping[str, SlowSensor], first: int, /) -> None:
+        """Forget everything: an episode begins, whose first fast row is the tick `first`.
+
+        sensors: clock and link of each slow sensor in this episode, "camera" and "gps".
+        """
+
+    def step(self, rows: Array, packets: Array, /) -> None:
+        """Take what the car's wires carried since the last call.
+
+        rows: (k, FAST_WIDTH), the fast rows of k ticks in order, columns as in `envs.record.Fast`;
+        row j holds the inputs that acted from the tick before it to its own. k is 1 at the reset
+        and 0 where the env refused an action. packets: (count, PACKET_WIDTH), what slow sensors
+        delivered in these ticks, columns as in `envs.record.Packet`, ordered by arrival. A packet
+        that arrived at a tick follows that tick's row; its values are of the tick at which it was
+        captured. SI units; both arrays are copies.
+        """
+
+
+EstimatorFactory = Callable[..., EstimatorLike]
+"""What builds an estimator, a class or a function, called with keywords alone: `vehicle`, a
+`Vehicle` as the filter believes it to be; `sensors`, the slow ones by name; `dt`, s of a tick;
+`speed`, m/s where it is held and None where it is to be measured; and the user's options."""
+
+
+class ForeignEstimator:
+    """A user's estimator behind the names that it shares with `Estimator`, its states checked.
+
+    inner: the user's object. `names`, `units`: of its states. `sensors`: slow ones of this episode.
+    Raises TypeError where `inner` lacks a member, ValueError for names that are not distinct words.
+    """
+
+    unobservable: tuple[str, ...] = ()
+
+    def __init__(
+        self, inner: EstimatorLike, name: str, dt: float, sensors: Mapping[str, SlowSensor]
+    ) -> None:
+        missing = [each for each in ("names", "reset", "step") if not hasattr(inner, each)]
+        if missing:
+            raise TypeError(
+                f"{name} is no estimator: {type(inner).__name__} has no {', '.join(missing)}; "
+                "see sideslip.estimators.EstimatorLike"
+            )
+        self.inner, self.name, self.dt, self.sensors = inner, name, dt, dict(sensors)
+        self.names = () if isinstance(inner.names, str) else tuple(inner.names)
+        words = all(isinstance(each, str) and each for each in self.names)
+        if not (self.names and words and len(set(self.names)) == len(self.names)):
+            raise ValueError(f"{name}: names are distinct words, one a state, got {inner.names!r}")
+        self.units = tuple(UNITS.get(state, "-") for state in self.names)
+
+    def reset(self, sensors: Mapping[str, SlowSensor] | None = None, first: int = 0) -> None:
+        """Forget everything; as `EstimatorLike.reset`, None for the clocks of the last time."""
+        self.sensors = self.sensors if sensors is None else dict(sensors)
+        self.inner.reset(self.sensors, first)
+
+    def step(self, rows: Array, packets: Array) -> None:
+        """Take fast rows (k, FAST_WIDTH) and packets (count, PACKET_WIDTH), which are copied."""
+        self.inner.step(np.array(rows, np.float64), np.array(packets, np.float64))
+
+    @property
+    def x(self) -> Array:
+        """The states now, (n,); ValueError for another shape, TypeError where there are none."""
+        return self._checked("x", (len(self.names),))
+
+    @property
+    def P(self) -> Array:
+        """Their covariance now, (n, n); errors as those of `x`."""
+        return self._checked("P", (len(self.names),) * 2)
+
+    def _checked(self, member: str, shape: tuple[int, ...]) -> Array:
+        try:
+            value = np.array(getattr(self.inner, member), np.float64)
+        except (AttributeError, TypeError, ValueError) as error:
+            raise TypeError(f"{self.name}: {member} is no array of numbers: {error}") from error
+        if value.shape != shape:
+            raise ValueError(
+                f"{self.name}: {member} has shape {shape} for the states "
+                f"{', '.join(self.names)}, got {value.shape}"
+            )
+        return value
+
+    def run(self, source: Log | Record) -> Estimates:
+        """Reset, then filter a whole record tick by tick.
+
+        Raises ValueError if the record is empty or has another tick than `dt`.
+        """
+        record = source.record if isinstance(source, Log) else source
+        if len(record.fast) == 0 or abs(record.dt - self.dt) > 1e-9:
+            raise ValueError(
+                f"{self.name} was built for ticks of {self.dt:g} s, the record has "
+                f"{len(record.fast)} of {record.dt:g} s"
+            )
+        self.reset(source.slow if isinstance(source, Log) else None, record.first)
+        ends = np.searchsorted(record.packets[:, PACKET.arrived], record.ticks, "right").tolist()
+        x, std = np.empty((2, len(record.fast), len(self.names)))
+        for k, (start, end) in enumerate(zip([0, *ends], ends, strict=False)):
+            self.step(record.fast[k : k + 1], record.packets[start:end])
+            x[k], std[k] = self.x, deviations(self.P)
+        nis = np.full(len(record.packets), np.nan)
+        return Estimates(np.asarray(record.ticks * record.dt, np.float64), x, std, self.names, nis)
+
+    def get_state(self) -> Any:
+        """A deep copy of the user's object, from which `set_state` continues."""
+        return copy.deepcopy(self.inner)
+
+    def set_state(self, snapshot: Any) -> None:
+        """Go on with a copy of a snapshot in the place of `inner`."""
+        self.inner = copy.deepcopy(snapshot)
+
+    def __repr__(self) -> str:
+        return f"<{self.name}: {', '.join(self.names)}>"
+
+
+def label_of(source: Any) -> str:
+    """What messages call an estimator or its factory: a name, or that of its class."""
+    if isinstance(source, str):
+        return source
+    ours = getattr(source, "name", None)
+    own = ours if isinstance(ours, str) else getattr(source, "__qualname__", None)
+    return str(own or type(source).__name__)
+
+
+def deviations(P: Array) -> Array:
+    """Standard deviations (n,) of a covariance (n, n); NaN stays."""
+    return np.sqrt(np.maximum(np.diag(P), 0.0))

@@ -1,0 +1,101 @@
+"""Factories by name: those of the package, and those that users register as with Gymnasium."""
+
+import difflib
+import importlib
+import operator
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Any
+
+Factory = Callable[..., Any]
+
+
+class Registry:
+    """Factories of one kind of thing by name.
+
+    kind: what they make, for messages. ours: the package's own. Iterates over all names.
+    """
+
+    def __init__(self, kind: str, ours: Mapping[str, Factory]) -> None:
+        self._kind = kind
+        self._factories: dict[str, Factory | str] = dict(ours)
+
+    def register(self, name: str, factory: Factory | str) -> None:
+        """Make a name known; the same factory once more changes nothing.
+
+        factory: a callable, or "package.module:Name", which is imported when first asked for.
+        Raises TypeError for another kind of name or factory; ValueError for a name that is empty,
+        has a colon or belongs to another factory, and for a string that is no entry point.
+        """
+        if not isinstance(name, str):
+            raise TypeError(f"the name of an {self._kind} is a str, got {name!r}")
+        if not name or ":" in name:
+            raise ValueError(f"the name of an {self._kind} has letters and no colon, got {name!r}")
+        if isinstance(factory, str):
+            _parts(factory)
+        elif not callable(factory):
+            raise TypeError(
+                f"{name!r}: a factory is callable or 'package.module:Name', "
+                f"got {type(factory).__name__}"
+            )
+        known = self._factories.setdefault(name, factory)
+        if known != factory:
+            raise ValueError(f"the {self._kind} {name!r} is registered already, as {known!r}")
+
+    def load(self, name: str, others: Iterable[str] = ()) -> Factory:
+        """The factory of a registered name or of an entry point "package.module:Name".
+
+        others: further names that may have been meant. Raises ValueError for a name that nobody
+        registered or an entry point that leads nowhere, TypeError where no callable is there.
+        """
+        factory = self._factories.get(name, name)
+        if not isinstance(factory, str):
+            return factory
+        if ":" in factory:
+            return imported(factory)
+        names = [*self._factories, *others]
+        close = difflib.get_close_matches(name, names, 1)
+        hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(names)}"
+        raise ValueError(f"unknown {self._kind} {name!r}; {hint}")
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._factories
+
+    def __len__(self) -> int:
+        return len(self._factories)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(tuple(self._factories))
+
+
+def _parts(entry_point: str) -> tuple[str, str]:
+    module, _, name = entry_point.partition(":")
+    if not all(word.isidentifier() for word in (*module.split("."), *name.split("."))):
+        raise ValueError(f"an entry point is 'package.module:Name', got {entry_point!r}")
+    return module, name
+
+
+def imported(entry_point: str) -> Factory:
+    """What stands at "package.module:Name"; errors as `Registry.load`."""
+    module, name = _parts(entry_point)
+    try:
+        found = importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        if error.name is None or not f"{module}.".startswith(f"{error.name}."):
+            raise  # a module that it needs is missing
+        raise ValueError(f"{entry_point!r}: there is no module {error.name!r}") from None
+    try:
+        factory = operator.attrgetter(name)(found)
+    except AttributeError:
+        raise ValueError(f"{entry_point!r}: the module {module!r} has no {name!r}") from None
+    if not callable(factory):
+        raise TypeError(f"{entry_point!r} is no factory but of type {type(factory).__name__}")
+    return factory  # type: ignore[no-any-return]
+
+
+def entry_point_of(factory: Factory) -> str | None:
+    """ "package.module:Name" of a factory that `imported` finds there, else None."""
+    text = f"{getattr(factory, '__module__', '')}:{getattr(factory, '__qualname__', '')}"
+    try:
+        return text if not text.startswith("__main__:") and imported(text) is factory else None
+    except (TypeError, ValueError):
+        return None

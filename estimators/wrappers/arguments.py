@@ -1,0 +1,130 @@
+"""The arguments of `EstimateObservation`, single and vector: an estimator, and its car."""
+
+import dataclasses
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple, NoReturn
+
+from ...envs.sensors.link import SlowSensor
+from ...envs.vehicle.vehicle import Vehicle, vehicle_from
+from ..estimator import Estimator
+from ..make import make_estimator
+from ..protocol import EstimatorFactory, EstimatorLike, ForeignEstimator, label_of
+from ..registry import entry_point_of
+from .truth import TRUTH
+
+Source = str | EstimatorFactory | EstimatorLike
+"""What `EstimateObservation` takes for its estimator: a name, a factory or an object."""
+AnyEstimator = Estimator | ForeignEstimator
+
+
+class Setup(NamedTuple):
+    """What an estimator is built for: the vehicle as it believes it to be, the slow sensors, and
+    the speed in m/s where it is held."""
+
+    vehicle: Vehicle
+    sensors: Mapping[str, SlowSensor]
+    speed: float | None = None
+
+    @property
+    def design(self) -> Any:
+        """A key that is equal for setups that differ in the phases of their clocks alone."""
+        clocks = [(name, dataclasses.replace(s, phase=0.0)) for name, s in self.sensors.items()]
+        return self.vehicle, tuple(sorted(clocks)), self.speed
+
+
+def setup_of(base: Any) -> Setup:
+    """What a bare single env offers to estimators in its present episode."""
+    return Setup(base.nominal, base.slow_sensors, getattr(base, "held_speed", None))
+
+
+def build(
+    source: str | EstimatorFactory, options: Mapping[str, Any], dt: float, setup: Setup
+) -> AnyEstimator:
+    """`make_estimator` of a name or a factory for a setup."""
+    vehicle, sensors, speed = setup
+    return make_estimator(source, vehicle=vehicle, sensors=sensors, dt=dt, speed=speed, **options)
+
+
+class Arguments:
+    """The checked arguments of a wrapper, and the estimators they stand for.
+
+    source: a name or a factory; None where `object` is the one estimator to use. vehicle: None for
+    the env's nominal one, or, if `truth`, the true one. recorded: what stands in the env's spec.
+    Raises ValueError for an object with a vehicle or options, which would not reach it.
+    """
+
+    def __init__(
+        self,
+        estimator: Source | None,
+        outputs: Sequence[str],
+        std: bool,
+        replace: bool,
+        vehicle: str | Mapping[str, Any] | Vehicle | None,
+        options: Mapping[str, Any] | None,
+        name: str | None,
+        slow_sensors: Iterable[str],
+    ) -> None:
+        source: Any = usual_estimator(slow_sensors) if estimator is None else estimator
+        recorded = source
+        self.options = dict(options or {})
+        self.truth = isinstance(vehicle, str) and vehicle == TRUTH
+        self.vehicle = None if vehicle is None or self.truth else vehicle_from(vehicle)
+        self.source, self.object, self.label = source, None, label_of(source)
+        if not _is_object(source):
+            recorded = source if isinstance(source, str) else entry_point_of(source) or source
+        else:
+            if vehicle is not None or self.options:
+                raise ValueError(
+                    f"{self.label} is built already: a vehicle and options go to a name or a "
+                    "factory"
+                )
+            self.source, self.object, recorded = None, source, Unrecorded(self.label)
+        car = vehicle.to_dict() if isinstance(vehicle, Vehicle) else vehicle
+        self.recorded = {
+            "estimator": recorded,
+            "outputs": list(outputs),
+            "std": bool(std),
+            "replace": bool(replace),
+            "vehicle": dict(car) if isinstance(car, Mapping) else car,
+            "options": self.options,
+            "name": name,
+        }
+
+    def build(self, setup: Setup, dt: float) -> AnyEstimator:
+        """An estimator for a setup and ticks of dt seconds; where one object is used, that one."""
+        if self.object is None:
+            return build(self.source, self.options, dt, setup)
+        if not isinstance(self.object, AnyEstimator):
+            self.object = ForeignEstimator(self.object, self.label, dt, setup.sensors)
+        elif abs(self.object.dt - dt) > 1e-9:
+            raise ValueError(
+                f"{self.label} was built for ticks of {self.object.dt:g} s, the env has {dt:g} s"
+            )
+        fixed: AnyEstimator = self.object
+        return fixed
+
+
+class Unrecorded:
+    """In a spec in the place of an object: whoever builds from that spec gets the reason."""
+
+    def __init__(self, label: str) -> None:
+        self._label = label
+
+    def __call__(self, **_: Any) -> NoReturn:
+        """Refuse to be the factory that the spec would need."""
+        raise TypeError(
+            f"a spec cannot build {self._label} once more: it was passed as an object; pass its "
+            "class, a factory or a name"
+        )
+
+
+def usual_estimator(slow_sensors: Iterable[str]) -> str:
+    """The estimator where none is named: `dakf` where there is a GPS, else `exact-kf`."""
+    return "dakf" if "gps" in slow_sensors else "exact-kf"
+
+
+def _is_object(source: Any) -> bool:
+    """Whether this is an estimator, well made or not, rather than what builds one."""
+    if isinstance(source, str | type):
+        return False
+    return not callable(source) or hasattr(source, "step") or hasattr(source, "reset")
