@@ -13,7 +13,8 @@ sideslip/YawGps-v0
 sideslip/YawVision-v0
 sideslip/YawVisionUneven-v0
 
-`rollout`, `make_agent`, `make_estimator` and the subpackages are loaded when first asked for.
+`rollout`, `make_agent`, `make_estimator`, `register_agent`, `register_estimator` and the
+subpackages are loaded when first asked for.
 """
 
 from importlib import import_module
@@ -22,16 +23,25 @@ from typing import TYPE_CHECKING, Any
 from gymnasium import register, registry
 
 if TYPE_CHECKING:
-    from .agents import make_agent
+    from .agents import make_agent, register_agent
     from .agents.rollout import rollout
-    from .estimators import make_estimator
+    from .estimators import make_estimator, register_estimator
 
 __version__ = "0.1.0"
-__all__ = ["__version__", "make_agent", "make_estimator", "rollout"]
+__all__ = [
+    "__version__",
+    "make_agent",
+    "make_estimator",
+    "register_agent",
+    "register_estimator",
+    "rollout",
+]
 
 _HOMES = {
     "make_agent": ".agents",
     "make_estimator": ".estimators",
+    "register_agent": ".agents",
+    "register_estimator": ".estimators",
     "rollout": ".agents.rollout",
 }
 _ROOMS = ("envs", "estimators", "agents", "benchmarks")

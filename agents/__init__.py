@@ -1,8 +1,9 @@
 """Everything that acts, with stable-baselines3's `predict`: controllers and learned policies."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Protocol, overload
 
+from ..estimators.registry import Registry
 from .controllers.base import Controller, NoControl
 from .controllers.esc import Esc
 from .controllers.informed import Informed
@@ -13,25 +14,30 @@ from .controllers.mpc import Mpc
 from .controllers.sliding_mode import SlidingMode
 from .controllers.two_dof import Feedforward, TwoDof
 from .env_facts import AnyEnv
-from .learned.files import is_policy
+from .learned.files import is_policy, shipped
 from .learned.policy import Learned
 
-AGENTS: dict[str, Callable[..., Controller]] = {
-    "none": NoControl,
-    "feedforward": Feedforward,
-    "two-dof": TwoDof,
-    "model-following": ModelFollowing,
-    "esc": Esc,
-    "sliding-mode": SlidingMode,
-    "lqr": Lqr,
-    "mpc": Mpc,
-    "lane-keeping": LaneKeeping,
-    "informed": Informed,
-    "learned": Learned,
-}
+AGENTS = Registry(
+    "agent",
+    {
+        "none": NoControl,
+        "feedforward": Feedforward,
+        "two-dof": TwoDof,
+        "model-following": ModelFollowing,
+        "esc": Esc,
+        "sliding-mode": SlidingMode,
+        "lqr": Lqr,
+        "mpc": Mpc,
+        "lane-keeping": LaneKeeping,
+        "informed": Informed,
+        "learned": Learned,
+    },
+)
+"""Every agent that has a name, but for policies: the package's own and those registered."""
 
 __all__ = [
     "AGENTS",
+    "Agent",
     "Controller",
     "Esc",
     "Feedforward",
@@ -45,19 +51,70 @@ __all__ = [
     "SlidingMode",
     "TwoDof",
     "make_agent",
+    "register_agent",
 ]
 
 
-def make_agent(name: str, env: AnyEnv, **options: Any) -> Controller:
-    """A controller designed for an env, single or vector, from the env's nominal vehicle.
+class Agent(Protocol):
+    """What acts in an env: stable-baselines3's models, our controllers, or a user's own object."""
 
-    name: a key of `AGENTS`, a shipped policy, or the path of one (`.../NAME.safetensors`).
-    options: arguments of that controller.
+    def predict(
+        self,
+        observation: Any,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = True,
+    ) -> tuple[Any, Any]:
+        """The action (width,) for an observation (k,), or (N, width) for (N, k); the next state.
+
+        state: as returned by the last call, None at first; the agent's memory, if it has one.
+        episode_start: (N,) of bool, the rows whose episode has just begun.
+        """
+
+
+@overload
+def make_agent(name: str, env: AnyEnv, **options: Any) -> Controller: ...
+
+
+@overload
+def make_agent(name: Agent | Callable[..., Agent], env: AnyEnv, **options: Any) -> Agent: ...
+
+
+def make_agent(
+    name: str | Agent | Callable[..., Agent], env: AnyEnv, **options: Any
+) -> Controller | Agent:
+    """An agent for an env, single or vector; ours are designed from the env's nominal vehicle.
+
+    name: of `AGENTS`, a shipped policy, the path of one (`.../NAME.safetensors`), or an entry point
+    "package.module:Name"; or a factory, called with the env and the options; or an `Agent`, which
+    is returned. options: arguments of that controller.
     Raises ValueError for an unknown name or an observation without what the controller needs,
-    TypeError for an unknown option.
+    TypeError for an unknown option, options beside an `Agent`, or what has no `predict`.
     """
-    if name not in AGENTS and is_policy(name):
-        return Learned(env, policy=name, **options)
-    if name not in AGENTS:
-        raise ValueError(f"unknown agent {name!r}; known: {', '.join(AGENTS)}")
-    return AGENTS[name](env, **options)
+    agent: Any = name
+    if isinstance(name, str):
+        if name not in AGENTS and is_policy(name):
+            return Learned(env, policy=name, **options)
+        agent = AGENTS.load(name, shipped())(env, **options)
+    elif isinstance(name, type) or not hasattr(name, "predict"):
+        agent = name(env, **options) if callable(name) else name
+    elif options:
+        raise TypeError(f"{type(name).__name__} is built already, got {', '.join(options)}")
+    if not hasattr(agent, "predict"):
+        raise TypeError(f"{name!r} is no agent: {type(agent).__name__} has no predict")
+    made: Controller | Agent = agent
+    return made
+
+
+def register_agent(name: str, factory: Callable[..., Agent] | str) -> None:
+    """Give an agent of your own a name that works wherever an agent's name does.
+
+    factory: called with the env and options, as the classes of `AGENTS` are; or
+    "package.module:Name", which is imported when first asked for. A name is known in this process
+    alone; worker processes and `sideslip`'s command line take the entry point itself for a name.
+    Raises TypeError or ValueError for a name or factory that is none, ValueError for a name that is
+    taken.
+    """
+    if isinstance(name, str) and is_policy(name):
+        raise ValueError(f"{name!r} is the name of a policy")
+    AGENTS.register(name, factory)

@@ -1,4 +1,4 @@
-"""What an environment, single or vector, tells those who act in it."""
+"""Facts of an environment, single or vector, that controllers are designed from."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,10 +19,10 @@ else:
 
 
 @dataclass(frozen=True)
-class Given:
+class EnvFacts:
     """What controllers are designed from, the same for all rows of a vector env.
 
-    layout: of an observation. nominal: the vehicle that controllers are told. full_scale: N m of
+    layout: of an observation. nominal: the vehicle as controllers know it. full_scale: N m of
     the action 1. authority: rad of added steering of the action 1. control_period: ticks.
     reference: of `envs.reference.REFERENCES`. width: of an action.
     """
@@ -36,11 +36,11 @@ class Given:
     width: int
 
 
-def given(env: AnyEnv) -> Given:
-    """Read it, from a stable-baselines3 `VecEnv` too.
+def facts_of(env: AnyEnv) -> EnvFacts:
+    """The facts of an env, a vector env or a stable-baselines3 `VecEnv`.
 
-    Raises ValueError where the rows of a vector env were told different cars, or where a wrapper of
-    stable-baselines3 changes the observations.
+    Raises ValueError where the rows of a vector env have different nominal cars or limits, or where
+    a wrapper of stable-baselines3 changes the observations.
     """
     nominals: Sequence[Any]
     vehicles: Sequence[Any]
@@ -60,17 +60,17 @@ def given(env: AnyEnv) -> Given:
         nominals, vehicles = base.get_attr("nominal"), base.get_attr("vehicle")
         period, kind = _common(base, "control_period"), _common(base, "reference")
     limits = [(car.yaw_moment_limit, car.steering_authority) for car in vehicles]
-    for i, told in enumerate(zip(nominals, limits, strict=True)):
-        if told != (nominals[0], limits[0]):
+    for i, car in enumerate(zip(nominals, limits, strict=True)):
+        if car != (nominals[0], limits[0]):
             raise ValueError(
-                f"the rows of a vector env share one design, but row {i} was told another nominal "
-                "vehicle or has other limits than row 0: make an agent for each kind of car"
+                f"the rows of a vector env share one design, but row {i} has another nominal "
+                "vehicle or other limits than row 0: make an agent for each kind of car"
             )
-    return Given(layout, nominals[0], *limits[0], period, kind, width)
+    return EnvFacts(layout, nominals[0], *limits[0], period, kind, width)
 
 
 def _plain(env: Any, layout: tuple[Entry, ...]) -> tuple[Entry, ...]:
-    """The layout, if the outermost observations of a stable-baselines3 env are what it says."""
+    """The layout, if the outermost observations of a stable-baselines3 env have it."""
     layer = env
     while layer is not None:
         if vars(layer).get("norm_obs") or layer.observation_space.shape != (len(layout),):

@@ -41,8 +41,13 @@ def steps_of(
     """The steps of an episode, or of each row's first one, until the last row's is over.
 
     agent: anything with stable-baselines3's `predict`; None leaves the cars alone. seeds, options:
-    of the env's reset.
+    of the env's reset. Raises TypeError for an agent without `predict`.
     """
+    if not (agent is None or hasattr(agent, "predict")):
+        raise TypeError(
+            f"an agent has stable-baselines3's predict, got {type(agent).__name__}; make_agent "
+            "builds one from a name"
+        )
     obs, info = env.reset(seed=seeds, options=options)
     running = np.ones(getattr(env, "num_envs", 1), np.bool_)
     action, state, start = np.zeros(env.action_space.shape or (1,), np.float32), None, running

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...envs.backend.decorators import jit
-from ..env_facts import AnyEnv, given
+from ..env_facts import AnyEnv, facts_of
 
 Array = npt.NDArray[np.float64]
 
@@ -33,7 +33,7 @@ class Controller(ABC):
     _design: tuple[Any, ...] = ()  # the arguments of a compiled law behind inputs, state, action
 
     def __init__(self, env: AnyEnv) -> None:
-        facts = given(env)
+        facts = facts_of(env)
         names = [entry.name for entry in facts.layout]
         missing = [name for name in self.needs if name not in names]
         if missing:
@@ -101,7 +101,7 @@ def _hint(missing: list[str]) -> str:
 
 def entries_of(env: AnyEnv) -> set[str]:
     """The names in the env's observation."""
-    return {entry.name for entry in given(env).layout}
+    return {entry.name for entry in facts_of(env).layout}
 
 
 def positive(name: str, value: float) -> float:

@@ -9,7 +9,7 @@ import gymnasium as gym
 
 from ... import __version__
 from ...estimators.wrappers.estimate import EstimateObservation
-from ..env_facts import given
+from ..env_facts import facts_of
 
 JsonMap = dict[str, Any]
 
@@ -52,6 +52,11 @@ class Card:
         object.__setattr__(self, "observation", tuple((name, unit) for name, unit in pairs))
         if len({name for name, _ in pairs}) != len(pairs):
             raise ValueError("the card's observation names an entry twice")
+        if ":" in str(self.estimator):  # a file from elsewhere would name code to be imported
+            raise ValueError(
+                f"the card's estimator is a name, got the entry point {self.estimator!r}: "
+                "sideslip.register_estimator gives it one"
+            )
         for each in fields(self):
             value = getattr(self, each.name)
             kinds = _KINDS.get(each.type, ())
@@ -79,7 +84,7 @@ class Card:
         env: gym.Env[Any, Any] = gym.make(env_id, **options["env_options"])
         if estimator:
             env = EstimateObservation(env, estimator, **options["estimator_options"])
-        seen = given(env)
+        seen = facts_of(env)
         env.close()
         entries = tuple((entry.name, entry.unit) for entry in seen.layout)
         options |= {"control_period": int(seen.control_period), "reference": seen.reference}

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from ..controllers.base import Array, Controller
-from ..env_facts import AnyEnv, given
+from ..env_facts import AnyEnv, facts_of
 from .files import Policy, load_policy
 
 DEFAULT = "ppo-yaw-vision"
@@ -25,7 +25,7 @@ class Learned(Controller):
 
     def __init__(self, env: AnyEnv, policy: str | Path | Policy = DEFAULT) -> None:
         self.policy = policy if isinstance(policy, Policy) else load_policy(policy)
-        name, card, told = self.policy.name, self.policy.card, given(env)
+        name, card, told = self.policy.name, self.policy.card, facts_of(env)
         reads = self.policy.reads
         entries = [entry for entry, read in zip(card.observation, reads, strict=True) if read]
         units = {entry.name: entry.unit for entry in told.layout}

@@ -199,7 +199,7 @@ def make_native_env(
     env: VectorEnv[Any, Any, Any] = gym.make_vec(env_id, num_envs=num_envs, **arguments)
     if estimator is None:
         return env
-    how = {"estimator": estimator} if isinstance(estimator, str) else dict(estimator)
+    how = dict(estimator) if isinstance(estimator, Mapping) else {"estimator": estimator}
     return EstimateObservation(env, **how)
 
 
