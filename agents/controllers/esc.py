@@ -1,11 +1,11 @@
 """ESC as cars have it: the yaw rate is held near what driver and friction ask for, slip bounded."""
 
 import math
-from typing import Any, NamedTuple
+from collections import namedtuple
+from typing import Any
 
 import numpy as np
 
-from ...envs.backend.arrays import offsets
 from ...envs.backend.decorators import jit
 from ...envs.backend.primitives import absolute, maximum
 from ...envs.task.reference import LIMITED, reference, target_of
@@ -20,17 +20,11 @@ BANDWIDTH = 16.0  # rad/s
 RELEASE = 0.5  # s, in which the integral is let go within the dead band
 
 
-class Inputs(NamedTuple):
-    """Columns of the law's inputs; the last one only where the slip is bounded."""
-
-    wheel_left: Any
-    wheel_right: Any
-    steer_command: Any
-    gyro: Any
-    beta_hat: Any
+Inputs = namedtuple("Inputs", "wheel_left wheel_right steer_command gyro beta_hat")
+"""Columns of the law's inputs; the last one only where the slip is bounded."""
 
 
-IN, _ = offsets(Inputs)
+IN = Inputs(*range(5))
 
 
 def yaw_gains(vehicle: Vehicle, speed: float, bandwidth: float = BANDWIDTH) -> tuple[float, float]:

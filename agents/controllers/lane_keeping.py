@@ -5,11 +5,11 @@ serve one controller of all four.
 """
 
 import math
-from typing import Any, NamedTuple
+from collections import namedtuple
+from typing import Any
 
 import numpy as np
 
-from ...envs.backend.arrays import offsets
 from ...envs.backend.decorators import jit
 from ...envs.backend.primitives import maximum
 from ...envs.task.cost import BETA_SCALE, EFFORT_WEIGHT, GAMMA_SCALE, STEER_SCALE
@@ -21,48 +21,27 @@ from ..design.sampled_model import optimal
 from ..env_facts import AnyEnv
 from .base import Array, Controller, positive
 
-
-class Inputs(NamedTuple):
-    """Columns of the law's inputs."""
-
-    wheel_left: Any
-    wheel_right: Any
-    torque_left: Any
-    torque_right: Any
-    steer: Any
-    steer_command: Any
-    beta_hat: Any
-    gamma_hat: Any
-    psi_hat: Any
-    y_l_hat: Any
+Inputs = namedtuple(
+    "Inputs",
+    "wheel_left wheel_right torque_left torque_right steer steer_command beta_hat gamma_hat "
+    "psi_hat y_l_hat",
+)
+"""Columns of the law's inputs."""
 
 
-class Lane(NamedTuple):
-    """States of the lane model: the inputs move the first seven, the others move by themselves."""
+Lane = namedtuple("Lane", "beta gamma psi y N_z delta_f integral driver kappa")
+"""States of the lane model: the inputs move the first seven, the others move by themselves.
 
-    beta: Any
-    gamma: Any
-    psi: Any  # relative to the road
-    y: Any  # m, of the centre of gravity from the road's centre line
-    N_z: Any  # share of full scale
-    delta_f: Any
-    integral: Any  # m s, of y
-    driver: Any
-    kappa: Any
+psi: relative to the road. y: m, of the centre of gravity from the road's centre line, and its
+integral in m s. N_z: share of full scale.
+"""
+Memory = namedtuple("Memory", "integral rate heading started")
+"""The integral, the filtered gamma / V and psi that the curvature is from, whether it began."""
 
 
-class Memory(NamedTuple):
-    """The integral, the filtered gamma / V and psi that the curvature is from, whether it began."""
-
-    integral: Any
-    rate: Any
-    heading: Any
-    started: Any
-
-
-IN, _ = offsets(Inputs)
-AT, WIDTH = offsets(Lane)
-LAST, _ = offsets(Memory)
+IN = Inputs(*range(10))
+AT = Lane(*range(9))
+LAST = Memory(*range(4))
 MOVED = Lane._fields[: AT.driver]
 HASTE = 3.0
 OFFSET_SCALE, INTEGRAL_SCALE = 0.1, 0.2  # m, m s
@@ -79,7 +58,7 @@ def lane_model(
     asked for is ahead of the applied, in what its rate covers in a period and a lag: without it a
     linear law asks for what the rate cannot give. It is taken at the end of each period.
     """
-    n, T = WIDTH, period * TICK
+    n, T = len(AT), period * TICK
     plane = vision(vehicle, speed)
     lags = [max(tau, TICK) for tau in (vehicle.motor_lag, vehicle.steering_lag)]
     A, B = np.zeros((n, n)), np.zeros((n, 2))

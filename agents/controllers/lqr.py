@@ -1,12 +1,12 @@
 """LQR: the yaw moment, and steering where there is some, that minimise the env's own cost."""
 
 import math
+from collections import namedtuple
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from ...envs.backend.arrays import offsets
 from ...envs.backend.decorators import jit
 from ...envs.backend.primitives import absolute
 from ...envs.task.reference import REFERENCES
@@ -17,27 +17,15 @@ from ..design.sampled_model import Purpose
 from ..env_facts import AnyEnv
 from .base import Array, Controller, entries_of, positive
 
-
-class Inputs(NamedTuple):
-    """Columns of the law's inputs; `Lqr` puts in beta_ref for those that it does without."""
-
-    wheel_left: Any
-    wheel_right: Any
-    torque_left: Any
-    torque_right: Any
-    steer: Any
-    steer_command: Any
-    beta_ref: Any
-    gamma_ref: Any
-    beta_hat: Any
-    gamma_hat: Any
-    disturbance_1: Any
-    disturbance_2: Any
-    front_stiffness: Any
-    rear_stiffness: Any
+Inputs = namedtuple(
+    "Inputs",
+    "wheel_left wheel_right torque_left torque_right steer steer_command beta_ref gamma_ref "
+    "beta_hat gamma_hat disturbance_1 disturbance_2 front_stiffness rear_stiffness",
+)
+"""Columns of the law's inputs; `Lqr` puts in beta_ref for those that it does without."""
 
 
-IN, _ = offsets(Inputs)
+IN = Inputs(*range(14))
 
 
 @jit

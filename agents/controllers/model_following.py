@@ -6,12 +6,12 @@ that nothing is tabulated and no design tool is needed.
 """
 
 import math
+from collections import namedtuple
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from ...envs.backend.arrays import offsets
 from ...envs.backend.decorators import jit
 from ...envs.backend.primitives import maximum
 from ...envs.backend.rebuild import plain
@@ -26,31 +26,17 @@ SLOWEST = 2.0  # m/s: below it the vehicle is taken as at this speed
 BANDWIDTH = (5.0, 5.0)  # rad/s, K_beta and K_gamma of dakf-stability V.D
 
 
-class Inputs(NamedTuple):
-    """Columns of the law's inputs; what the observation lacks is put in by `ModelFollowing`."""
-
-    wheel_left: Any
-    wheel_right: Any
-    steer_command: Any
-    beta_ref: Any
-    gamma_ref: Any
-    beta_hat: Any
-    gamma_hat: Any
-    d1_hat: Any
-    d2_hat: Any
+Inputs = namedtuple(
+    "Inputs",
+    "wheel_left wheel_right steer_command beta_ref gamma_ref beta_hat gamma_hat d1_hat d2_hat",
+)
+"""Columns of the law's inputs; what the observation lacks is put in by `ModelFollowing`."""
+Memory = namedtuple("Memory", "delta_f N_z driver known")
+"""The integrals in rad and N m, the last steering command, and whether there was one."""
 
 
-class Memory(NamedTuple):
-    """The integrals in rad and N m, the last steering command, and whether there was one."""
-
-    delta_f: Any
-    N_z: Any
-    driver: Any
-    known: Any
-
-
-IN, _ = offsets(Inputs)
-LAST, _ = offsets(Memory)
+IN = Inputs(*range(9))
+LAST = Memory(*range(4))
 
 
 def feedback_gains(

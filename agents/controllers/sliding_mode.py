@@ -1,8 +1,8 @@
 """Sliding mode: the yaw moment keeps errors of yaw rate and sideslip angle on one line."""
 
-from typing import Any, NamedTuple
+from collections import namedtuple
+from typing import Any
 
-from ...envs.backend.arrays import offsets
 from ...envs.backend.decorators import jit
 from ...envs.backend.primitives import maximum
 from ...envs.task.reference import REFERENCES, ZERO_SLIP, reference, target_of
@@ -12,28 +12,14 @@ from ..env_facts import AnyEnv
 from .base import Array, Controller, entries_of, positive
 from .model_following import SLOWEST
 
-
-class Inputs(NamedTuple):
-    """Columns of the law's inputs; gamma_hat is the gyro where the observation has no estimate."""
-
-    wheel_left: Any
-    wheel_right: Any
-    steer_command: Any
-    steer: Any
-    beta_hat: Any
-    gamma_hat: Any
+Inputs = namedtuple("Inputs", "wheel_left wheel_right steer_command steer beta_hat gamma_hat")
+"""Columns of the law's inputs; gamma_hat is the gyro where the observation has no estimate."""
+Memory = namedtuple("Memory", "beta_ref gamma_ref known")
+"""The references of the last decision, for their derivatives, and whether there was one."""
 
 
-class Memory(NamedTuple):
-    """The references of the last decision, for their derivatives, and whether there was one."""
-
-    beta_ref: Any
-    gamma_ref: Any
-    known: Any
-
-
-IN, _ = offsets(Inputs)
-LAST, _ = offsets(Memory)
+IN = Inputs(*range(6))
+LAST = Memory(*range(3))
 
 
 @jit

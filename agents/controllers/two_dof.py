@@ -5,11 +5,11 @@ front wheel speeds: the feedforward by its formula, the PI on a grid of speeds.
 """
 
 import math
-from typing import Any, NamedTuple
+from collections import namedtuple
+from typing import Any
 
 import numpy as np
 
-from ...envs.backend.arrays import offsets
 from ...envs.backend.decorators import jit
 from ...envs.backend.primitives import absolute, maximum, select
 from ...envs.ticks import TICK
@@ -24,26 +24,14 @@ SPEEDS = np.arange(SLOWEST, 61.0, 0.5)  # m/s
 CAMERA_PERIOD = 0.033  # s
 
 
-class Inputs(NamedTuple):
-    """Columns of the laws' inputs; the feedforward reads the first three alone."""
-
-    wheel_left: Any
-    wheel_right: Any
-    steer_command: Any
-    beta_hat: Any
-    beta_ref: Any
+Inputs = namedtuple("Inputs", "wheel_left wheel_right steer_command beta_hat beta_ref")
+"""Columns of the laws' inputs; the feedforward reads the first three alone."""
+Memory = namedtuple("Memory", "integral wait share")
+"""The integral in N m, the decisions until the next update, the share held until then."""
 
 
-class Memory(NamedTuple):
-    """The integral in N m, the decisions until the next update, the share held until then."""
-
-    integral: Any
-    wait: Any
-    share: Any
-
-
-IN, _ = offsets(Inputs)
-LAST, _ = offsets(Memory)
+IN = Inputs(*range(5))
+LAST = Memory(*range(3))
 
 
 @jit
