@@ -8,9 +8,10 @@ import numpy as np
 import numpy.typing as npt
 from rich.console import Console
 
+from ..harness.stats import Estimate
 from .cells import INFORMED, YAW, Cell
 from .run import Results, measure
-from .scores import Ceiling, Estimate, Resampled
+from .scores import Ceiling, Resampled
 
 Array = npt.NDArray[np.float64]
 
@@ -83,6 +84,6 @@ def lines(prices: Sequence[Price], what: str) -> dict[str, tuple[Array, Array, A
     for price in prices:
         each: list[Estimate] = getattr(price, what)
         if each:
-            value, low, high = np.array([(e.value, e.low, e.high) for e in each]).T
+            value, low, high = np.array(each).T
             found[price.cell.label] = value, low, high
     return found

@@ -13,6 +13,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.stats import trim_mean
 
+from ..harness.stats import Estimate
+
 Array = npt.NDArray[np.float64]
 
 RESAMPLES = 400
@@ -26,20 +28,6 @@ class Ceiling:
 
     mean: float
     error: float
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """A number with its 95 % interval."""
-
-    value: float
-    low: float
-    high: float
-
-    @property
-    def half_width(self) -> float:
-        """Half the interval."""
-        return 0.5 * (self.high - self.low)
 
 
 class Resampled:

@@ -94,15 +94,13 @@ def _refusals(all_results: list[Results]) -> list[Table]:
 def _price_rows(prices: list[Price], n: int, salt: str) -> list[Row]:
     """Rows of the price of delay; the scenario names the delay."""
     return [
-        Row(
-            "control",
-            f"{SCENARIO}, sensors {1e3 * delay:.0f} ms late",
+        Row.of(
             metric,
-            each.value,
+            each,
+            suite="control",
+            scenario=f"{SCENARIO}, sensors {1e3 * delay:.0f} ms late",
             estimator=price.cell.estimator,
             controller=price.cell.controller,
-            low=each.low,
-            high=each.high,
             n=n,
             salt=salt,
             env_version=f"{YAW} {__version__}",

@@ -9,11 +9,12 @@ import numpy as np
 from ... import __version__
 from ..harness.metrics import EPISODE
 from ..harness.results import Row, Table
+from ..harness.stats import Estimate
 from .ceiling import judged
 from .cells import INFORMED, REFERENCE_CONTROLLER, REFERENCE_FILTER, Cell
 from .episodes import NUMBERS, Driven, control_period
 from .run import Results
-from .scores import Ceiling, Estimate, Resampled, improvement
+from .scores import Ceiling, Resampled, improvement
 
 RATES = {"spin": "spin_rate", "off-road": "departure_rate"}
 _FAILED = {"not-finite": "not_finite_rate", "bad-action": "bad_action_rate"}
@@ -69,10 +70,11 @@ def standings(results: Results, env_id: str, tops: dict[str, Ceiling]) -> list[S
             s: _metrics(draw, i, mine[s], yard[s], informed[s], tops[s] if s in scored else None)
             for i, s in enumerate(scenarios)
         }
-        overall = _overall(draw, [mine[s].costs for s in scored], [yard[s] for s in scored],
-                           [tops[s] for s in scored])  # fmt: skip
-        ratios = [by[s]["cost_over_informed"] for s in scenarios]
-        overall["cost_over_informed"] = _geometric(ratios)
+        overall = {}
+        if scored:
+            none, costs = [yard[s] for s in scored], [mine[s].costs for s in scored]
+            overall = draw.aggregate(np.array(none), np.array(costs), [tops[s] for s in scored])
+        overall["cost_over_informed"] = _geometric([by[s]["cost_over_informed"] for s in scenarios])
         overall["probability_of_improvement"] = _improvement(results, env_id, mine)
         found.append(Standing(first, mine, by, overall))
     return sorted(found, key=lambda each: -_rank(each))
@@ -101,10 +103,6 @@ def _metrics(
     return found
 
 
-def _overall(draw: Resampled, costs: Any, none: Any, tops: list[Ceiling]) -> dict[str, Estimate]:
-    return draw.aggregate(np.array(none), np.array(costs), tops) if tops else {}
-
-
 def _improvement(results: Results, env_id: str, mine: dict[str, Driven]) -> Estimate:
     """Over the reference pair, on every manoeuvre alike."""
     pairs = [
@@ -112,7 +110,7 @@ def _improvement(results: Results, env_id: str, mine: dict[str, Driven]) -> Esti
         for s, r in mine.items()
     ]
     value = float(np.mean([improvement(ours, theirs) for ours, theirs in pairs]))
-    return Estimate(value, np.nan, np.nan)
+    return Estimate(value)
 
 
 def _geometric(ratios: list[Estimate]) -> Estimate:
@@ -138,18 +136,12 @@ def rows_of(standing: Standing, salt: str) -> list[Row]:
     for scenario, metrics in standing.by_scenario.items():
         n, spec = len(standing.results[scenario].costs), spec_of(replace(cell, scenario=scenario))
         rest = common | {"n": n, "spec": spec}
-        rows += [_row(scenario, name, each, rest) for name, each in metrics.items()]
-    total = common | {"n": sum(len(r.costs) for r in standing.results.values())}
-    rows += [_row("all", name, each, total) for name, each in standing.overall.items()]
+        rows += [Row.of(name, each, scenario=scenario, **rest) for name, each in metrics.items()]
+    common |= {"scenario": "all", "n": sum(len(r.costs) for r in standing.results.values())}
+    rows += [Row.of(name, each, **common) for name, each in standing.overall.items()]
     if np.isfinite(standing.us):
-        rows.append(Row(scenario="all", metric="us_per_decision", value=standing.us, **total))
+        rows.append(Row(metric="us_per_decision", value=standing.us, **common))
     return rows
-
-
-def _row(scenario: str, metric: str, each: Estimate, common: dict[str, Any]) -> Row:
-    return Row(
-        scenario=scenario, metric=metric, value=each.value, low=each.low, high=each.high, **common
-    )
 
 
 def spec_of(cell: Cell) -> str:
@@ -162,27 +154,19 @@ def spec_of(cell: Cell) -> str:
 def main_table(title: str, found: list[Standing], note: str) -> Table:
     """The contestants' scores, the best first."""
     header = (
-        "controller and estimator",
-        "score",
-        "95 % interval",
-        "IQM",
-        "cost / informed",
-        "better / %",
-        "spin / %",
-        "left road / %",
-        "us a decision",
+        *("controller and estimator", "score", "95 % interval", "IQM", "cost / informed"),
+        *("better / %", "spin / %", "left road / %", "us a decision"),
     )
     cells = []
     for each in found:
-        score, iqm = each.overall.get("score"), each.overall.get("iqm")
+        score, overall = each.overall.get("score"), each.overall
         cells.append(
             [
                 each.label,
-                f"{score.value:.3f}" if score else "",
-                f"{score.low:.3f} .. {score.high:.3f}" if score else "",
-                f"{iqm.value:.3f}" if iqm else "",
-                f"{each.overall['cost_over_informed'].value:.2f}",
-                f"{100 * each.overall['probability_of_improvement'].value:.0f}",
+                *(score.text() if score else ("", "")),
+                f"{overall['iqm'].value:.3f}" if score else "",
+                f"{overall['cost_over_informed'].value:.2f}",
+                f"{100 * overall['probability_of_improvement'].value:.0f}",
                 f"{100 * each.rate('spin'):.1f}",
                 f"{100 * each.rate('off-road'):.1f}",
                 f"{each.us:.0f}" if np.isfinite(each.us) else "",

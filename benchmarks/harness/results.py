@@ -11,6 +11,7 @@ from typing import Any
 from ...envs.backend.files import write_whole
 from .explorer import Explorer
 from .metrics import METRICS
+from .stats import Estimate
 
 VERDICTS = ("", "reproduced", "partly", "not reproduced", "report only")
 
@@ -47,6 +48,11 @@ class Row:
             raise ValueError(f"unknown metric {self.metric!r}; known: {', '.join(METRICS)}")
         if self.verdict not in VERDICTS:
             raise ValueError(f"unknown verdict {self.verdict!r}")
+
+    @classmethod
+    def of(cls, metric: str, number: Estimate, **columns: Any) -> "Row":
+        """A row of a number with its interval; columns: the others."""
+        return cls(metric=metric, value=number.value, low=number.low, high=number.high, **columns)
 
 
 @dataclass

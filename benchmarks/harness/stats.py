@@ -1,6 +1,8 @@
 """Intervals over seeds: the bootstrap, paired where two columns share their seeds."""
 
+import math
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -12,20 +14,38 @@ LEVEL = 0.95
 RESAMPLES = 2000
 
 
+class Estimate(NamedTuple):
+    """A number with its 95 % interval; NaN bounds where there is none."""
+
+    value: float
+    low: float = math.nan
+    high: float = math.nan
+
+    @property
+    def half_width(self) -> float:
+        """Half the interval."""
+        return 0.5 * (self.high - self.low)
+
+    def text(self, scale: float = 1.0, digits: str = ".3f") -> tuple[str, str]:
+        """The number and its interval, as two cells of a table."""
+        value, low, high = (f"{scale * each:{digits}}" for each in self)
+        return value, f"{low} .. {high}"
+
+
 def root_mean(squares: Array, axis: int = -1) -> Array:
     """The square root of the mean: RMSE from each seed's mean squared error."""
     return np.asarray(np.sqrt(np.mean(squares, axis=axis)))
 
 
 def mean(values: Array, axis: int = -1) -> Array:
-    """The mean, in the form `interval` wants."""
+    """The mean, a statistic of `interval`."""
     return np.asarray(np.mean(values, axis=axis))
 
 
 def interval(
     values: Array, statistic: Callable[..., Array] = mean, paired: Array | None = None
-) -> tuple[float, float, float]:
-    """(estimate, low, high) of a statistic over seeds with its 95 % bootstrap interval.
+) -> Estimate:
+    """A statistic over seeds with its 95 % bootstrap interval.
 
     values: (n,) one number a seed. paired: (n,), resampled together with values and handed to the
     statistic as its second argument. Fewer than two different values: the estimate three times.
@@ -34,7 +54,7 @@ def interval(
     data = (values,) if paired is None else (values, paired)
     estimate = float(statistic(*data, axis=-1))
     if len(values) < 2 or all(np.ptp(column) == 0.0 for column in data):
-        return estimate, estimate, estimate
+        return Estimate(estimate, estimate, estimate)
     result = bootstrap(
         data,
         statistic,
@@ -45,7 +65,7 @@ def interval(
         rng=np.random.default_rng(0),
     )
     low, high = result.confidence_interval
-    return estimate, float(low), float(high)
+    return Estimate(estimate, float(low), float(high))
 
 
 def ratio_of_roots(squares: Array, reference: Array, axis: int = -1) -> Array:

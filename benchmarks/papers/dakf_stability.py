@@ -1,6 +1,8 @@
 """dakf-stability: slip from a GPS course and a gyro by disturbance accommodation, and control."""
 
-from .ledger.claim import Bound, Claim, Part, number, smaller
+from functools import partial
+
+from .ledger.claim import Bound, Part, claims_of, measured, smaller
 from .ledger.controllers import Following
 from .ledger.filters import Estimation, Filter
 from .ledger.plots import PaperFigure, course, curves
@@ -19,6 +21,7 @@ _ENV = "sideslip/YawGps-v0"
 _FILTERS = tuple(Filter(name, name) for name in (DAKF, KF, LOB))
 _AGENTS = {WITHOUT: {"agent": "none"}, WITH: {}}
 
+# fmt: off
 SIMULATIONS = (
     Following(FIG7, FIG7, {**_AGENTS, FEEDBACK: {"rejection": False}}),
     Following(LARGER, {"base": FIG7, "name": LARGER, "amplitude": 0.1}, _AGENTS, share=0.25),
@@ -26,25 +29,14 @@ SIMULATIONS = (
     Estimation(FIG6, _ENV, FIG6, _FILTERS),
     Estimation(FASTER, _ENV, {"base": FIG6, "name": FASTER, "frequency": 0.4}, _FILTERS),
     Estimation(FIG8, _ENV, FIG8, _FILTERS),
-    Estimation(
-        BIAS,
-        _ENV,
-        {
-            "base": FIG6,
-            "name": BIAS,
-            "steering": "straight",
-            "duration": 120.0,
-            "wind_force": 0.0,
-            "gps_outage": None,
-            "disturbance_force": 0.0,
-            "disturbance_moment": 0.0,
-            "noise": {"gyro_bias": GYRO_BIAS},
-        },
-        _FILTERS[:2],
-        control_period=100,
-    ),
+    Estimation(BIAS, _ENV,
+        {"base": FIG6, "name": BIAS, "steering": "straight", "duration": 120.0, "wind_force": 0.0,
+            "gps_outage": None, "disturbance_force": 0.0, "disturbance_moment": 0.0,
+            "noise": {"gyro_bias": GYRO_BIAS}},
+        _FILTERS[:2], control_period=100),
     Analysis(RANKS, coms_ranks, random=False),
 )
+# fmt: on
 
 
 def _tracks(scenario: str, beta: float | None, gamma: float | None) -> tuple[Part, ...]:
@@ -54,171 +46,86 @@ def _tracks(scenario: str, beta: float | None, gamma: float | None) -> tuple[Par
     )
 
 
+claim = claims_of(PAPER)
+# A claim a paragraph, a part a line: by hand.
+# fmt: off
 CLAIMS = (
-    Claim(
-        PAPER,
-        "Fig. 6",
-        "the DAKF beats the three-state Kalman filter, and this the linear observer",
-        (
-            smaller("DAKF / KF", FIG6, DAKF, KF, 0.75),
-            smaller("KF / LOB", FIG6, KF, LOB, 0.80),
-            smaller("DAKF / KF at 0.4 Hz", FASTER, DAKF, KF),
-            smaller("KF / LOB at 0.4 Hz", FASTER, KF, LOB),
-        ),
-    ),
-    Claim(
-        PAPER,
-        "Fig. 6",
-        "the DAKF is better during the outage too",
-        tuple(
+    claim("Fig. 6", "the DAKF beats the three-state Kalman filter, and this the linear observer",
+        smaller("DAKF / KF", FIG6, DAKF, KF, 0.75),
+        smaller("KF / LOB", FIG6, KF, LOB, 0.80),
+        smaller("DAKF / KF at 0.4 Hz", FASTER, DAKF, KF),
+        smaller("KF / LOB at 0.4 Hz", FASTER, KF, LOB)),
+    claim("Fig. 6", "the DAKF is better during the outage too",
+        *(
             smaller(f"DAKF / {rival}, 4 to 6 s{text}", name, DAKF, filter_, metric="outage")
             for name, text in ((FIG6, ""), (FASTER, " at 0.4 Hz"))
             for rival, filter_ in (("KF", KF), ("LOB", LOB))
-        ),
-    ),
-    Claim(
-        PAPER,
-        "Sec. IV.D",
-        "slip and disturbances are observable",
-        (
-            Part(
-                "rank, of 5 states",
-                RANKS,
-                number(RANKS, "dakf", "rank"),
-                Bound("=", 5.0),
-                Bound("=", 4.0),
-                "rank",
-            ),
-            Part(
-                "slip error after 120 s with 0.05 deg/s of gyro bias, DAKF",
-                BIAS,
-                number(BIAS, DAKF, "last"),
-                None,
-                Bound(">=", 0.05),
-                "drift",
-            ),
-            Part(
-                "the same, three-state KF",
-                BIAS,
-                number(BIAS, KF, "last"),
-                None,
-                Bound("<=", 0.01),
-                "drift",
-            ),
-        ),
-        "A constant slip is the same to the sensors as a heading the other way with constant d1 "
-        "and d2.",
-    ),
-    Claim(
-        PAPER,
-        "Fig. 7",
-        "with control sideslip angle and yaw rate track their references",
-        (
-            *_tracks(FIG7, 0.80, 0.50),
-            smaller("peak of the slip, with / without", FIG7, WITH, WITHOUT, metric="peak_beta"),
-            Part(
-                "share of time at the yaw moment's limit",
-                FIG7,
-                number(FIG7, WITH, "saturated"),
-                metric="share",
-            ),
-            Part(
-                "the same, a step of 0.1 rad",
-                LARGER,
-                number(LARGER, WITH, "saturated"),
-                metric="share",
-            ),
-        ),
-    ),
-    Claim(
-        PAPER,
-        "Sec. V.B",
-        "disturbance rejection makes the car the nominal one",
-        tuple(
+        )),
+    claim("Sec. IV.D", "slip and disturbances are observable",
+        measured("rank, of 5 states", RANKS, "dakf", "rank", Bound("=", 5.0), Bound("=", 4.0),
+            "rank"),
+        measured("slip error after 120 s with 0.05 deg/s of gyro bias, DAKF", BIAS, DAKF, "last",
+            None, Bound(">=", 0.05), "drift"),
+        measured("the same, three-state KF", BIAS, KF, "last", None, Bound("<=", 0.01), "drift"),
+        note="A constant slip is the same to the sensors as a heading the other way with constant "
+        "d1 and d2."),
+    claim("Fig. 7", "with control sideslip angle and yaw rate track their references",
+        *_tracks(FIG7, 0.80, 0.50),
+        smaller("peak of the slip, with / without", FIG7, WITH, WITHOUT, metric="peak_beta"),
+        measured("share of time at the yaw moment's limit", FIG7, WITH, "saturated",
+            metric="share"),
+        measured("the same, a step of 0.1 rad", LARGER, WITH, "saturated", metric="share")),
+    claim("Sec. V.B", "disturbance rejection makes the car the nominal one",
+        *(
             smaller(f"{text} error, with / without rejection", FIG7, WITH, FEEDBACK, metric=metric)
             for text, metric in (("sideslip", "rms_beta"), ("yaw rate", "rms_gamma"))
         ),
-        "The feedback's integrals already take away what is constant.",
-    ),
-    Claim(
-        PAPER,
-        "Fig. 8 (twin)",
-        "the same order of the filters on the road, during the outage too",
-        (
-            smaller("DAKF / KF", FIG8, DAKF, KF),
-            smaller("KF / LOB", FIG8, KF, LOB),
-            smaller("DAKF / KF, 10.5 to 13 s", FIG8, DAKF, KF, metric="outage"),
-            smaller("DAKF / LOB, 10.5 to 13 s", FIG8, DAKF, LOB, metric="outage"),
-        ),
-        "At 20 km/h, close to 20.7 km/h where the slip of the stationary turn changes its sign, "
-        "there is little slip to see, and no course while it is there.",
-    ),
-    Claim(
-        PAPER,
-        "Fig. 9 (twin)",
-        "with control the car tracks on the road too",
-        _tracks(FIG9, None, None),
-    ),
+        note="The feedback's integrals already take away what is constant."),
+    claim("Fig. 8 (twin)", "the same order of the filters on the road, during the outage too",
+        smaller("DAKF / KF", FIG8, DAKF, KF),
+        smaller("KF / LOB", FIG8, KF, LOB),
+        smaller("DAKF / KF, 10.5 to 13 s", FIG8, DAKF, KF, metric="outage"),
+        smaller("DAKF / LOB, 10.5 to 13 s", FIG8, DAKF, LOB, metric="outage"),
+        note="At 20 km/h, close to 20.7 km/h where the slip of the stationary turn changes its "
+        "sign, there is little slip to see, and no course while it is there."),
+    claim("Fig. 9 (twin)", "with control the car tracks on the road too",
+        *_tracks(FIG9, None, None)),
 )
 
 _SLIP, _RATE = "sideslip angle / rad", "yaw rate / (rad/s)"
+figure = partial(PaperFigure, PAPER)
 FIGURES = (
     *(
-        PaperFigure(PAPER, f"{figure} {panel}", name, draw, caption)
-        for name, figure, caption in (
+        figure(f"{number} {panel}", name, draw, caption)
+        for name, number, caption in (
             (FIG6, "Fig. 6", "Lane change at 25 km/h; wind from 4 to 8 s, no GPS from 4 to 6 s."),
-            (FIG8, "Fig. 8 (twin)", "Lane change at 20 km/h; course unused from 10.5 to 13.0 s."),
-        )
+            (FIG8, "Fig. 8 (twin)", "Lane change at 20 km/h; course unused from 10.5 to 13.0 s."))
         for panel, draw in (
             ("(a): sideslip angle", curves("beta", _SLIP, ("truth", LOB, KF, DAKF))),
-            ("(b): course angle", course("course angle / rad", ("truth", KF, DAKF))),
-        )
+            ("(b): course angle", course("course angle / rad", ("truth", KF, DAKF))))
     ),
-    PaperFigure(
-        PAPER,
-        "Sec. IV.D: slip with a gyro bias of 0.05 deg/s",
-        BIAS,
-        curves("beta", _SLIP),
-        "Straight on at 25 km/h: the direction that the DAKF cannot see fills up.",
-    ),
+    figure("Sec. IV.D: slip with a gyro bias of 0.05 deg/s", BIAS, curves("beta", _SLIP),
+        "Straight on at 25 km/h: the direction that the DAKF cannot see fills up."),
     *(
-        PaperFigure(PAPER, f"Fig. 7 {panel}", FIG7, draw, caption)
+        figure(f"Fig. 7 {panel}", FIG7, draw, caption)
         for panel, draw, caption in (
-            (
-                "(a): sideslip angle",
-                curves("beta", _SLIP, ("reference", WITHOUT, WITH, FEEDBACK)),
-                "A step of 0.06 rad at 1 s, wind from 4 to 8 s.",
-            ),
-            (
-                "(b): yaw rate",
-                curves("gamma", _RATE, ("reference", WITHOUT, WITH, FEEDBACK)),
-                "Tyres 7000 real, 10000 N/rad nominal.",
-            ),
-            (
-                "(c): front steering angle",
+            ("(a): sideslip angle", curves("beta", _SLIP, ("reference", WITHOUT, WITH, FEEDBACK)),
+                "A step of 0.06 rad at 1 s, wind from 4 to 8 s."),
+            ("(b): yaw rate", curves("gamma", _RATE, ("reference", WITHOUT, WITH, FEEDBACK)),
+                "Tyres 7000 real, 10000 N/rad nominal."),
+            ("(c): front steering angle",
                 curves("steer", "front steering angle / rad", (WITHOUT, WITH, FEEDBACK)),
-                "Behind the EPS motor's lag of 30 ms.",
-            ),
-            (
-                "(d): yaw moment",
+                "Behind the EPS motor's lag of 30 ms."),
+            ("(d): yaw moment",
                 curves("yaw_moment", "yaw moment / (N m)", (WITHOUT, WITH, FEEDBACK)),
-                "What the motors deliver.",
-            ),
-        )
+                "What the motors deliver."))
     ),
     *(
-        PaperFigure(
-            PAPER,
-            f"Fig. 9 (twin) ({panel}): {text}: {who}",
-            FIG9,
+        figure(f"Fig. 9 (twin) ({panel}): {text}: {who}", FIG9,
             curves(signal, label, ("reference", who)),
-            "Cornering by wire at 20 km/h, with everything that the plant has.",
-        )
-        for panel, who, text, signal, label in (
-            ("a", WITHOUT, "sideslip angle", "beta", _SLIP),
+            "Cornering by wire at 20 km/h, with everything that the plant has.")
+        for panel, who, text, signal, label in (("a", WITHOUT, "sideslip angle", "beta", _SLIP),
             ("b", WITHOUT, "yaw rate", "gamma", _RATE),
-            ("c", WITH, "sideslip angle", "beta", _SLIP),
-            ("d", WITH, "yaw rate", "gamma", _RATE),
-        )
+            ("c", WITH, "sideslip angle", "beta", _SLIP), ("d", WITH, "yaw rate", "gamma", _RATE))
     ),
 )

@@ -1,9 +1,11 @@
 """double-layer-gps: slip, roll and velocities from a single-antenna GPS in two layers."""
 
+from functools import partial
+
 import numpy as np
 
 from ...estimators.filters import FILTERS
-from .ledger.claim import Bound, Claim, Part, over_others, smaller
+from .ledger.claim import Bound, Part, claims_of, over_others, smaller
 from .ledger.filters import Estimation, Filter
 from .ledger.plots import PaperFigure, curves
 
@@ -42,170 +44,99 @@ _SKIES = (
     ("open sky, noise law: table", _OPEN, "table", None),
 )
 
+# fmt: off
 SIMULATIONS = (
     *(Estimation(name, _ENV, name, _FILTERS) for name in (FIG9, FASTER, PERIODS, ROAD)),
     Estimation(CALM, _ENV, CALM, (_FILTERS[0], Filter(ROLL, ROLL))),
     *(
-        Estimation(
-            name,
-            _ENV,
+        Estimation(name, _ENV,
             {"base": FIG9, "name": name, "hdop": hdop, "hdop_spread": spread, "hdop_law": law},
-            (
-                *_FILTERS[:2],
-                Filter(WALKS + FIXED, PROPOSED, {**_PREDICTED, "hdop_table": None}),
-                Filter(PROPOSED + FIXED, PROPOSED, {"hdop_table": None}),
-            ),
-        )
+            (*_FILTERS[:2], Filter(WALKS + FIXED, PROPOSED, {**_PREDICTED, "hdop_table": None}),
+                Filter(PROPOSED + FIXED, PROPOSED, {"hdop_table": None})))
         for name, (hdop, spread), law, _ in _SKIES
     ),
 )
+# fmt: on
 
+claim = claims_of(PAPER)
+# A claim a paragraph, a part a line: by hand.
+# fmt: off
 CLAIMS = (
-    Claim(
-        PAPER,
-        "Fig. 9 (a)",
-        "proposed < three-state filter < two-state observer, sideslip angle",
-        (
-            *(
-                smaller(f"{who} / three-state, {text}", scenario, name, THREE, most)
-                for scenario, text in _SLALOMS
-                for who, name, most in (
-                    ("disturbance KF", WALKS, 0.75),
-                    ("double layer", PROPOSED, 0.95),
-                )
-            ),
-            *(
-                smaller(f"three-state / two-state, {text}", name, THREE, LOB)
-                for name, text in _SLALOMS
-            ),
+    claim("Fig. 9 (a)", "proposed < three-state filter < two-state observer, sideslip angle",
+        *(
+            smaller(f"{who} / three-state, {text}", scenario, name, THREE, most)
+            for scenario, text in _SLALOMS
+            for who, name, most in (("disturbance KF", WALKS, 0.75),
+                ("double layer", PROPOSED, 0.95))
         ),
-        "The gain is that of the disturbance states. The disturbance KF is the double layer "
-        "without its correction between courses, which adds no information and costs accuracy.",
-    ),
-    Claim(
-        PAPER,
-        "Fig. 9 (b)",
-        "the smallest error between courses",
-        tuple(
+        *(smaller(f"three-state / two-state, {text}", name, THREE, LOB) for name, text in _SLALOMS),
+        note="The gain is that of the disturbance states. The disturbance KF is the double layer "
+        "without its correction between courses, which adds no information and costs accuracy."),
+    claim("Fig. 9 (b)", "the smallest error between courses",
+        *(
             smaller(f"double layer / disturbance KF, {text}", name, PROPOSED, WALKS)
             for name, text in _SLALOMS
-        )
-        + tuple(
-            smaller(
-                f"jump at a course, double layer / three-state, {text}",
-                name,
-                PROPOSED,
-                THREE,
-                metric="jump",
-            )
+        ),
+        *(
+            smaller(f"jump at a course, double layer / three-state, {text}", name, PROPOSED, THREE,
+                metric="jump")
             for name, text in _SLALOMS
         ),
-        "The error over all milliseconds is that between courses: there are 200 to a course.",
-    ),
-    Claim(
-        PAPER,
-        "Fig. 9 (c)",
-        "the yaw angle at 1 kHz from courses at 5 Hz",
-        (smaller("double layer / three-state", FIG9, PROPOSED, THREE, metric="psi"),),
-    ),
-    Claim(
-        PAPER,
-        "Fig. 9 (d)",
-        "roll angle better than a two-state roll filter's",
-        (
-            smaller("double layer / roll KF, wind", FIG9, PROPOSED, ROLL, 0.55, "phi"),
-            smaller("double layer / roll KF, no wind", CALM, PROPOSED, ROLL, metric="phi"),
+        note="The error over all milliseconds is that between courses: there are 200 to a course."),
+    claim("Fig. 9 (c)", "the yaw angle at 1 kHz from courses at 5 Hz",
+        smaller("double layer / three-state", FIG9, PROPOSED, THREE, metric="psi")),
+    claim("Fig. 9 (d)", "roll angle better than a two-state roll filter's",
+        smaller("double layer / roll KF, wind", FIG9, PROPOSED, ROLL, 0.55, "phi"),
+        smaller("double layer / roll KF, no wind", CALM, PROPOSED, ROLL, metric="phi"),
+        note="30 % on inertia, damping and stiffness cancel except in the input gain."),
+    claim("Fig. 9 (e)-(f)", "velocities better than a kinematic filter's",
+        smaller("v_y, double layer / kinematic KF", FIG9, PROPOSED, DESIGNED, 0.30, "v_y"),
+        smaller("v_x, double layer / kinematic KF", FIG9, PROPOSED, DESIGNED, metric="v_x"),
+        *(
+            smaller(f"{state}, the same, tuned", FIG9, PROPOSED, KINEMATIC, metric=state)
+            for state in ("v_y", "v_x")
         ),
-        "30 % on inertia, damping and stiffness cancel except in the input gain.",
-    ),
-    Claim(
-        PAPER,
-        "Fig. 9 (e)-(f)",
-        "velocities better than a kinematic filter's",
-        (
-            smaller("v_y, double layer / kinematic KF", FIG9, PROPOSED, DESIGNED, 0.30, "v_y"),
-            smaller("v_x, double layer / kinematic KF", FIG9, PROPOSED, DESIGNED, metric="v_x"),
-            *(
-                smaller(f"{state}, the same, tuned", FIG9, PROPOSED, KINEMATIC, metric=state)
-                for state in ("v_y", "v_x")
-            ),
-        ),
-        "The kinematic KF with the process noise of its accelerometers, and with one tuned to the "
-        "drive, which takes roll for noise. v_x: it has the wheels at 1 kHz, the double layer the "
-        "GPS's speed at 5 Hz.",
-    ),
-    Claim(
-        PAPER,
-        "Sec. 4.3",
-        "R from a table of HDOP beats a fixed R, sideslip angle",
-        tuple(
+        note="The kinematic KF with the process noise of its accelerometers, and with one tuned "
+        "to the drive, which takes roll for noise. v_x: it has the wheels at 1 kHz, the double "
+        "layer the GPS's speed at 5 Hz."),
+    claim("Sec. 4.3", "R from a table of HDOP beats a fixed R, sideslip angle",
+        *(
             smaller(f"{who}, {name}", name, filter_, filter_ + FIXED, threshold)
-            for who, filter_, limited in (
-                ("disturbance KF", WALKS, True),
-                ("double layer", PROPOSED, False),
-            )
+            for who, filter_, limited in (("disturbance KF", WALKS, True),
+                ("double layer", PROPOSED, False))
             for name, _, _, most in _SKIES
             for threshold in (most if limited else None,)
         ),
-        "Table / R of HDOP 1. The table helps the disturbance KF where HDOP is high and the noise "
-        "follows it; where the noise does not, it is a wrong R. The double layer, which corrects "
-        "between courses, gains nothing. On three real receivers the spread hardly follows HDOP "
-        "(docs/PAPERS.md).",
-    ),
-    Claim(
-        PAPER,
-        "Fig. 9 (twin)",
-        "the proposed estimator is the best on the road",
-        (
-            Part(
-                "slip, double layer / best rival",
-                ROAD,
-                over_others(ROAD, PROPOSED, (THREE, LOB), np.min),
-                Bound("<", 1.0),
-            ),
-            smaller("slip, three-state / two-state", ROAD, THREE, LOB),
-            smaller("roll, double layer / roll KF", ROAD, PROPOSED, ROLL, metric="phi"),
-            smaller("v_y, double layer / kinematic KF", ROAD, PROPOSED, KINEMATIC, metric="v_y"),
-            smaller("v_x, double layer / kinematic KF", ROAD, PROPOSED, KINEMATIC, metric="v_x"),
-        ),
-    ),
+        note="Table / R of HDOP 1. The table helps the disturbance KF where HDOP is high and the "
+        "noise follows it; where the noise does not, it is a wrong R. The double layer, which "
+        "corrects between courses, gains nothing. On three real receivers the spread hardly "
+        "follows HDOP (docs/PAPERS.md)."),
+    claim("Fig. 9 (twin)", "the proposed estimator is the best on the road",
+        Part("slip, double layer / best rival", ROAD,
+            over_others(ROAD, PROPOSED, (THREE, LOB), np.min), Bound("<", 1.0)),
+        smaller("slip, three-state / two-state", ROAD, THREE, LOB),
+        smaller("roll, double layer / roll KF", ROAD, PROPOSED, ROLL, metric="phi"),
+        smaller("v_y, double layer / kinematic KF", ROAD, PROPOSED, KINEMATIC, metric="v_y"),
+        smaller("v_x, double layer / kinematic KF", ROAD, PROPOSED, KINEMATIC, metric="v_x")),
 )
 
 _SLIP, _SLIPS = "sideslip angle / rad", ("truth", LOB, THREE, PROPOSED)
+figure = partial(PaperFigure, PAPER)
 FIGURES = tuple(
-    PaperFigure(PAPER, f"Fig. 9 ({panel}){twin}: {text}", name, draw, caption)
+    figure(f"Fig. 9 ({panel}){twin}: {text}", name, draw, caption)
     for name, twin in ((FIG9, ""), (ROAD, " (twin)"))
     for panel, text, draw, caption in (
         ("a", "sideslip angle", curves("beta", _SLIP, _SLIPS), "Tyres 7000 real, 10000 nominal."),
-        (
-            "b",
-            "sideslip angle between courses",
-            curves("beta", _SLIP, _SLIPS, (9.0, 10.0)),
-            "One second: five courses.",
-        ),
-        (
-            "c",
-            "yaw angle",
-            curves("psi", "yaw angle / rad", ("truth", PROPOSED)),
-            "At 1 kHz from 5 Hz.",
-        ),
-        (
-            "d",
-            "roll angle",
-            curves("phi", "roll angle / rad", ("truth", ROLL, PROPOSED)),
-            "The roll model is 30 % off.",
-        ),
-        (
-            "e",
-            "longitudinal velocity",
+        ("b", "sideslip angle between courses", curves("beta", _SLIP, _SLIPS, (9.0, 10.0)),
+            "One second: five courses."),
+        ("c", "yaw angle", curves("psi", "yaw angle / rad", ("truth", PROPOSED)),
+            "At 1 kHz from 5 Hz."),
+        ("d", "roll angle", curves("phi", "roll angle / rad", ("truth", ROLL, PROPOSED)),
+            "The roll model is 30 % off."),
+        ("e", "longitudinal velocity",
             curves("v_x", "longitudinal velocity / (m/s)", ("truth", KINEMATIC, PROPOSED)),
-            "The front wheels are the kinematic filter's reference.",
-        ),
-        (
-            "f",
-            "lateral velocity",
+            "The front wheels are the kinematic filter's reference."),
+        ("f", "lateral velocity",
             curves("v_y", "lateral velocity / (m/s)", ("truth", KINEMATIC, PROPOSED)),
-            "Roll puts gravity into the accelerometer.",
-        ),
-    )
+            "Roll puts gravity into the accelerometer."))
 )

@@ -1,6 +1,8 @@
 """dual-rate: slip from the GPS's course alone; `dual_rate_gains` has the theory behind it."""
 
-from .ledger.claim import Claim, Part, smaller
+from functools import partial
+
+from .ledger.claim import Part, claims_of, smaller
 from .ledger.filters import Estimation, Filter
 from .ledger.plots import PaperFigure, course, curves
 from .theory.dual_rate_gains import PAPER
@@ -60,59 +62,36 @@ def _order(scenario: str, most: float | None) -> tuple[Part, ...]:
     )
 
 
+claim = claims_of(PAPER)
+# A claim a paragraph, a part a line: by hand.
+# fmt: off
 CLAIMS = (
-    Claim(
-        PAPER,
-        "Fig. 4",
+    claim("Fig. 4",
         "the pseudo measurement is the most accurate, then holding, then prediction alone",
-        _order(FIG4, 1.12),
-        "With a tuning of its own each rule reaches the same. Oh's rule (35) is the pseudo "
-        "measurement (31) to rounding.",
-    ),
-    Claim(
-        PAPER,
-        "Sec. 4.1",
+        *_order(FIG4, 1.12),
+        note="With a tuning of its own each rule reaches the same. Oh's rule (35) is the pseudo "
+        "measurement (31) to rounding."),
+    claim("Sec. 4.1",
         "slip can be estimated from the GPS's course alone, robustly by disturbance accommodation",
-        (
-            smaller("pseudo / the slip itself", FIG4, PSEUDO, "truth"),
-            smaller("with / without disturbance states", FIG4, CONVENTIONAL, PLAIN),
-        ),
-        "At 25 km/h the course alone hardly tells slip from heading: an estimate of zero is about "
-        "as good.",
-    ),
-    Claim(
-        PAPER,
-        "Fig. 4 (c)",
-        "the pseudo measurement is smoother",
-        (
-            smaller(
-                "jump at a course, pseudo / conventional",
-                FIG4,
-                PSEUDO,
-                CONVENTIONAL,
-                0.15,
-                "jump",
-            ),
-        ),
-    ),
-    Claim(
-        PAPER,
-        "Fig. 5 (twin)",
-        "the pseudo measurement is the most accurate on the road",
-        _order(FIG5, None),
-    ),
+        smaller("pseudo / the slip itself", FIG4, PSEUDO, "truth"),
+        smaller("with / without disturbance states", FIG4, CONVENTIONAL, PLAIN),
+        note="At 25 km/h the course alone hardly tells slip from heading: an estimate of zero is "
+        "about as good."),
+    claim("Fig. 4 (c)", "the pseudo measurement is smoother",
+        smaller("jump at a course, pseudo / conventional", FIG4, PSEUDO, CONVENTIONAL, 0.15,
+            "jump")),
+    claim("Fig. 5 (twin)", "the pseudo measurement is the most accurate on the road",
+        *_order(FIG5, None)),
 )
 
 _SLIP, _ALL = "sideslip angle / rad", ("truth", CONVENTIONAL, HOLDING, PSEUDO)
+figure = partial(PaperFigure, PAPER)
 FIGURES = tuple(
-    PaperFigure(PAPER, f"{figure} {panel}", name, draw, caption)
-    for name, figure, caption in (
+    figure(f"{number} {panel}", name, draw, caption)
+    for name, number, caption in (
         (FIG4, "Fig. 4", "A slalom at 25 km/h, wind from 4 to 8 s, tyres 1.3 times too stiff."),
-        (FIG5, "Fig. 5 (twin)", "The road test's slalom, with everything that the plant has."),
-    )
-    for panel, draw in (
-        ("(a): course angle", course("course angle / rad", _ALL)),
+        (FIG5, "Fig. 5 (twin)", "The road test's slalom, with everything that the plant has."))
+    for panel, draw in (("(a): course angle", course("course angle / rad", _ALL)),
         ("(b): sideslip angle", curves("beta", _SLIP, _ALL)),
-        ("(c): inter-sample performance", curves("beta", _SLIP, _ALL, (6.0, 7.0))),
-    )
+        ("(c): inter-sample performance", curves("beta", _SLIP, _ALL, (6.0, 7.0))))
 )

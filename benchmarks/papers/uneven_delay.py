@@ -1,6 +1,8 @@
 """uneven-delay: the lateral offset from a camera whose delay varies and is time-stamped."""
 
-from .ledger.claim import Bound, Claim, Part, number, ratio, smaller
+from functools import partial
+
+from .ledger.claim import Bound, Part, claims_of, measured, ratio, smaller
 from .ledger.filters import Estimation, Filter
 from .ledger.plots import PaperFigure, curves, delays, measured_offset
 from .ledger.simulations import Analysis
@@ -35,106 +37,56 @@ SIMULATIONS = (
 )
 
 _NOISES = ((FIG5, ""), (NOISY, ", three times the noise"))
+claim = claims_of(PAPER)
+# A claim a paragraph, a part a line: by hand.
+# fmt: off
 CLAIMS = (
-    Claim(
-        PAPER,
-        "Sec. 1.3",
-        "slip is observable from vision alone",
-        (
-            Part(
-                "rank, of 4 states",
-                RANKS,
-                number(RANKS, "vision", "rank"),
-                Bound("=", 4.0),
-                Bound("=", 4.0),
-                "rank",
-            ),
-            smaller("vision alone / the slip itself", FIG5, VISION, "truth"),
-        ),
-    ),
-    Claim(
-        PAPER,
-        "Fig. 5",
-        "time stamps beat a constant delay, lateral offset",
-        tuple(
+    claim("Sec. 1.3", "slip is observable from vision alone",
+        measured("rank, of 4 states", RANKS, "vision", "rank", Bound("=", 4.0), Bound("=", 4.0),
+            "rank"),
+        smaller("vision alone / the slip itself", FIG5, VISION, "truth")),
+    claim("Fig. 5", "time stamps beat a constant delay, lateral offset",
+        *(
             smaller(f"proposed / constant {told}{text}", scenario, PROPOSED, rival, most, "y_l")
             for scenario, text in _NOISES
-            for told, rival, most in (
-                ("33 ms", FRAME, 0.80),
-                ("17 ms, the true mean", MEAN, None),
-            )
+            for told, rival, most in (("33 ms", FRAME, 0.80), ("17 ms, the true mean", MEAN, None))
         ),
-        "Against one frame the time stamps win; against the true mean delay there is no gain. One "
-        "process noise for all; with one tuned to the offset for each of them the order is the "
-        "same.",
-    ),
-    Claim(
-        PAPER,
-        "Fig. 5",
-        "what exact handling of the delay is worth, lateral offset",
-        tuple(
-            Part(
-                f"exact rollback / constant 17 ms{text}",
-                scenario,
+        note="Against one frame the time stamps win; against the true mean delay there is no "
+        "gain. One process noise for all; with one tuned to the offset for each of them the order "
+        "is the same."),
+    claim("Fig. 5", "what exact handling of the delay is worth, lateral offset",
+        *(
+            Part(f"exact rollback / constant 17 ms{text}", scenario,
                 ratio(scenario, EXACT, ROLLBACK_17, "y_l"),
-                threshold=Bound("<=", 0.95) if scenario == FIG5 else None,
-            )
+                threshold=Bound("<=", 0.95) if scenario == FIG5 else None)
+            for scenario, text in _NOISES
+        )),
+    claim("Fig. 5", "what the delay does to the slip",
+        *(
+            Part(f"slip, proposed / constant 33 ms{text}", scenario,
+                ratio(scenario, PROPOSED, FRAME))
             for scenario, text in _NOISES
         ),
-    ),
-    Claim(
-        PAPER,
-        "Fig. 5",
-        "what the delay does to the slip",
-        tuple(
-            Part(
-                f"slip, proposed / constant 33 ms{text}", scenario, ratio(scenario, PROPOSED, FRAME)
-            )
-            for scenario, text in _NOISES
-        ),
-        "The paper shows the lateral offset alone. A delay of one frame too many turns the "
-        "phase of the slip as too soft tyres do, the other way: with noise the two errors cancel.",
-    ),
-    Claim(
-        PAPER,
-        "Fig. 7 (twin)",
-        "time stamps beat a constant delay on the road, lateral offset",
-        (
-            smaller("proposed / constant 33 ms", FIG7, PROPOSED, FRAME, metric="y_l"),
-            smaller("proposed / constant 17 ms", FIG7, PROPOSED, MEAN, metric="y_l"),
-        ),
-    ),
+        note="The paper shows the lateral offset alone. A delay of one frame too many turns the "
+        "phase of the slip as too soft tyres do, the other way: with noise the two errors cancel."),
+    claim("Fig. 7 (twin)", "time stamps beat a constant delay on the road, lateral offset",
+        smaller("proposed / constant 33 ms", FIG7, PROPOSED, FRAME, metric="y_l"),
+        smaller("proposed / constant 17 ms", FIG7, PROPOSED, MEAN, metric="y_l")),
 )
 
 _OFFSET, _SHOWN = "lateral offset / m", ("truth", FRAME, PROPOSED)
+figure = partial(PaperFigure, PAPER)
 FIGURES = (
-    PaperFigure(PAPER, "Fig. 4: delay of each frame", FIG5, delays, "20, 15, 10, 25 ms, repeated."),
-    PaperFigure(
-        PAPER,
-        "Fig. 5: lateral offset at the preview point",
-        FIG5,
+    figure("Fig. 4: delay of each frame", FIG5, delays, "20, 15, 10, 25 ms, repeated."),
+    figure("Fig. 5: lateral offset at the preview point", FIG5,
         measured_offset(_OFFSET, _SHOWN, (4.0, 4.5)),
-        "Truth, the camera's held late samples, a constant delay and the proposed filter.",
-    ),
-    PaperFigure(
-        PAPER,
-        "Fig. 5: body slip angle",
-        FIG5,
+        "Truth, the camera's held late samples, a constant delay and the proposed filter."),
+    figure("Fig. 5: body slip angle", FIG5,
         curves("beta", "body slip angle / rad", ("truth", FRAME, PROPOSED, VISION)),
-        "The same drive; the paper shows the offset alone.",
-    ),
-    PaperFigure(
-        PAPER,
-        "Fig. 6 (twin): delay of each frame",
-        FIG7,
-        delays,
-        "Processing takes 9 to 18 ms, as on the road.",
-    ),
-    PaperFigure(
-        PAPER,
-        "Fig. 7 (twin): lateral offset at the preview point",
-        FIG7,
+        "The same drive; the paper shows the offset alone."),
+    figure("Fig. 6 (twin): delay of each frame", FIG7, delays,
+        "Processing takes 9 to 18 ms, as on the road."),
+    figure("Fig. 7 (twin): lateral offset at the preview point", FIG7,
         measured_offset(_OFFSET, _SHOWN, (20.0, 20.5)),
-        "The driver's sine at about 28 km/h, half a second.",
-    ),
+        "The driver's sine at about 28 km/h, half a second."),
 )

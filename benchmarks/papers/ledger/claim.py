@@ -121,6 +121,15 @@ class Claim:
             raise ValueError(f"{self.paper} {self.source}: a claim needs at least one part")
 
 
+def claims_of(paper: str) -> Callable[..., Claim]:
+    """A maker of a paper's claims, from source, text, their parts and a note."""
+
+    def claim(source: str, text: str, *parts: Part, note: str = "") -> Claim:
+        return Claim(paper, source, text, parts, note)
+
+    return claim
+
+
 @dataclass(frozen=True)
 class Found:
     """A part with its numbers, (seeds,)."""
@@ -187,6 +196,19 @@ def verdict(found: Sequence[Found]) -> str:
 def number(scenario: str, who: str, metric: str) -> Callable[[Results], Array]:
     """A measured number as it stands."""
     return lambda results: results[scenario].numbers[who, metric]
+
+
+def measured(
+    label: str,
+    scenario: str,
+    who: str,
+    what: str,
+    says: Bound | None = None,
+    threshold: Bound | None = None,
+    metric: str = "ratio",
+) -> Part:
+    """A measured number as a part of a claim."""
+    return Part(label, scenario, number(scenario, who, what), says, threshold, metric)
 
 
 def ratio(scenario: str, one: str, other: str, metric: str = "beta") -> Callable[[Results], Array]:

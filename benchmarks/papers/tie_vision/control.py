@@ -1,6 +1,7 @@
 """tie-vision's controller: feedforward, Table II, and the lane changes of Fig. 8 and 10."""
 
 import math
+from functools import partial
 
 import gymnasium as gym
 import numpy as np
@@ -11,7 +12,7 @@ from ....agents.rollout import rollout
 from ....envs.scenarios.draws import KMH
 from ....envs.ticks import TICK
 from ....envs.vehicle.vehicle import COMS
-from ..ledger.claim import Bound, Claim, Example, Measured, Part, number, ratio, smaller
+from ..ledger.claim import Bound, Example, Measured, Part, claims_of, measured, ratio, smaller
 from ..ledger.controllers import Slip
 from ..ledger.plots import PaperFigure, curves, loops
 from ..ledger.simulations import Analysis
@@ -98,152 +99,59 @@ SIMULATIONS = (
 )
 
 _TYRES = {FIG8: "nominal", STIFF: "tyres x 1.2", FIG10: "twin"}
+claim = claims_of(PAPER)
+# A claim a paragraph, a part a line: by hand.
+# fmt: off
 CLAIMS = (
-    Claim(
-        PAPER,
-        "(24)",
-        "the feedforward brings the static slip to zero",
-        (
-            Part(
-                "slip left, 10 to 45 km/h",
-                STATIC,
-                number(STATIC, "feedforward", "static_slip"),
-                Bound("<", 1e-9),
-                Bound("<", 1e-9),
-                "static_slip",
-            ),
+    claim("(24)", "the feedforward brings the static slip to zero",
+        measured("slip left, 10 to 45 km/h", STATIC, "feedforward", "static_slip", Bound("<", 1e-9),
+            Bound("<", 1e-9), "static_slip")),
+    claim("Table II", "gain margins of 5.92 dB at 15.15 Hz and 22.8 dB at 477.46 Hz",
+        measured("farther of both margins from the printed ones, best loop / dB", TABLE2, "loops",
+            "off", Bound("<=", 0.05), Bound("<=", 0.5), "decibels"),
+        measured("the same, best loop at 25 km/h / dB", TABLE2, "25 km/h", "off", Bound("<=", 0.05),
+            Bound("<=", 0.5), "decibels"),
+        *(
+            measured(f"crossover of the {label} loop / Hz", TABLE2, label, "crossover",
+                Bound("=", hertz), metric="hertz")
+            for label, hertz in zip((SINGLE, MULTI), HERTZ, strict=True)
         ),
-    ),
-    Claim(
-        PAPER,
-        "Table II",
-        "gain margins of 5.92 dB at 15.15 Hz and 22.8 dB at 477.46 Hz",
-        (
-            Part(
-                "farther of both margins from the printed ones, best loop / dB",
-                TABLE2,
-                number(TABLE2, "loops", "off"),
-                Bound("<=", 0.05),
-                Bound("<=", 0.5),
-                "decibels",
-            ),
-            Part(
-                "the same, best loop at 25 km/h / dB",
-                TABLE2,
-                number(TABLE2, "25 km/h", "off"),
-                Bound("<=", 0.05),
-                Bound("<=", 0.5),
-                "decibels",
-            ),
-            *(
-                Part(
-                    f"crossover of the {label} loop / Hz",
-                    TABLE2,
-                    number(TABLE2, label, "crossover"),
-                    Bound("=", hertz),
-                    metric="hertz",
-                )
-                for label, hertz in zip((SINGLE, MULTI), HERTZ, strict=True)
-            ),
-            Part(
-                "loops of the search within 0.5 dB of both",
-                TABLE2,
-                number(TABLE2, "loops", "count"),
-                metric="count",
-            ),
-        ),
-        "The table gives no speed, no Q and R, no discretisation: agents/loops.py searches 4590 "
-        "loops for those that fit. Several do, at several speeds: the table does not tell which "
-        "was meant. Every loop crosses at half its sampling rate; 477.46 Hz is 3000 rad/s, "
-        "probably where a frequency grid ended.",
-    ),
-    Claim(
-        PAPER,
-        "Table II",
-        "multirate feedback raises the gain margin",
-        (
-            Part(
-                "multirate - single-rate, the same PI / dB",
-                TABLE2,
-                number(TABLE2, "same PI", "raised"),
-                Bound(">", 0.0),
-                Bound(">=", 20.0),
-                "decibels",
-            ),
-        ),
-    ),
-    Claim(
-        PAPER,
-        "Fig. 8",
-        "the controller reduces the slip",
-        tuple(
+        measured("loops of the search within 0.5 dB of both", TABLE2, "loops", "count",
+            metric="count"),
+        note="The table gives no speed, no Q and R, no discretisation: `table_two` searches "
+        "4590 loops for those that fit. Several do, at several speeds: the table does not tell "
+        "which was meant. Every loop crosses at half its sampling rate; 477.46 Hz is 3000 rad/s, "
+        "probably where a frequency grid ended."),
+    claim("Table II", "multirate feedback raises the gain margin",
+        measured("multirate - single-rate, the same PI / dB", TABLE2, "same PI", "raised",
+            Bound(">", 0.0), Bound(">=", 20.0), "decibels")),
+    claim("Fig. 8", "the controller reduces the slip",
+        *(
             smaller(f"{who} / none, {_TYRES[name]}", name, who, "none", most, "rms_slip")
             for name, most in ((FIG8, 0.40), (STIFF, 0.55))
             for who in (SINGLE, MULTI)
-        ),
-    ),
-    Claim(
-        PAPER,
-        "Fig. 8 (a)",
-        "the multirate controller keeps the slip smaller than the single-rate one",
-        tuple(
+        )),
+    claim("Fig. 8 (a)", "the multirate controller keeps the slip smaller than the single-rate one",
+        *(
             smaller(f"{who} / single-rate, {_TYRES[name]}", name, who, SINGLE, most, "rms_slip")
             for name, most in ((FIG8, 0.92), (STIFF, None))
             for who in (MULTI, PROPOSED)
-        ),
-    ),
-    Claim(
-        PAPER,
-        "Fig. 8 (b)",
-        "the multirate controller's input is smoother",
-        (
-            smaller(
-                "largest 1 ms step, pseudo-residuals / single-rate",
-                FIG8,
-                PROPOSED,
-                SINGLE,
-                0.4,
-                "largest_step",
-            ),
-            smaller(
-                "total variation, pseudo-residuals / single-rate",
-                FIG8,
-                PROPOSED,
-                SINGLE,
-                metric="total_variation",
-            ),
-        ),
-    ),
-    Claim(
-        PAPER,
-        "Fig. 8",
-        "the gain margins of both control systems were set to be the same",
-        (
-            Part(
-                "share of time at the yaw moment's limit, multirate with single-rate's margin",
-                FIG8,
-                number(FIG8, EQUAL, "saturation"),
-                metric="share",
-            ),
-            Part(
-                "its slip / multirate with the same PI",
-                FIG8,
-                ratio(FIG8, EQUAL, MULTI, "rms_slip"),
-            ),
-        ),
-        "Taken literally the multirate PI is 28.8 dB stronger and its yaw moment jumps from limit "
-        "to limit with the noise.",
-    ),
-    Claim(
-        PAPER,
-        "Fig. 10 (twin)",
-        "on the road control reduces the slip, multirate more than single-rate",
-        (
-            smaller("single-rate / none", FIG10, SINGLE, "none", metric="rms_slip"),
-            smaller("pseudo-residuals / none", FIG10, PROPOSED, "none", metric="rms_slip"),
-            smaller("pseudo-residuals / single-rate", FIG10, PROPOSED, SINGLE, metric="rms_slip"),
-        ),
-    ),
+        )),
+    claim("Fig. 8 (b)", "the multirate controller's input is smoother",
+        smaller("largest 1 ms step, pseudo-residuals / single-rate", FIG8, PROPOSED, SINGLE, 0.4,
+            "largest_step"),
+        smaller("total variation, pseudo-residuals / single-rate", FIG8, PROPOSED, SINGLE,
+            metric="total_variation")),
+    claim("Fig. 8", "the gain margins of both control systems were set to be the same",
+        measured("share of time at the yaw moment's limit, multirate with single-rate's margin",
+            FIG8, EQUAL, "saturation", metric="share"),
+        Part("its slip / multirate with the same PI", FIG8, ratio(FIG8, EQUAL, MULTI, "rms_slip")),
+        note="Taken literally the multirate PI is 28.8 dB stronger and its yaw moment jumps from "
+        "limit to limit with the noise."),
+    claim("Fig. 10 (twin)", "on the road control reduces the slip, multirate more than single-rate",
+        smaller("single-rate / none", FIG10, SINGLE, "none", metric="rms_slip"),
+        smaller("pseudo-residuals / none", FIG10, PROPOSED, "none", metric="rms_slip"),
+        smaller("pseudo-residuals / single-rate", FIG10, PROPOSED, SINGLE, metric="rms_slip")),
 )
 
 _BETA, _MOMENT = "body slip angle / rad", "yaw moment / (N m)"
@@ -255,42 +163,24 @@ _BEHIND = {
         "The same lane change, when the controllers believe in too soft tyres.",
     ),
 }
+figure = partial(PaperFigure, PAPER)
 FIGURES = (
-    PaperFigure(
-        PAPER,
-        "Table II: the open loops",
-        TABLE2,
-        loops("gain of the open loop / dB"),
-        "Each line ends at half its sampling rate, where the phase is -180 deg: the gain margin is "
-        "how far it is below 0 dB there.",
-    ),
+    figure("Table II: the open loops", TABLE2, loops("gain of the open loop / dB"),
+        "Each line ends at half its sampling rate, where the phase is -180 deg: the gain margin "
+        "is how far it is below 0 dB there."),
     *(
-        PaperFigure(PAPER, f"{paper} {panel}{more}", name, draw, caption)
+        figure(f"{paper} {panel}{more}", name, draw, caption)
         for name, (paper, more, caption) in _BEHIND.items()
         for panel, draw in (
             ("(a): body slip angle", curves("beta", _BETA, ("none", SINGLE, PROPOSED, MULTI))),
-            ("(b): yaw moment", curves("yaw_moment", _MOMENT, (SINGLE, PROPOSED, MULTI))),
-        )
+            ("(b): yaw moment", curves("yaw_moment", _MOMENT, (SINGLE, PROPOSED, MULTI))))
     ),
-    PaperFigure(
-        PAPER,
-        "Fig. 10 (a) (twin): steering input",
-        FIG10,
+    figure("Fig. 10 (a) (twin): steering input", FIG10,
         curves("steer", "front steering angle / rad", ("none",)),
-        "A lane change by the steering motor.",
-    ),
-    PaperFigure(
-        PAPER,
-        "Fig. 10 (b) (twin): body slip angle",
-        FIG10,
+        "A lane change by the steering motor."),
+    figure("Fig. 10 (b) (twin): body slip angle", FIG10,
         curves("beta", _BETA, ("none", SINGLE, PROPOSED)),
-        "The road test's simulated twin, with everything that the plant has.",
-    ),
-    PaperFigure(
-        PAPER,
-        "Fig. 10 (c) (twin): yaw moment",
-        FIG10,
-        curves("yaw_moment", _MOMENT, (SINGLE, PROPOSED)),
-        "Single-rate decides every 33 ms.",
-    ),
+        "The road test's simulated twin, with everything that the plant has."),
+    figure("Fig. 10 (c) (twin): yaw moment", FIG10,
+        curves("yaw_moment", _MOMENT, (SINGLE, PROPOSED)), "Single-rate decides every 33 ms."),
 )

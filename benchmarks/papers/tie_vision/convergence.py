@@ -6,6 +6,8 @@ four steps (19)-(22) read; and the shipped filter's, which spreads the multirate
 the frame.
 """
 
+from functools import partial
+
 import numpy as np
 from scipy.linalg import solve_discrete_are
 
@@ -15,7 +17,7 @@ from ....envs.vehicle.linear import vision
 from ....envs.vehicle.vehicle import COMS
 from ....estimators.design import kalman
 from ....estimators.make import make_estimator
-from ..ledger.claim import Array, Bound, Claim, Example, Measured, Part, number
+from ..ledger.claim import Array, Bound, Example, Measured, claims_of, measured
 from ..ledger.plots import PaperFigure, curves
 from ..ledger.simulations import FIRST, Analysis
 from ..theory import error_maps
@@ -128,68 +130,38 @@ SIMULATIONS = (
 )
 
 _zero = Bound("<=", 1e-12)
+claim = claims_of(PAPER)
+# A claim a paragraph, a part a line: by hand.
+# fmt: off
 CLAIMS = (
-    Claim(
-        PAPER,
-        "Appendix",
+    claim("Appendix",
         "pseudo-residuals let the estimate converge, as measurements at every step would",
-        (
-            Part(
-                "error dynamics, difference from a fast camera",
-                MAPS,
-                number(MAPS, "pseudo-residuals", "difference"),
-                Bound("<=", 1e-9),
-                metric="difference",
-            ),
-            *(
-                Part(
-                    f"share of random tunings that diverge, {gain}",
-                    TUNINGS,
-                    number(TUNINGS, gain, "share"),
-                    Bound("=", 0.0),
-                    metric="share",
-                )
-                for gain in (LITERAL, SPREAD)
-            ),
+        measured("error dynamics, difference from a fast camera", MAPS, "pseudo-residuals",
+            "difference", Bound("<=", 1e-9), metric="difference"),
+        *(
+            measured(f"share of random tunings that diverge, {gain}", TUNINGS, gain, "share",
+                Bound("=", 0.0), metric="share")
+            for gain in (LITERAL, SPREAD)
         ),
-        "C has full row rank only: (20) cannot know the error that the sample does not see. How "
-        "often the filter diverges depends on the gain between samples, which the paper leaves "
-        "open.",
-    ),
-    Claim(
-        PAPER,
-        "Appendix",
-        "the error recursions of the three cases",
-        tuple(
-            Part(
-                f"{case}, residual",
-                APPENDIX,
-                number(APPENDIX, case, "residual"),
-                None if corrected else _zero,
-                _zero if corrected or not case.endswith("printed") else None,
-                "residual",
-            )
-            for case, corrected in (
-                ("case 1", False),
-                ("case 2", False),
-                ("case 3 (a)", True),
-                ("case 3 (a), printed", False),
-                ("case 3 (b)", True),
-                ("case 3 (b), printed", False),
-            )
+        note="C has full row rank only: (20) cannot know the error that the sample does not see. "
+        "How often the filter diverges depends on the gain between samples, which the paper "
+        "leaves open."),
+    claim("Appendix", "the error recursions of the three cases",
+        *(
+            measured(f"{case}, residual", APPENDIX, case, "residual", None if corrected else _zero,
+                _zero if corrected or not case.endswith("printed") else None, "residual")
+            for case, corrected in (("case 1", False), ("case 2", False), ("case 3 (a)", True),
+                ("case 3 (a), printed", False), ("case 3 (b)", True),
+                ("case 3 (b), printed", False))
         ),
-        "Case 3 (a): the products run over G of k+i, not of k+1. Case 3 (b): with the residual "
-        "C G e nothing multiplies w; printed is (I - K C) w.",
-    ),
+        note="Case 3 (a): the products run over G of k+i, not of k+1. Case 3 (b): with the "
+        "residual C G e nothing multiplies w; printed is (I - K C) w."),
 )
 
+figure = partial(PaperFigure, PAPER)
 FIGURES = (
-    PaperFigure(
-        PAPER,
-        "Appendix: what is left of an error between samples",
-        MAPS,
+    figure("Appendix: what is left of an error between samples", MAPS,
         curves("error", "size of the error / its size before the sample", x_label="time / ms"),
         "A sample at 0 ms, the next after 33 ms. Ideal: a fast camera (case 1); none: no "
-        "correction in between (case 2); pseudo-residuals: case 3. Without noise.",
-    ),
+        "correction in between (case 2); pseudo-residuals: case 3. Without noise."),
 )

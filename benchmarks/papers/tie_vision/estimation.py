@@ -1,8 +1,10 @@
 """tie-vision: body slip angle from a camera and a gyro; `tie_vision_control` has its controller."""
 
+from functools import partial
+
 import numpy as np
 
-from ..ledger.claim import Bound, Claim, Measured, Part, over_others, ratio, smaller
+from ..ledger.claim import Bound, Measured, Part, claims_of, over_others, ratio, smaller
 from ..ledger.filters import Estimation, Filter
 from ..ledger.plots import PaperFigure, curves
 
@@ -24,22 +26,16 @@ _FOR_NO_DELAY = {
     "y_l_noise": 2.2,
 }
 
+# fmt: off
 SIMULATIONS = (
-    Estimation(
-        FIG7,
-        "sideslip/YawVision-v0",
-        FIG7,
-        (
-            *_PAPERS_OWN,
-            Filter(NO_DELAY, MULTI, {"delay": "ignore"}),
+    Estimation(FIG7, "sideslip/YawVision-v0", FIG7,
+        (*_PAPERS_OWN, Filter(NO_DELAY, MULTI, {"delay": "ignore"}),
             Filter(RETUNED, MULTI, {"delay": "ignore", **_FOR_NO_DELAY}),
-            Filter(EXACT, "exact-kf", told="truth"),
-        ),
-        bound=True,
-        times=5,
-    ),
+            Filter(EXACT, "exact-kf", told="truth")),
+        bound=True, times=5),
     Estimation(FIG9, "sideslip/YawVision-v0", FIG9, _PAPERS_OWN),
 )
+# fmt: on
 
 
 def _poorest(scenario: str, threshold: Bound | None) -> Part:
@@ -66,71 +62,40 @@ def _pooled(measured: Measured, one: str, other: str) -> np.ndarray:
     return np.array([np.sqrt(squares[0] / squares[1])])
 
 
+claim = claims_of(PAPER)
+# A claim a paragraph, a part a line: by hand.
+# fmt: off
 CLAIMS = (
-    Claim(
-        PAPER,
-        "Fig. 7",
-        "the bicycle model's filter is the poorest",
-        (_poorest(FIG7, Bound(">=", 1.05)),),
-    ),
-    Claim(
-        PAPER,
-        "Fig. 7",
-        "the multirate filter with pseudo-residuals is the best",
-        _best(FIG7, 1.10),
-        "For an optimal gain the expected error given the residual is zero: the correction adds no "
-        "information, it is a change of gain.",
-    ),
-    Claim(
-        PAPER,
-        "Fig. 7",
-        "how far from the best possible, and what the delay costs",
-        (
-            Part(
-                "exact filter of the true model / bound, pooled",
-                FIG7,
-                lambda results: _pooled(results[FIG7], EXACT, "bound"),
-                threshold=Bound("<=", 1.03),
-            ),
-            Part("multirate / bound: the stiffness error", FIG7, ratio(FIG7, MULTI, "bound")),
-            Part("delay ignored / multirate", FIG7, ratio(FIG7, NO_DELAY, MULTI)),
-            Part("delay ignored, tuned for it / multirate", FIG7, ratio(FIG7, RETUNED, MULTI)),
-        ),
-        "docs/PAPERS.md has 2.7 for the stiffness error and 1.64 for the ignored delay. The exact "
-        "filter reaches our bound, so that 2.7 belongs to another bound. What ignoring the delay "
-        "costs is a matter of tuning: more than twice the error with the gains of the filter that "
-        "knows the delay; far less than that filter's error with gains tuned for ignoring it, "
-        "since on a single sine the lag that is left cancels the lag of too soft tyres.",
-    ),
-    Claim(
-        PAPER,
-        "Fig. 9 (twin)",
-        "on the road the bicycle model's filter is the poorest",
-        (_poorest(FIG9, None),),
-    ),
-    Claim(
-        PAPER,
-        "Fig. 9 (twin)",
-        "on the road the filter with pseudo-residuals is the best",
-        _best(FIG9, None),
-    ),
+    claim("Fig. 7", "the bicycle model's filter is the poorest", _poorest(FIG7, Bound(">=", 1.05))),
+    claim("Fig. 7", "the multirate filter with pseudo-residuals is the best",
+        *_best(FIG7, 1.10),
+        note="For an optimal gain the expected error given the residual is zero: the correction "
+        "adds no information, it is a change of gain."),
+    claim("Fig. 7", "how far from the best possible, and what the delay costs",
+        Part("exact filter of the true model / bound, pooled", FIG7,
+            lambda results: _pooled(results[FIG7], EXACT, "bound"), threshold=Bound("<=", 1.03)),
+        Part("multirate / bound: the stiffness error", FIG7, ratio(FIG7, MULTI, "bound")),
+        Part("delay ignored / multirate", FIG7, ratio(FIG7, NO_DELAY, MULTI)),
+        Part("delay ignored, tuned for it / multirate", FIG7, ratio(FIG7, RETUNED, MULTI)),
+        note="docs/PAPERS.md has 2.7 for the stiffness error and 1.64 for the ignored delay. The "
+        "exact filter reaches our bound, so that 2.7 belongs to another bound. What ignoring the "
+        "delay costs is a matter of tuning: more than twice the error with the gains of the "
+        "filter that knows the delay; far less than that filter's error with gains tuned for "
+        "ignoring it, since on a single sine the lag that is left cancels the lag of too soft "
+        "tyres."),
+    claim("Fig. 9 (twin)", "on the road the bicycle model's filter is the poorest",
+        _poorest(FIG9, None)),
+    claim("Fig. 9 (twin)", "on the road the filter with pseudo-residuals is the best",
+        *_best(FIG9, None)),
 )
 
 _BETA = "body slip angle / rad"
 _SHOWN = ("truth", BICYCLE, SINGLE, MULTI, PROPOSED)
+figure = partial(PaperFigure, PAPER)
 FIGURES = (
-    PaperFigure(
-        PAPER,
-        "Fig. 7: body slip angle, estimators",
-        FIG7,
-        curves("beta", _BETA, _SHOWN),
-        "Sine steering at 25 km/h, tyres 1.2 times stiffer than the filters believe.",
-    ),
-    PaperFigure(
-        PAPER,
-        "Fig. 9 (twin): body slip angle, estimators",
-        FIG9,
+    figure("Fig. 7: body slip angle, estimators", FIG7, curves("beta", _BETA, _SHOWN),
+        "Sine steering at 25 km/h, tyres 1.2 times stiffer than the filters believe."),
+    figure("Fig. 9 (twin): body slip angle, estimators", FIG9,
         curves("beta", _BETA, _SHOWN, (8.0, 20.0)),
-        "The driver's sine while the car goes from 0 to 30 km/h; 12 of 30 s.",
-    ),
+        "The driver's sine while the car goes from 0 to 30 km/h; 12 of 30 s."),
 )

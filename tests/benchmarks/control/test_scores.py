@@ -6,13 +6,13 @@ from scipy.stats import mannwhitneyu, trim_mean
 
 from sideslip.benchmarks.control.scores import (
     Ceiling,
-    Estimate,
     Resampled,
     improvement,
     normalised,
 )
 from sideslip.benchmarks.control.seeds import salt_of, salted_seeds
 from sideslip.benchmarks.control.tables import _geometric
+from sideslip.benchmarks.harness.stats import Estimate
 
 TOP = Ceiling(1.0, 0.0)
 
