@@ -2,7 +2,6 @@
 best possible? On the papers' simulations tie-vision-fig7 and dakf-fig6."""
 
 import time
-import warnings
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,15 +13,14 @@ from rich.console import Console
 from .. import __version__
 from ..agents.rollout import Rollout, rollout
 from ..estimators.analysis.bound import bound
-from ..estimators.estimates import UnobservableWarning
-from ..estimators.make import make_estimator
-from .harness.parallel import run_cases
+from .harness.drives import SETTLED, facts_of
+from .harness.parallel import chunked, run_cases
 from .harness.results import Row, Suite, Table
-from .harness.stats import interval, ratio_of_roots, root_mean
+from .harness.stats import Estimate, interval, ratio_of_roots, root_mean
+from .papers.ledger.filters import Filter, filters_for
 
 Array = npt.NDArray[np.float64]
 
-SETTLED = 2.0  # s: errors count from here on
 SEEDS = 100
 QUICK_SEEDS = 10
 _CHUNK = 5
@@ -30,17 +28,18 @@ _CHUNK = 5
 
 @dataclass(frozen=True)
 class Experiment:
-    """A paper's simulation, the env that runs it and the estimators that have their sensors.
-
-    estimators: (label, name in make_estimator, options); the option "told": "truth" gives the
-    estimator the true vehicle instead of the nominal one.
-    """
+    """A paper's simulation, the env that runs it and the filters that have their sensors."""
 
     scenario: str
     env_id: str
     paper: str
     text: str
-    estimators: tuple[tuple[str, str, dict[str, Any]], ...]
+    filters: tuple[Filter, ...]
+
+
+def _filters(*names: str) -> tuple[Filter, ...]:
+    true = Filter("exact-kf, true model", "exact-kf", vehicle="true")
+    return (*(Filter(name, name) for name in (*names, "exact-kf")), true)
 
 
 EXPERIMENTS = (
@@ -48,16 +47,9 @@ EXPERIMENTS = (
         "tie-vision-fig7",
         "sideslip/YawVision-v0",
         "tie-vision Fig. 7",
-        "Sine steering at 25 km/h, tyres 1.2 times stiffer than the filters are told; camera every "
+        "Sine steering at 25 km/h, tyres 1.2 times stiffer than the filters believe; camera every "
         "33 ms, 30 ms late.",
-        (
-            ("bicycle-kf", "bicycle-kf", {}),
-            ("single-rate-kf", "single-rate-kf", {}),
-            ("multirate-kf", "multirate-kf", {}),
-            ("multirate-residual-kf", "multirate-residual-kf", {}),
-            ("exact-kf", "exact-kf", {}),
-            ("exact-kf, true model", "exact-kf", {"told": "truth"}),
-        ),
+        _filters("bicycle-kf", "single-rate-kf", "multirate-kf", "multirate-residual-kf"),
     ),
     Experiment(
         "dakf-fig6",
@@ -65,14 +57,7 @@ EXPERIMENTS = (
         "dakf-stability Fig. 6",
         "Lane change at 25 km/h with a side wind from 4 to 8 s and no GPS from 4 to 6 s; the "
         "filters believe in tyres 1.4 times stiffer than they are.",
-        (
-            ("bicycle-kf", "bicycle-kf", {}),
-            ("single-rate-kf", "single-rate-kf", {}),
-            ("course-kf", "course-kf", {}),
-            ("dakf", "dakf", {}),
-            ("exact-kf", "exact-kf", {}),
-            ("exact-kf, true model", "exact-kf", {"told": "truth"}),
-        ),
+        _filters("bicycle-kf", "single-rate-kf", "course-kf", "dakf"),
     ),
 )
 
@@ -87,12 +72,15 @@ class Seeds:
 
 @dataclass
 class Measured:
-    """Mean squared errors (seeds, estimators), of the bound (seeds,), CPU us per tick."""
+    """Mean squared errors (seeds, filters), of the bound (seeds,), CPU us per tick.
+
+    example: the drive of seed 0 and each filter's estimate of beta.
+    """
 
     squares: Array
     bound: Array
     cost: Array
-    example: tuple[Rollout, list[Array]] | None
+    example: tuple[Rollout, dict[str, Array]] | None
 
 
 def _env(experiment: Experiment) -> gym.Env[Any, Any]:
@@ -100,32 +88,25 @@ def _env(experiment: Experiment) -> gym.Env[Any, Any]:
 
 
 def measure(case: Seeds) -> Measured:
-    """Drive the seeds of a case once and run every estimator over the same records."""
+    """Drive the seeds of a case once and run every filter over the same records."""
     experiment = EXPERIMENTS[case.experiment]
     env = _env(experiment)
     base: Any = env.unwrapped
-    shape = (len(case.seeds), len(experiment.estimators))
+    shape = (len(case.seeds), len(experiment.filters))
     squares, cost, best = np.empty(shape), np.empty(shape), np.empty(len(case.seeds))
     example = None
     for i, seed in enumerate(case.seeds):
         drive = rollout(env, seed=seed)
         late = drive.log.time >= SETTLED - 1e-9
-        told = {"nominal": base.nominal, "truth": base.vehicle}
-        common = {"sensors": drive.log.slow, "dt": base.dt, "speed": base.held_speed}
-        traces = []
-        for j, (_, name, options) in enumerate(experiment.estimators):
-            rest = {key: value for key, value in options.items() if key != "told"}
-            vehicle = told[options.get("told", "nominal")]
-            with warnings.catch_warnings():  # what dakf cannot see is part of the result
-                warnings.simplefilter("ignore", UnobservableWarning)
-                estimator = make_estimator(name, vehicle=vehicle, **common, **rest)
+        traces = {}
+        for j, (label, estimator) in enumerate(filters_for(experiment.filters, base).items()):
             estimator.run(drive.log)  # gains are designed when they are first asked for
             start = time.process_time()
             estimates = estimator.run(drive.log)
             cost[i, j] = (time.process_time() - start) / len(late) * 1e6
-            traces.append(estimates.x[:, estimates.names.index("beta")])
-            squares[i, j] = np.mean((traces[-1] - drive.log.truth["beta"])[late] ** 2)
-        std = bound(base.vehicle, record=drive.log.record, **common)
+            traces[label] = estimates["beta"]
+            squares[i, j] = np.mean((traces[label] - drive.log.truth["beta"])[late] ** 2)
+        std = bound(record=drive.log.record, **facts_of(base) | {"vehicle": base.vehicle})
         best[i] = np.mean(std[late] ** 2)
         if seed == 0:
             example = (drive, traces)
@@ -134,11 +115,8 @@ def measure(case: Seeds) -> Measured:
 
 def run(seeds: int = SEEDS, jobs: int | None = None, console: Console | None = None) -> Suite:
     """Every estimator of both experiments on the seeds 0 .. seeds-1."""
-    cases = [
-        Seeds(e, tuple(range(first, min(first + _CHUNK, seeds))))
-        for e in range(len(EXPERIMENTS))
-        for first in range(0, seeds, _CHUNK)
-    ]
+    chunks = chunked(seeds, _CHUNK)
+    cases = [Seeds(e, chunk) for e in range(len(EXPERIMENTS)) for chunk in chunks]
     results = run_cases(measure, cases, "estimation", jobs, console)
     suite = Suite(
         "estimation",
@@ -146,7 +124,7 @@ def run(seeds: int = SEEDS, jobs: int | None = None, console: Console | None = N
         "Root mean square error of the sideslip angle from 2 s on. The bound is the standard "
         "deviation that the optimal filter of the true linear model has on the same arrivals, the "
         "wind included; no estimator can do better on average. exact-kf is exact about delays and "
-        "trusts its vehicle: told the true one it is the best, told the nominal one it has no "
+        "trusts its vehicle: with the true one it is the best, with the nominal one it has no "
         "process noise to doubt it with. tie-vision reports that its pseudo-residual filter is the "
         "best on Fig. 7 and the bicycle model the worst: the second is so among the tuned filters, "
         "the first is not. dakf-stability's order (DAKF before KF) holds on its Fig. 6. Intervals "
@@ -176,37 +154,21 @@ def _add(suite: Suite, experiment: Experiment, squares: Array, best: Array, cost
         "spec": spec,
         "paper": experiment.paper,
     }
-    lines = []
-    for j, (label, _, _) in enumerate(experiment.estimators):
-        value, low, high = interval(squares[:, j], root_mean)
-        over, over_low, over_high = interval(squares[:, j], ratio_of_roots, best)
+    lines = [(float(root_mean(best)), ["the bound", f"{1e3 * root_mean(best):.2f}", "", "1", ""])]
+    for j, filter_ in enumerate(experiment.filters):
+        error = interval(squares[:, j], root_mean)
+        over = interval(squares[:, j], ratio_of_roots, best)
+        us = float(cost[j])
         suite.rows += [
-            Row(metric="rmse", estimator=label, value=value, low=low, high=high, **common),
-            Row(
-                metric="rmse_over_bound",
-                estimator=label,
-                value=over,
-                low=over_low,
-                high=over_high,
-                **common,
-            ),
-            Row(metric="us_per_tick", estimator=label, value=float(cost[j]), **common),
-        ]
-        lines.append(
-            (
-                value,
-                [
-                    label,
-                    f"{1e3 * value:.2f}",
-                    f"{1e3 * low:.2f} .. {1e3 * high:.2f}",
-                    f"{over:.2f}",
-                    f"{cost[j]:.3f}",
-                ],
+            Row.of(metric, number, estimator=filter_.label, **common)
+            for metric, number in (
+                ("rmse", error),
+                ("rmse_over_bound", over),
+                ("us_per_tick", Estimate(us)),
             )
-        )
-    lines.append(
-        (float(root_mean(best)), ["the bound", f"{1e3 * root_mean(best):.2f}", "", "1", ""])
-    )
+        ]
+        texts = error.text(1e3, ".2f")
+        lines.append((error.value, [filter_.label, *texts, f"{over.value:.2f}", f"{us:.3f}"]))
     suite.tables.append(
         Table(
             f"{experiment.paper}: error of the sideslip angle ({len(squares)} seeds)",
@@ -223,49 +185,36 @@ def _draw(
     squares: Array,
     best: Array,
     drive: Rollout,
-    traces: list[Array],
+    traces: dict[str, Array],
 ) -> None:
     """Figures of one experiment; nothing where plotly is not installed."""
     try:
         from .report.figures import bars_with_interval, time_series
     except ModuleNotFoundError:
         return
-    labels = [label for label, _, _ in experiment.estimators]
-    spread = [interval(squares[:, j], root_mean) for j in range(len(labels))]
-    milli = 1e3 * np.array(spread)
+    limit = float(root_mean(best))
+    errors = [interval(column, root_mean) for column in squares.T] + [Estimate(limit, limit, limit)]
+    value, low, high = 1e3 * np.array(errors).T
+    bars = bars_with_interval(
+        [*traces, "the bound"], value, low, high, "RMSE of the sideslip angle / mrad"
+    )
     t, beta = drive.log.time, drive.log.truth["beta"]
-    paper = experiment.paper
+    estimates = {"truth": 1e3 * beta} | {label: 1e3 * x for label, x in traces.items()}
+    missed = {label: 1e3 * (x - beta) for label, x in traces.items()}
+    angle = "sideslip angle / mrad"
     suite.figures += [
-        (
-            f"{paper}: error of each estimator",
-            bars_with_interval(
-                [*labels, "the bound"],
-                [*milli[:, 0], 1e3 * float(root_mean(best))],
-                [*milli[:, 1], 1e3 * float(root_mean(best))],
-                [*milli[:, 2], 1e3 * float(root_mean(best))],
-                "RMSE of the sideslip angle / mrad",
+        (f"{experiment.paper}: {title}", figure, caption)
+        for title, figure, caption in (
+            ("error of each estimator", bars, experiment.text),
+            (
+                "the sideslip angle and its estimates (seed 0)",
+                time_series("", t, estimates, angle),
+                "The paper's figure, redrawn.",
             ),
-            experiment.text,
-        ),
-        (
-            f"{paper}: the sideslip angle and its estimates (seed 0)",
-            time_series(
-                "",
-                t,
-                {"truth": 1e3 * beta}
-                | {label: 1e3 * x for label, x in zip(labels, traces, strict=True)},
-                "sideslip angle / mrad",
+            (
+                "errors (seed 0)",
+                time_series("", t, missed, f"error of the {angle}"),
+                "Estimate minus truth.",
             ),
-            "The paper's figure, redrawn.",
-        ),
-        (
-            f"{paper}: errors (seed 0)",
-            time_series(
-                "",
-                t,
-                {label: 1e3 * (x - beta) for label, x in zip(labels, traces, strict=True)},
-                "error of the sideslip angle / mrad",
-            ),
-            "Estimate minus truth.",
-        ),
+        )
     ]

@@ -1,7 +1,6 @@
 """Question: what do steering and yaw moment do together? dakf-stability's bandwidth K, and lanes
 kept on curved roads from camera and gyro, the aim of uneven-delay."""
 
-import warnings
 from dataclasses import dataclass
 from itertools import islice
 from typing import Any
@@ -19,8 +18,8 @@ from ..envs.scenarios.manoeuvres import scenario_from
 from ..envs.ticks import TICK
 from ..envs.vehicle.dynamics import Motion
 from ..envs.vehicle.linear import LinearModel, bicycle
-from ..estimators.estimates import UnobservableWarning
 from ..estimators.vector.estimate import EstimateObservation
+from .harness.drives import quietly
 from .harness.parallel import run_cases
 from .harness.results import Row, Suite, Table
 from .harness.stats import interval
@@ -101,9 +100,7 @@ def keep_lane(keeper: int, cars: int) -> Array:
     """(cars, 3): largest offset from the lane's centre in m, RMS slip in rad, left the road."""
     _, estimator, moment = KEEPERS[keeper]
     env: Any = gym.make_vec(ROAD_ID, num_envs=cars, scenario=ROAD, steering=True)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UnobservableWarning)
-        env = EstimateObservation(env, estimator, outputs=_STATES, std=False)
+    env = quietly(EstimateObservation, env, estimator, outputs=_STATES, std=False)
     options = {} if moment is None else {"moment": moment}
     agent = make_agent("none" if moment is None else "lane-keeping", env, **options)
     base = env.unwrapped

@@ -1,6 +1,5 @@
 """A cell's cars: the vector env with its estimator, and the controller that drives them all."""
 
-import warnings
 from collections.abc import Mapping
 from typing import Any
 
@@ -13,9 +12,9 @@ from gymnasium.vector.utils import batch_space
 from ...agents import make_agent
 from ...agents.learned.files import is_policy, load_policy
 from ...envs.task.observation import Entry
-from ...estimators.estimates import UnobservableWarning
 from ...estimators.filters import FILTERS
 from ...estimators.vector.estimate import EstimateObservation
+from ..harness.drives import quietly
 from .cells import INFORMED, TRUTH, Cell
 
 _DISTURBANCES = {"forces": ("F_d", "N_d"), "walk": ("d1", "d2"), "walk-all": ("d1", "d2")}
@@ -36,23 +35,23 @@ class TrueState(VectorWrapper[Any, Any, Any, Any, Any]):
         self.single_observation_space = gym.spaces.Box(low, high, dtype=np.float32)
         self.observation_space = batch_space(self.single_observation_space, env.num_envs)
 
-    def _told(self, obs: Any, infos: Mapping[str, Any]) -> npt.NDArray[np.float32]:
+    def _joined(self, obs: Any, infos: Mapping[str, Any]) -> npt.NDArray[np.float32]:
         truth = np.stack([infos["beta"], infos["gamma"]], axis=1)
         return np.hstack([obs, np.clip(truth, [-np.pi, -20.0], [np.pi, 20.0])]).astype(np.float32)
 
     def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
         """Reset the rows and append their truth."""
         obs, infos = self.env.reset(seed=seed, options=options)
-        return self._told(obs, infos), infos
+        return self._joined(obs, infos), infos
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """One step of all rows, with their truth."""
         obs, rewards, terminated, truncated, infos = self.env.step(actions)
-        return self._told(obs, infos), rewards, terminated, truncated, infos
+        return self._joined(obs, infos), rewards, terminated, truncated, infos
 
 
 def outputs_for(estimator: str) -> tuple[str, ...]:
-    """What controllers are told of an estimate: beta, gamma, and disturbances if it has them."""
+    """The estimates that controllers read: beta, gamma, and disturbances if there are any."""
     row = FILTERS.get(estimator)  # a user's own has none
     return ("beta", "gamma", *_DISTURBANCES.get(row.disturbances if row else "", ()))
 
@@ -80,7 +79,5 @@ def make_contest(cell: Cell, cars: int) -> tuple[VectorEnv[Any, Any, Any], Any]:
     if cell.estimator == TRUTH:
         env = TrueState(env)
     elif cell.estimator:
-        with warnings.catch_warnings():  # what dakf cannot see is told elsewhere
-            warnings.simplefilter("ignore", UnobservableWarning)
-            env = EstimateObservation(env, cell.estimator, **estimate_options(cell))
+        env = quietly(EstimateObservation, env, cell.estimator, **estimate_options(cell))
     return env, make_agent(cell.controller, env, **agent_options)

@@ -4,14 +4,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 
 from ...agents import make_agent
 from ...agents.rollout import Rollout, rollout
 from ...envs.vehicle.vehicle import VEHICLES
-from ...estimators.wrappers.estimate import EstimateObservation
+from ..harness.drives import make_env
 from ..harness.explorer import Explorer, Panel
 from ..harness.results import Suite
 from ..report.colours import INK, colour
@@ -145,8 +144,7 @@ def over_time(
 
 def run_of(cell: Cell, seed: int) -> Rollout:
     """One episode of a contestant in a single env."""
-    options = {"scenario": cell.scenario, "on_bad_action": "fail"} | cell.options
-    env: gym.Env[Any, Any] = gym.make(cell.env_id, **options)
-    if cell.estimator:
-        env = EstimateObservation(env, cell.estimator, **estimate_options(cell))
+    estimate = estimate_options(cell) if cell.estimator else None
+    options = {"scenario": cell.scenario} | cell.options
+    env = make_env(cell.env_id, cell.estimator, estimate, **options)
     return rollout(env, make_agent(cell.controller, env), seed)

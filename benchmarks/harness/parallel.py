@@ -17,6 +17,17 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+def chunked(seeds: int, size: int) -> list[tuple[int, ...]]:
+    """The seeds 0 .. seeds-1 in tuples of at most `size`."""
+    return [tuple(range(k, min(k + size, seeds))) for k in range(0, seeds, size)]
+
+
+def progress(console: Console | None) -> Progress:
+    """A progress bar on a console, hidden without one."""
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
+    return Progress(*columns, TimeElapsedColumn(), console=console, disable=console is None)
+
+
 def run_cases(
     function: Callable[[Case], Result],
     cases: Sequence[Case],
@@ -30,14 +41,11 @@ def run_cases(
     this process. console: where the progress bar goes; None shows none.
     """
     jobs = min(jobs or cores(), len(cases))
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
-    with Progress(
-        *columns, TimeElapsedColumn(), console=console, disable=console is None
-    ) as progress:
-        task = progress.add_task(title, total=len(cases))
+    with progress(console) as bar:
+        task = bar.add_task(title, total=len(cases))
         results = []
         pool = joblib.Parallel(n_jobs=jobs, return_as="generator")
         for result in pool(joblib.delayed(function)(case) for case in cases):
             results.append(result)
-            progress.advance(task)
+            bar.advance(task)
     return results

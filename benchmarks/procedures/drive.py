@@ -17,7 +17,7 @@ from ...envs.scenarios.steering import STEERING_KINDS, STEERING_WIDTH, steering_
 from ...envs.ticks import TICK
 from ...envs.vehicle.dynamics import Motion
 from ...envs.vehicle.vehicle import Vehicle
-from ...estimators.wrappers.estimate import EstimateObservation
+from ..harness.drives import make_env
 
 Array = npt.NDArray[np.float64]
 Fields = Mapping[str, Any]
@@ -94,12 +94,7 @@ def of_env(
     """
 
     def drive(fields: Fields) -> Series:
-        scenario = CALM | dict(fields)
-        env: gym.Env[Any, Any] = gym.make(
-            env_id, scenario=scenario, on_bad_action="fail", **options
-        )
-        if estimator:
-            env = EstimateObservation(env, estimator)
+        env = make_env(env_id, estimator, scenario=CALM | dict(fields), **options)
         return _episode(env, make_agent(agent, env, **(agent_options or {})), seed)
 
     return drive

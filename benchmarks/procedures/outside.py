@@ -9,14 +9,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import gymnasium as gym
-
 from ...agents import make_agent
 from ...agents.rollout import rollout
 from ...envs.outside.plants import outside_vehicle
 from ...envs.vehicle.dynamics import Motion
 from ...envs.vehicle.vehicle import GRAVITY
-from ...estimators.wrappers.estimate import EstimateObservation
+from ..harness.drives import make_env
 from . import fmvss126
 from .contestants import OUTSIDE_ID, Contestant, outside_car
 from .drive import Law, of_plant
@@ -84,11 +82,8 @@ class Episode:
 
 def episodes(model: str, contestant: Contestant, seeds: Sequence[int]) -> list[Episode]:
     """A contestant on an outside plant."""
-    env: gym.Env[Any, Any] = gym.make(
-        OUTSIDE_ID, model=model, scenario=SCENARIO, reference="limited", on_bad_action="fail"
-    )
-    if contestant.estimator:
-        env = EstimateObservation(env, contestant.estimator)
+    options: dict[str, Any] = {"model": model, "scenario": SCENARIO, "reference": "limited"}
+    env = make_env(OUTSIDE_ID, contestant.estimator, **options)
     agent = make_agent(contestant.agent, env)
     driven = [rollout(env, agent, seed) for seed in seeds]
     return [Episode(d.cost, d.failed, float(abs(d["beta"]).max())) for d in driven]

@@ -11,8 +11,8 @@ from ...envs.record import PACKET, Record
 from ...estimators.estimator import Estimator
 from ...estimators.make import make_estimator
 from ...estimators.vector.make import make_batch
+from ..harness.drives import Drive, facts_of
 from ..harness.results import Row, Suite, Table
-from ..tuning.task import Drive, told_by
 from .filterpy_rival import OURS, Rival, four_states, six_states
 from .timing import Contestant, Effort, interleaved, ratios, spread
 
@@ -34,12 +34,12 @@ def drive(delay: float) -> Drive:
         "duration": TICKS * 1e-3,
     }
     env: gym.Env[Any, Any] = gym.make("sideslip/YawVision-v0", scenario=scenario, control_period=1)
-    return Drive(rollout(env).log, told_by(env.unwrapped))
+    return Drive(rollout(env).log, facts_of(env.unwrapped))
 
 
 def ours(name: str, drive: Drive, **options: Any) -> Estimator:
     """A filter of ours that computes its covariance as it goes."""
-    return make_estimator(name, **drive.told, gains="covariance", **OURS[name], **options)
+    return make_estimator(name, **drive.facts, gains="covariance", **OURS[name], **options)
 
 
 def _whole(estimator: Estimator, record: Record) -> Contestant:
@@ -74,7 +74,7 @@ def _single(estimator: Estimator, record: Record, checked: bool = True) -> Conte
 
 def _batch(name: str, drive: Drive) -> Contestant:
     """A control period of many filters a call, each with its own covariance."""
-    batch = make_batch(name, BATCH, gains="covariance", **drive.told, **OURS[name])
+    batch = make_batch(name, BATCH, gains="covariance", **drive.facts, **OURS[name])
     record = drive.log.record
     arrived = np.searchsorted(record.packets[:, PACKET.arrived], record.ticks[::BLOCK])
     blocks = []
@@ -92,14 +92,14 @@ def _batch(name: str, drive: Drive) -> Contestant:
 
 
 def _rival(kf: Any, drive: Drive, late: int = 0) -> Contestant:
-    rival, record = Rival(kf, drive.told["vehicle"], late), drive.log.record
+    rival, record = Rival(kf, drive.facts["vehicle"], late), drive.log.record
     return Contestant(lambda: rival.run(record), len(record.fast))
 
 
 def contestants() -> dict[str, tuple[Contestant, str]]:
     """Name to contestant and the FilterPy filter it is compared with; FilterPy's own first."""
     prompt, late = drive(0.0), drive(LATE)
-    car = (prompt.told["vehicle"], prompt.told["speed"], prompt.told["dt"])
+    car = (prompt.facts["vehicle"], prompt.facts["speed"], prompt.facts["dt"])
     multi = ours("multirate-kf", prompt)
     exact = ours("exact-kf", prompt)
     clone = ours("multirate-kf", late)

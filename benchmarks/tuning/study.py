@@ -15,11 +15,11 @@ from typing import Any
 
 import joblib
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from ..harness.parallel import cores
+from ..harness.drives import Drive
+from ..harness.parallel import cores, progress
 from ..harness.stats import root_mean
-from .task import SAMPLERS, STORAGE, Drive, Task, squares
+from .task import SAMPLERS, STORAGE, Task, squares
 
 try:
     import cmaes  # noqa: F401  Optuna imports it when it is too late
@@ -94,7 +94,7 @@ def search(
         path = str(Path(folder) / "drives")
         joblib.dump(list(drives), path)
         with (
-            _progress(console) as bar,
+            progress(console) as bar,
             joblib.Parallel(n_jobs=min(jobs or cores(), BATCH)) as pool,
         ):
             shown = bar.add_task(_best_text(study), total=trials, completed=len(done))
@@ -155,11 +155,6 @@ def _storage_errors(storage: str, *others: type[Exception]) -> Iterator[None]:
         cause = error.__cause__ or error
         reason = str(getattr(cause, "orig", None) or cause).strip().splitlines()[0]
         raise ValueError(f"the study's storage failed ({shown}): {reason}") from None
-
-
-def _progress(console: Console | None) -> Progress:
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
-    return Progress(*columns, TimeElapsedColumn(), console=console, disable=console is None)
 
 
 def _best_text(study: "optuna.Study") -> str:

@@ -12,9 +12,10 @@ import numpy as np
 from rich.console import Console
 
 from ...estimators.design.tunings import TUNINGS
+from ..harness.drives import Drive
 from ..harness.results import Suite, Table
 from ..harness.stats import interval, ratio_of_roots, root_mean
-from .task import SAMPLERS, STORAGE, Array, Drive, Task, simulate, squares
+from .task import SAMPLERS, STORAGE, Array, Task, simulate, squares
 
 _EDGE = 0.1  # decades: so close to an end of its range a number counts as being there
 

@@ -4,7 +4,6 @@ import dataclasses
 import hashlib
 import json
 import math
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -17,12 +16,11 @@ from rich.console import Console
 from ... import __version__
 from ...agents.rollout import rollout
 from ...envs.backend.cache import source_stamp
-from ...envs.record import Log
-from ...estimators.estimates import UnobservableWarning
 from ...estimators.estimator import Estimator
 from ...estimators.filters import FILTERS
 from ...estimators.make import ESTIMATORS, make_estimator
-from ..estimation import EXPERIMENTS, SETTLED
+from ..estimation import EXPERIMENTS
+from ..harness.drives import SETTLED, Drive, facts_of, quietly
 from ..harness.parallel import run_cases
 
 Array = npt.NDArray[np.float64]
@@ -33,14 +31,6 @@ NOISE_RANGE = (1e-5, 1.0)  # unit of the sensor
 SAMPLERS = ("cma", "tpe")
 STORAGE = "sqlite:///sideslip-tune.db"
 FIRST_SEED = 1000  # of training; the test seeds count from 0
-
-
-@dataclass(frozen=True)
-class Drive:
-    """An episode's log, and what an estimator is told about it (arguments of make_estimator)."""
-
-    log: Log
-    told: dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -93,7 +83,7 @@ def make_task(
         raise ValueError(f"seeds must be at least 1, got {seeds}")
     held = dict(options or {})
     ESTIMATORS.load(estimator)  # or ValueError
-    env_id, told, filter_ = _fitting(estimator, scenario, env_id, held)
+    env_id, facts, filter_ = _fitting(estimator, scenario, env_id, held)
     states = filter_.names
     if target not in states:
         raise ValueError(f"{estimator} has no {target}; a target is one of {', '.join(states)}")
@@ -105,7 +95,7 @@ def make_task(
         search = {
             f"q_{state}": None
             for state in states
-            if f"q_{state}" not in held and _takes(estimator, f"q_{state}", held, told)
+            if f"q_{state}" not in held and _takes(estimator, f"q_{state}", held, facts)
         }
     wished = {**search, **(noises or {})}
     if not wished:
@@ -113,8 +103,8 @@ def make_task(
     for option in wished:
         if option in held:
             raise ValueError(f"the option {option} is both held and searched")
-        if not _takes(estimator, option, held, told):
-            build(estimator, told, {**held, option: 1.0})  # says what it has
+        if not _takes(estimator, option, held, facts):
+            build(estimator, facts, {**held, option: 1.0})  # says what it has
     return Task(
         estimator,
         scenario,
@@ -135,11 +125,9 @@ def _range(option: str, limits: Range | None) -> Range:
     return float(low), float(high)
 
 
-def build(estimator: str, told: Mapping[str, Any], options: Mapping[str, Any]) -> Estimator:
-    """An estimator, without the warning of what it cannot see."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UnobservableWarning)
-        return make_estimator(estimator, **told, **options)
+def build(estimator: str, facts: Mapping[str, Any], options: Mapping[str, Any]) -> Estimator:
+    """An estimator of an env's facts, without the warning of what it cannot see."""
+    return quietly(make_estimator, estimator, **facts, **options)
 
 
 def _unstable(estimator: str) -> dict[str, bool]:
@@ -147,10 +135,10 @@ def _unstable(estimator: str) -> dict[str, bool]:
     return {"allow_unstable": True} if estimator in FILTERS else {}
 
 
-def _takes(estimator: str, option: str, held: Mapping[str, Any], told: Mapping[str, Any]) -> bool:
+def _takes(estimator: str, option: str, held: Mapping[str, Any], facts: Mapping[str, Any]) -> bool:
     """Whether the estimator has an option; whether the number suits is another matter."""
     try:
-        build(estimator, told, {**_unstable(estimator), **held, option: 1e-3})
+        build(estimator, facts, {**_unstable(estimator), **held, option: 1e-3})
     except TypeError:
         return False
     except ValueError:
@@ -169,30 +157,20 @@ def _fitting(
     for name in ids:
         env: gym.Env[Any, Any] = gym.make(name, scenario=scenario)
         env.reset(seed=FIRST_SEED)
-        told = told_by(env.unwrapped)
+        facts = facts_of(env.unwrapped)
         try:
-            return name, told, build(estimator, told, {**_unstable(estimator), **held})
+            return name, facts, build(estimator, facts, {**_unstable(estimator), **held})
         except ValueError as error:
             refused.setdefault(str(error), name)
     why = "; ".join(f"{name}: {text}" for text, name in refused.items())
     raise ValueError(f"no environment of {scenario} suits {estimator}: {why}")
 
 
-def told_by(base: Any) -> dict[str, Any]:
-    """What the environment tells estimators about the running episode."""
-    return {
-        "vehicle": base.nominal,
-        "sensors": base.slow_sensors,
-        "dt": base.dt,
-        "speed": base.held_speed,
-    }
-
-
 def drives_of(case: tuple[str, str, tuple[int, ...]]) -> list[Drive]:
     """The drives of (env id, scenario, seeds)."""
     env_id, scenario, seeds = case
     env: gym.Env[Any, Any] = gym.make(env_id, scenario=scenario, control_period=1)
-    return [Drive(rollout(env, seed=seed).log, told_by(env.unwrapped)) for seed in seeds]
+    return [Drive(rollout(env, seed=seed).log, facts_of(env.unwrapped)) for seed in seeds]
 
 
 def simulate(
@@ -212,11 +190,11 @@ def squares(task: Task, drives: Sequence[Drive], found: Mapping[str, float]) -> 
     """
     options, turn = task.options | dict(found), 2.0 * math.pi
     errors, filters = np.empty(len(drives)), dict[str, Estimator]()
-    for i, (log, told) in enumerate((drive.log, drive.told) for drive in drives):
-        clocks = [dataclasses.replace(sensor, phase=0.0) for sensor in told["sensors"].values()]
-        key = repr(told | {"sensors": clocks})  # a reset tells an estimator the clocks' phases
+    for i, (log, facts) in enumerate((drive.log, drive.facts) for drive in drives):
+        clocks = [dataclasses.replace(sensor, phase=0.0) for sensor in facts["sensors"].values()]
+        key = repr(facts | {"sensors": clocks})  # a reset tells an estimator the clocks' phases
         if key not in filters:
-            filters[key] = build(task.estimator, told, options)
+            filters[key] = build(task.estimator, facts, options)
         late = log.time >= SETTLED - 1e-9
         with np.errstate(all="ignore"):
             error = (filters[key].run(log)[task.target] - log.truth[task.target])[late]

@@ -15,7 +15,7 @@ def _ratio(squares: np.ndarray, of: int, to: int) -> float:
 def test_dakf_beats_the_kalman_filter() -> None:
     """dakf-stability: DAKF < KF, at most 0.75 of its error."""
     (measured,) = run_cases(estimation.measure, [estimation.Seeds(1, tuple(range(8)))], "", 1)
-    labels = [label for label, _, _ in estimation.EXPERIMENTS[1].estimators]
+    labels = [each.label for each in estimation.EXPERIMENTS[1].filters]
     assert _ratio(measured.squares, labels.index("dakf"), labels.index("course-kf")) <= 0.75
 
 
@@ -27,7 +27,7 @@ def test_exact_filter_of_the_true_model_is_at_the_bound() -> None:
     results = run_cases(estimation.measure, cases, "", None)
     squares = np.concatenate([each.squares for each in results])
     bound = np.sqrt(np.concatenate([each.bound for each in results]).mean())
-    labels = [label for label, _, _ in estimation.EXPERIMENTS[0].estimators]
+    labels = [each.label for each in estimation.EXPERIMENTS[0].filters]
     true = labels.index("exact-kf, true model")
     assert np.sqrt(squares[:, true].mean()) == pytest.approx(bound, rel=0.03)
     bicycle, multirate = labels.index("bicycle-kf"), labels.index("multirate-kf")

@@ -8,9 +8,10 @@ import numpy as np
 
 from ....agents import make_agent
 from ....agents.rollout import rollout
+from ...harness.parallel import chunked
 from . import lane_change, tracking
 from .claim import Array, Example, Measured
-from .simulations import FIRST, Numbers, chunked, rms, stacked
+from .simulations import FIRST, Numbers, rms, stacked
 
 SIGNALS = ("beta", "gamma", "steer", "yaw_moment")
 

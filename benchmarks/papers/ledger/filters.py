@@ -1,7 +1,6 @@
 """Filters over the same uncontrolled drives, and how far off they are."""
 
-import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,25 +10,35 @@ import numpy as np
 from ....agents.rollout import rollout
 from ....envs.record import PACKET, Log
 from ....envs.scenarios.manoeuvres import scenario_from
-from ....envs.vehicle.vehicle import Vehicle
 from ....estimators.analysis.bound import bound
-from ....estimators.estimates import UnobservableWarning
+from ....estimators.estimator import Estimator
 from ....estimators.make import make_estimator
+from ...harness.drives import SETTLED, facts_of, quietly
+from ...harness.parallel import chunked
 from .claim import Array, Example, Measured
-from .simulations import FIRST, Numbers, chunked, rms, stacked
-
-SETTLED = 2.0  # s: errors count from here on
+from .simulations import CHUNK, FIRST, Numbers, rms, stacked
 
 
 @dataclass(frozen=True)
 class Filter:
-    """label: its name in the ledger. name, options: of `make_estimator`. told: the "nominal"
-    vehicle or the "truth"."""
+    """label: its name in tables. name, options: of `make_estimator`. vehicle: the "nominal" one or
+    the "true" one, for which it is built."""
 
     label: str
     name: str
     options: Mapping[str, Any] = field(default_factory=dict)
-    told: str = "nominal"
+    vehicle: str = "nominal"
+
+
+def filters_for(filters: Sequence[Filter], base: Any) -> dict[str, Estimator]:
+    """The filters by label, built for the running episode of an env."""
+    cars, facts = {"nominal": base.nominal, "true": base.vehicle}, facts_of(base)
+    return {
+        each.label: quietly(
+            make_estimator, each.name, **facts | {"vehicle": cars[each.vehicle]}, **each.options
+        )
+        for each in filters
+    }
 
 
 @dataclass(frozen=True)
@@ -60,7 +69,7 @@ class Estimation:
 
     def chunks(self, seeds: int) -> list[tuple[int, ...]]:
         """The seeds of each case."""
-        return chunked(self.times * seeds)
+        return chunked(self.times * seeds, CHUNK)
 
     def measure(self, seeds: tuple[int, ...]) -> Measured:
         """Drive each seed once and run every filter over its record."""
@@ -68,25 +77,22 @@ class Estimation:
             self.env_id, scenario=self.scenario, control_period=self.control_period
         )
         base: Any = env.unwrapped
-        estimators: dict[str, Any] = {}
+        estimators: dict[str, Estimator] = {}
         lines, example = [], None
         for seed in seeds:
             drive = rollout(env, seed=seed)
             if drive.failed:
                 raise RuntimeError(f"{self.name}: the car of seed {seed} failed without control")
             truth = drive.log.truth
-            told = {"nominal": base.nominal, "truth": base.vehicle}
-            common = {"sensors": drive.log.slow, "dt": base.dt, "speed": base.held_speed}
             numbers: Numbers = {("truth", "beta"): _settled_rms(truth["beta"], drive.log)}
             curves = {"truth": truth}
-            for each in self.filters:
-                if each.label not in estimators:
-                    estimators[each.label] = _built(each, told[each.told], common)
-                estimates = estimators[each.label].run(drive.log)
-                curves[each.label] = {name: estimates[name] for name in estimates.names}
-                numbers |= _errors(each.label, curves[each.label], truth, drive.log, base.scenario)
+            estimators = estimators or filters_for(self.filters, base)
+            for label, estimator in estimators.items():
+                estimates = estimator.run(drive.log)
+                curves[label] = {name: estimates[name] for name in estimates.names}
+                numbers |= _errors(label, curves[label], truth, drive.log, base.scenario)
             if self.bound:
-                std = bound(base.vehicle, record=drive.log.record, **common)
+                std = bound(record=drive.log.record, **facts_of(base) | {"vehicle": base.vehicle})
                 numbers["bound", "beta"] = _settled_rms(std, drive.log)
             lines.append(numbers)
             if seed == FIRST:
@@ -94,12 +100,6 @@ class Estimation:
                 packets = {sensor: record.packets_of(sensor) for sensor in drive.log.slow}
                 example = Example(drive.log.time, curves, packets)
         return Measured(stacked(lines), example)
-
-
-def _built(each: Filter, vehicle: Vehicle, common: Mapping[str, Any]) -> Any:
-    with warnings.catch_warnings():  # what dakf cannot see is a claim of its own
-        warnings.simplefilter("ignore", UnobservableWarning)
-        return make_estimator(each.name, vehicle=vehicle, **common, **each.options)
 
 
 def _settled_rms(values: Array, log: Log) -> float:

@@ -1,4 +1,4 @@
-"""tie-vision Fig. 8: who drives the lane change, each with an estimator told its camera's noise."""
+"""tie-vision Fig. 8: the drivers of the lane change, each with a filter of its camera's noise."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -6,7 +6,7 @@ from typing import Any
 import gymnasium as gym
 
 from ....envs.scenarios.manoeuvres import scenario_from
-from ....estimators.wrappers.estimate import EstimateObservation
+from ...harness import drives
 
 ENV_ID = "sideslip/YawVision-v0"
 
@@ -28,20 +28,17 @@ CONTESTANTS = (
     Contestant("multirate", "two-dof", "multirate-kf", "control"),
     Contestant("multirate-residual", "two-dof", "multirate-residual-kf", "control"),
 )
-_TOLD = {"camera_psi": "psi_noise", "camera_y": "y_l_noise"}
+_OPTIONS = {"camera_psi": "psi_noise", "camera_y": "y_l_noise"}
 
 
-def told_noise(scenario: str) -> dict[str, float]:
+def camera_noise(scenario: str) -> dict[str, float]:
     """The scenario's camera noise as options of an estimator: a filter knows its sensors."""
     noise = scenario_from(scenario).noise
-    return {told: noise[name] for name, told in _TOLD.items() if name in noise}
+    return {option: noise[name] for name, option in _OPTIONS.items() if name in noise}
 
 
 def make_env(scenario: str, contestant: Contestant) -> gym.Env[Any, Any]:
     """The env of a contestant: 1 ms control, its estimator in front."""
-    env: gym.Env[Any, Any] = gym.make(
-        ENV_ID, scenario=scenario, control_period=1, on_bad_action="fail"
-    )
-    if contestant.estimator:
-        env = EstimateObservation(env, contestant.estimator, options=told_noise(scenario))
-    return env
+    estimate = {"options": camera_noise(scenario)}
+    options: dict[str, Any] = {"scenario": scenario, "control_period": 1}
+    return drives.make_env(ENV_ID, contestant.estimator, estimate, **options)

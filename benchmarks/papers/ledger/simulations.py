@@ -12,6 +12,7 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
+from ...harness.parallel import chunked
 from .claim import Array, Measured
 
 FIRST = 0  # the seed of the figures
@@ -45,7 +46,7 @@ class Analysis:
 
     def chunks(self, seeds: int) -> list[tuple[int, ...]]:
         """The seeds of each case."""
-        return chunked(seeds if self.random else 1)
+        return chunked(seeds if self.random else 1, CHUNK)
 
     def measure(self, seeds: tuple[int, ...]) -> Measured:
         """What the function gives."""
@@ -55,11 +56,6 @@ class Analysis:
 def rms(values: npt.ArrayLike) -> float:
     """The root of the mean square."""
     return float(np.sqrt(np.mean(np.square(values))))
-
-
-def chunked(seeds: int, size: int = CHUNK) -> list[tuple[int, ...]]:
-    """The seeds 0 .. seeds-1 in tuples of at most some."""
-    return [tuple(range(k, min(k + size, seeds))) for k in range(0, seeds, size)]
 
 
 def stacked(lines: list[Numbers]) -> dict[tuple[str, str], Array]:

@@ -1,19 +1,17 @@
 """dakf-stability Fig. 7: do steering and yaw moment make the car follow its reference model?"""
 
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 
 from ....agents import make_agent
 from ....agents.rollout import Rollout, rollout
 from ....envs.scenarios.scenario import Scenario
-from ....estimators.estimates import UnobservableWarning
-from ....estimators.wrappers.estimate import EstimateObservation
+from ...harness.drives import make_env
+from .simulations import rms
 
 Array = npt.NDArray[np.float64]
 Manoeuvre = str | Mapping[str, Any] | Scenario
@@ -51,25 +49,17 @@ def drive(
     agent: "none" is the steer-by-wire car without control. options: of the agent (`bandwidth`,
     `rejection`).
     """
-    env: gym.Env[Any, Any] = gym.make(
-        ENV_ID, scenario=scenario, control_period=1, on_bad_action="fail"
-    )
-    with warnings.catch_warnings():  # what dakf cannot see is a claim of its own
-        warnings.simplefilter("ignore", UnobservableWarning)
-        env = EstimateObservation(env, estimator, outputs=STATES, options={"slow": "gps"})
+    estimate = {"outputs": STATES, "options": {"slow": "gps"}}
+    env = make_env(ENV_ID, estimator, estimate, scenario=scenario, control_period=1)
     return rollout(env, make_agent(agent, env, **options), seed)
-
-
-def _rms(error: Array) -> float:
-    return float(np.sqrt(np.mean(error**2)))
 
 
 def tracking(episode: Rollout) -> Tracking:
     """The numbers of an episode of `drive`."""
     moment, steering = np.abs(episode["action_0"]), np.abs(episode["action_1"])
     return Tracking(
-        rms_beta=_rms(episode["beta"] - episode["beta_ref"]),
-        rms_gamma=_rms(episode["gamma"] - episode["gamma_ref"]),
+        rms_beta=rms(episode["beta"] - episode["beta_ref"]),
+        rms_gamma=rms(episode["gamma"] - episode["gamma_ref"]),
         peak_beta=float(np.abs(episode["beta"]).max()),
         saturated=float(np.mean(moment >= 1.0)),
         steered=float(steering.max()),

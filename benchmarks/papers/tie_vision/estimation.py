@@ -31,7 +31,7 @@ SIMULATIONS = (
     Estimation(FIG7, "sideslip/YawVision-v0", FIG7,
         (*_PAPERS_OWN, Filter(NO_DELAY, MULTI, {"delay": "ignore"}),
             Filter(RETUNED, MULTI, {"delay": "ignore", **_FOR_NO_DELAY}),
-            Filter(EXACT, "exact-kf", told="truth")),
+            Filter(EXACT, "exact-kf", vehicle="true")),
         bound=True, times=5),
     Estimation(FIG9, "sideslip/YawVision-v0", FIG9, _PAPERS_OWN),
 )

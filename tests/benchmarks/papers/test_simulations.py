@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from sideslip.agents.rollout import rollout
+from sideslip.benchmarks.harness.drives import SETTLED
+from sideslip.benchmarks.harness.parallel import chunked
 from sideslip.benchmarks.papers.ledger.controllers import Following, Slip
-from sideslip.benchmarks.papers.ledger.filters import SETTLED, Estimation, Filter
-from sideslip.benchmarks.papers.ledger.simulations import chunked
+from sideslip.benchmarks.papers.ledger.filters import Estimation, Filter
 from sideslip.estimators import make_estimator
 
 VISION = "sideslip/YawVision-v0"
@@ -17,7 +18,7 @@ SHORT: dict[str, Any] = {"base": "tie-vision-fig7", "name": "short", "duration":
 
 
 def test_numbers_of_an_estimation_are_those_of_its_drives() -> None:
-    filters = (Filter("a", "multirate-kf"), Filter("b", "bicycle-kf", told="truth"))
+    filters = (Filter("a", "multirate-kf"), Filter("b", "bicycle-kf", vehicle="true"))
     found = Estimation("short", VISION, SHORT, filters, bound=True).measure((3, 5))
     env = gym.make(VISION, scenario=SHORT, control_period=10)
     base: Any = env.unwrapped

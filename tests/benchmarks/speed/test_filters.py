@@ -28,8 +28,8 @@ def test_filterpy_and_ours_give_the_same_estimates(name: str, states: object, de
     pytest.importorskip("filterpy")
     drive = filters.drive(delay)
     assert len(drive.log.record.packets) >= 8
-    car = drive.told["vehicle"]
-    kf = states(car, drive.told["speed"], drive.told["dt"])  # type: ignore[operator]
+    car = drive.facts["vehicle"]
+    kf = states(car, drive.facts["speed"], drive.facts["dt"])  # type: ignore[operator]
     theirs = Rival(kf, car, round(delay * 1e3)).run(drive.log.record)
     ours = filters.ours(name, drive).run(drive.log)
     scale = np.abs(ours.x).max(axis=0)

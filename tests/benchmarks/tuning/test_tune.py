@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sideslip.benchmarks.harness.drives import Drive
 from sideslip.benchmarks.tuning import file as tune_file
 from sideslip.benchmarks.tuning import study as tune_study
 from sideslip.benchmarks.tuning import suite as tune
 from sideslip.benchmarks.tuning import task as tune_task
-from sideslip.benchmarks.tuning.task import Drive, Task
+from sideslip.benchmarks.tuning.task import Task
 from sideslip.estimators import make_estimator
 from sideslip.estimators.design import tunings
 
@@ -42,7 +43,7 @@ def tried(task: Task, url: str) -> list[Any]:
 def test_error_is_the_mean_square_from_two_seconds_on(task: Task, drives: list[Drive]) -> None:
     found = {"q_beta": 1e-3, "q_gamma": 1e-2}
     for i, drive in enumerate(drives):
-        filter_ = make_estimator("bicycle-kf", **(drive.told | found))
+        filter_ = make_estimator("bicycle-kf", **(drive.facts | found))
         error = filter_.run(drive.log)["beta"] - drive.log.truth["beta"]
         wanted = np.mean(error[drive.log.time > 1.9995] ** 2)
         assert tune_task.squares(task, drives, found)[i] == pytest.approx(wanted, rel=1e-12)
@@ -52,7 +53,7 @@ def test_angles_are_compared_on_the_circle(task: Task, drives: list[Drive]) -> N
     log = drives[0].log
     turned = dataclasses.replace(log, truth={"beta": log.truth["beta"] + 4.0 * np.pi})
     there, back = (
-        tune_task.squares(task, [Drive(each, drives[0].told)], {}) for each in (log, turned)
+        tune_task.squares(task, [Drive(each, drives[0].facts)], {}) for each in (log, turned)
     )
     assert back == pytest.approx(there, rel=1e-9)
 
@@ -129,7 +130,7 @@ def test_a_diverging_filter_is_infinitely_wrong_and_says_why(tmp_path: Path) -> 
         seeds=1,
     )
     (drive,) = tune_task.simulate(task, task.seeds, "", 1, None)
-    fast = [Drive(drive.log, drive.told | {"speed": 40.0})]
+    fast = [Drive(drive.log, drive.facts | {"speed": 40.0})]
     study = tune_study.open_study(task, storage(tmp_path))
     with pytest.raises(ValueError, match="its error grows by a factor"):
         tune_study.search(study, task, fast, 3, 1)
