@@ -22,7 +22,7 @@ from ..estimators.vector.estimate import EstimateObservation
 from .harness.drives import quietly
 from .harness.parallel import run_cases
 from .harness.results import Row, Suite, Table
-from .harness.stats import interval
+from .harness.stats import Estimate, interval
 from .papers.ledger.tracking import drive, tracking
 
 Array = npt.NDArray[np.float64]
@@ -119,11 +119,7 @@ def run(
     seeds: int = SEEDS, cars: int = CARS, jobs: int | None = None, console: Console | None = None
 ) -> Suite:
     """Both questions; seeds of the step, cars on the road."""
-    suite = Suite(
-        "following",
-        "What steering and yaw moment do together",
-        _TEXT,
-    )
+    suite = Suite("following", "What steering and yaw moment do together", _TEXT)
     cases = [Case(K, seed) for K in (0.0, *BANDWIDTHS) for seed in range(seeds)]
     found = np.array(run_cases(follow, cases, "bandwidth", jobs, console))
     _bandwidths(suite, found.reshape(len(BANDWIDTHS) + 1, seeds, -1))
@@ -136,26 +132,27 @@ def _keeper(case: tuple[int, int]) -> Array:
     return keep_lane(*case)
 
 
+_COLUMNS = {  # what `follow` gives, and what the figure calls it
+    "error of beta / without control": "ratio",
+    "error of the yaw rate / without control": "ratio",
+    "share of time at the motors' limit": "saturation",
+    "share of runs that fail": "share",
+}
+
+
 def _bandwidths(suite: Suite, found: Array) -> None:
     """found: (none and every bandwidth, seeds, numbers of `follow`)."""
-    none = found[0].mean(axis=0)
+    none, seeds = found[0].mean(axis=0), found.shape[1]
+    shares = found[1:] / np.where([True, True, False, False], none, 1.0)
+    numbers = [[interval(column) for column in at_K.T] for at_K in shares]
     radius = np.array([loop_radius(STEP, K) for K in BANDWIDTHS])
-    lines: dict[str, list[tuple[float, float, float]]] = {
-        "error of beta / without control": [],
-        "error of the yaw rate / without control": [],
-        "share of time at the motors' limit": [],
-        "share of runs that fail": [],
-    }
     cells = []
-    for K, numbers, r in zip(BANDWIDTHS, found[1:], radius, strict=True):
-        numbers = numbers / np.where([True, True, False, False], none, 1.0)
-        spread = [interval(column) for column in numbers.T]
-        for name, each in zip(lines, spread, strict=True):
-            lines[name].append(each)
-        cells.append([f"{K:.0f}", *(f"{value:.3f}" for value, _, _ in spread), f"{r:.5f}"])
-        for metric, each in zip(("ratio", "ratio", "saturation", "share"), spread, strict=True):
-            suite.rows.append(_row(f"{STEP}, K = {K:.0f} rad/s", metric, each, found.shape[1]))
-        suite.rows.append(_row(f"{STEP}, K = {K:.0f} rad/s", "spectral_radius", (r, r, r), 1))
+    for K, spread, r in zip(BANDWIDTHS, numbers, radius.tolist(), strict=True):
+        cells.append([f"{K:.0f}", *(f"{each.value:.3f}" for each in spread), f"{r:.5f}"])
+        scenario = f"{STEP}, K = {K:.0f} rad/s"
+        for metric, each in zip(_COLUMNS.values(), spread, strict=True):
+            suite.rows.append(_row(scenario, metric, each, seeds))
+        suite.rows.append(_row(scenario, "spectral_radius", Estimate(r, r, r), 1))
     header = ("K / (rad/s)", "beta", "yaw rate", "saturated", "failed", "radius")
     note = "Errors over those without control; shares of time and of runs."
     suite.tables.append(Table("The bandwidth K", header, cells, note, keyed=False))
@@ -163,31 +160,20 @@ def _bandwidths(suite: Suite, found: Array) -> None:
         from .report.heat_maps import curves
     except ModuleNotFoundError:
         return
-    shown = {name: _columns(each) for name, each in lines.items()}
-    shown["spectral radius of the loop"] = (radius, radius, radius)
-    figure = curves(np.array(BANDWIDTHS), shown, "K / (rad/s)", "ratio or share", log=True)
+    columns = np.array(numbers).transpose(1, 2, 0)  # (column, value low high, K)
+    lines = {name: tuple(column) for name, column in zip(_COLUMNS, columns, strict=True)}
+    lines["spectral radius of the loop"] = (radius, radius, radius)
+    figure = curves(np.array(BANDWIDTHS), lines, "K / (rad/s)", "ratio or share", log=True)
     caption = "Tracking, saturation and stability against the bandwidth; whiskers 95 % over seeds."
     suite.figures.append(("dakf-stability V.D: the bandwidth K", figure, caption))
-
-
-def _columns(each: list[tuple[float, float, float]]) -> tuple[Array, Array, Array]:
-    value, low, high = np.array(each).T
-    return value, low, high
 
 
 def _lanes(suite: Suite, lanes: list[Array]) -> None:
     cells = []
     for (what, estimator, _), numbers in zip(KEEPERS, lanes, strict=True):
         most, slip, left = (interval(column) for column in numbers.T)
-        cells.append(
-            [
-                f"{what} on {estimator}" if what != "none" else what,
-                f"{most[0]:.3f}",
-                f"{most[1]:.3f} .. {most[2]:.3f}",
-                f"{1e3 * slip[0]:.1f}",
-                f"{100.0 * left[0]:.1f}",
-            ]
-        )
+        label = f"{what} on {estimator}" if what != "none" else what
+        cells.append([label, *most.text(), f"{1e3 * slip.value:.1f}", f"{100.0 * left.value:.1f}"])
         for metric, each in (("offset", most), ("rms_slip", slip), ("departure_rate", left)):
             suite.rows.append(_row(ROAD, metric, each, len(numbers), estimator, what))
     header = ("controller", "largest offset / m", "95 % interval", "RMS slip / mrad", "left / %")
@@ -198,22 +184,11 @@ def _lanes(suite: Suite, lanes: list[Array]) -> None:
 def _row(
     scenario: str,
     metric: str,
-    each: tuple[float, float, float],
+    number: Estimate,
     n: int,
     estimator: str = "dakf",
     controller: str = "model-following",
 ) -> Row:
-    value, low, high = each
-    return Row(
-        "following",
-        scenario,
-        metric,
-        value,
-        estimator=estimator,
-        controller=controller,
-        low=low,
-        high=high,
-        n=n,
-        salt="fixed",
-        env_version=__version__,
-    )
+    who = {"estimator": estimator, "controller": controller}
+    common = {"suite": "following", "salt": "fixed", "env_version": __version__}
+    return Row.of(metric, number, scenario=scenario, n=n, **who, **common)

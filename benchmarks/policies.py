@@ -29,8 +29,8 @@ CLASSICAL = "lqr"
 class Enjoyed:
     """The contestants' episodes on the same seeds: the policy's first.
 
-    salt: of the seeds, "" where they were given. reference: of the env. driven: by contestant.
-    left_out: why a contestant is not among them.
+    salt: of the seeds, "" where the caller chose them. reference: of the env. driven: by
+    contestant. left_out: why a contestant is not among them.
     """
 
     policy: Policy
@@ -143,47 +143,36 @@ def suite_of(found: Enjoyed) -> Suite:
 
 def _table(found: Enjoyed) -> Table:
     first = found.policy.name
-    own, none = found.costs(first), found.costs("none")
-    header = (
-        "controller",
-        "cost",
-        "95 % interval",
-        "of none",
-        "better",
-        "RMS slip",
-        "step",
-        "fails",
-    )
+    own, none = found.costs(first), found.costs("none").mean()
     cells = []
-    for name in found.driven:
-        costs = found.costs(name)
-        cost, low, high = interval(costs)
+    for name, driven in found.driven.items():
+        cost = interval(driven.costs)
+        better = f"{100.0 * improvement(own, driven.costs):.0f} %"
         cells.append(
             [
                 name,
-                f"{cost:.3f}",
-                f"{low:.3f} .. {high:.3f}",
-                f"{100.0 * cost / none.mean():.1f} %",
-                "" if name == first else f"{100.0 * improvement(own, costs):.0f} %",
-                f"{1e3 * found.driven[name]['rms_slip'].mean():.2f}",
-                f"{found.driven[name]['largest_step'].mean():.0f}",
-                f"{100.0 * np.mean(found.driven[name]['failure'] != 0.0):.1f} %",
+                *cost.text(),
+                f"{100.0 * cost.value / none:.1f} %",
+                "" if name == first else better,
+                f"{1e3 * driven['rms_slip'].mean():.2f}",
+                f"{driven['largest_step'].mean():.0f}",
+                f"{100.0 * np.mean(driven['failure'] != 0.0):.1f} %",
             ]
         )
+    header = ("cost", "95 % interval", "of none", "better", "RMS slip", "step", "fails")
     note = (
         "Mean cost of an episode. of none: share of the uncontrolled car's. better: probability "
         f"that an episode of {first} costs less than one of this one. Slip in mrad. step: "
         "the largest between two decisions, in N m."
     )
     left_out = [f"{name} was not driven: {error}." for name, error in found.left_out.items()]
-    return Table("What it costs", header, cells, " ".join([note, *left_out]))
+    return Table("What it costs", ("controller", *header), cells, " ".join([note, *left_out]))
 
 
 def _rows(found: Enjoyed) -> list[Row]:
     rows = []
-    for name, cell in found.cells.items():
-        if name not in found.driven:
-            continue
+    for name, driven in found.driven.items():
+        cell = found.cells[name]
         common: dict[str, Any] = {
             "suite": "enjoy",
             "scenario": cell.scenario,
@@ -195,6 +184,5 @@ def _rows(found: Enjoyed) -> list[Row]:
             "spec": spec_of(cell),
         }
         for metric in ("cost", "rms_slip", "peak_slip", "effort", "largest_step"):
-            value, low, high = interval(found.driven[name][metric])
-            rows.append(Row(metric=metric, value=value, low=low, high=high, **common))
+            rows.append(Row.of(metric, interval(driven[metric]), **common))
     return rows

@@ -2,7 +2,9 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 
@@ -10,8 +12,8 @@ from .harness.results import Suite
 
 
 @dataclass(frozen=True)
-class Wish:
-    """How a suite shall be run.
+class Request:
+    """How to run a suite.
 
     quick: few seeds. jobs: processes, None for all processors. episodes: of a cell of the matrix,
     None for the suite's own number. keep: a folder for finished cases.
@@ -24,55 +26,37 @@ class Wish:
     keep: Path | None = None
 
 
-def _estimation(wish: Wish) -> Suite:
-    from . import estimation
-
-    seeds = estimation.QUICK_SEEDS if wish.quick else estimation.SEEDS
-    return estimation.run(seeds, wish.jobs, console=wish.console)
+_Run = Callable[[Any, Request], Suite]
 
 
-def _control(wish: Wish) -> Suite:
-    from .control import suite as control
+def _seeds(suite: Any, r: Request) -> Any:
+    return suite.run(suite.QUICK_SEEDS if r.quick else suite.SEEDS, r.jobs, r.console)
+
+
+def _control(suite: Any, r: Request) -> Any:
     from .control.cells import EPISODES, QUICK_EPISODES
 
-    usual = QUICK_EPISODES if wish.quick else EPISODES
-    return control.run(wish.episodes or usual, wish.jobs, wish.console, wish.keep)
+    usual = QUICK_EPISODES if r.quick else EPISODES
+    return suite.run(r.episodes or usual, r.jobs, r.console, r.keep)
 
 
-def _papers(wish: Wish) -> Suite:
-    from .papers import suite as papers
-
-    seeds = papers.QUICK_SEEDS if wish.quick else papers.SEEDS
-    return papers.run(seeds, wish.jobs, console=wish.console)
+def _following(suite: Any, r: Request) -> Any:
+    numbers = (suite.QUICK_SEEDS, suite.QUICK_CARS) if r.quick else (suite.SEEDS, suite.CARS)
+    return suite.run(*numbers, r.jobs, r.console)
 
 
-def _following(wish: Wish) -> Suite:
-    from . import following
-
-    if wish.quick:
-        return following.run(
-            following.QUICK_SEEDS, following.QUICK_CARS, wish.jobs, console=wish.console
-        )
-    return following.run(jobs=wish.jobs, console=wish.console)
-
-
-def _procedures(wish: Wish) -> Suite:
-    from .procedures import suite
-
-    return suite.run(wish.quick, wish.jobs, console=wish.console)
-
-
-def _speed(wish: Wish) -> Suite:
-    from .speed import suite
-
-    return suite.run(wish.quick, wish.console)
-
-
-SUITES: dict[str, Callable[[Wish], Suite]] = {
-    "estimation": _estimation,
-    "control": _control,
-    "papers": _papers,
-    "following": _following,
-    "procedures": _procedures,
-    "speed": _speed,
+SUITES: dict[str, tuple[str, _Run]] = {
+    "estimation": (".estimation", _seeds),
+    "control": (".control.suite", _control),
+    "papers": (".papers.suite", _seeds),
+    "following": (".following", _following),
+    "procedures": (".procedures.suite", lambda suite, r: suite.run(r.quick, r.jobs, r.console)),
+    "speed": (".speed.suite", lambda suite, r: suite.run(r.quick, r.console)),
 }
+"""The module of each suite, and how a request runs it."""
+
+
+def run_suite(name: str, request: Request) -> Suite:
+    """Run a suite of `SUITES`."""
+    module, run = SUITES[name]
+    return run(import_module(module, __package__), request)

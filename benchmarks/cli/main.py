@@ -11,7 +11,7 @@ from rich.markup import escape
 
 from ... import __version__
 from ..harness.results import check_writable
-from ..suites import SUITES, Wish
+from ..suites import SUITES, Request, run_suite
 from .calibrate import calibrate_command
 from .enjoy import enjoy_command
 from .output import give, show_episode
@@ -147,8 +147,8 @@ def bench(
         from ..recorded.suite import replay_file
 
         done.append(replay_file(log, vehicle, mapping=mapping))
-    wish = Wish(quick, jobs, console, episodes, keep)
-    done += [SUITES[name](wish) for name in names]
+    request = Request(quick, jobs, console, episodes, keep)
+    done += [run_suite(name, request) for name in names]
     order = [*names, "replay"]
     done.sort(key=lambda suite: order.index(suite.name))
     give(console, done, html, json, parquet)
