@@ -12,7 +12,8 @@ from gymnasium.envs.registration import EnvSpec
 
 from sideslip.agents import make_agent
 from sideslip.agents.rollout import rollout
-from sideslip.benchmarks.tuning.task import Drive, make_task, squares, told_by
+from sideslip.benchmarks.harness.drives import Drive, facts_of
+from sideslip.benchmarks.tuning.task import make_task, squares
 from sideslip.envs import COMS
 from sideslip.estimators import (
     EstimateObservation,
@@ -314,7 +315,7 @@ def test_it_can_be_tuned() -> None:
     assert (task.unit, task.env_id) == ("rad", VISION)
     log = rollout(gym.make(VISION, **FIG7), seed=3, options={"duration": 2.2}).log
     base: Any = gym.make(VISION, **FIG7).unwrapped
-    drives = [Drive(log, told_by(base))]
+    drives = [Drive(log, facts_of(base))]
     assert squares(task, drives, {"gyro": 0.005}) < squares(task, drives, {"gyro": 1.0})
     with pytest.raises(ValueError, match="has no process noise to search; say which options"):
         make_task(UKF, "tie-vision-fig7", seeds=1)
