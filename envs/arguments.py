@@ -1,8 +1,9 @@
-"""What environments are given, one or as an array or list of rows; refused where it is not."""
+"""Arguments of environments, for one or for rows, checked; and how messages write them."""
 
 import operator
 import reprlib
-from collections.abc import Mapping, Sequence
+import textwrap
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,17 +13,60 @@ from gymnasium.vector import AutoresetMode
 Mask = npt.NDArray[np.bool_]
 Actions = npt.NDArray[np.float32]
 NAMED = 8  # rows that a message lists
+LARGEST = 1e12
+"""The largest number of a scenario or a vehicle: its ticks and its square are numbers still."""
 _NO_NUMBERS = (TypeError, ValueError, OverflowError)  # what numpy raises where it finds none
 
 _FLOAT32 = np.dtype(np.float32)
+_REPR = reprlib.Repr()
+_REPR.maxstring = _REPR.maxother = 80
+
+
+def brief(value: object) -> str:
+    """A value in a message, short however long it is."""
+    try:
+        return _REPR.repr(value)
+    except Exception:  # what cannot be written: an integer of thousands of digits
+        return f"<{type(value).__name__}>"
+
+
+def listed(names: Iterable[str]) -> str:
+    """Names in a message, the first of them where they are many."""
+    return textwrap.shorten(", ".join(names), 250, placeholder=" ...")
+
+
+def is_finite(value: Any) -> bool:
+    """Whether a value is a number, and no larger than LARGEST; True and False are none."""
+    number = isinstance(value, int | float | np.integer | np.floating)
+    return number and not isinstance(value, bool) and bool(abs(value) <= LARGEST)
+
+
+def number_of(name: str, value: Any) -> float:
+    """A finite number as a float; ValueError, with its name, for another value."""
+    if not is_finite(value):
+        raise ValueError(f"{name} {brief(value)} is no finite number")
+    return float(value)
+
+
+def mapping_of(name: str, value: Any) -> Mapping[str, Any]:
+    """A mapping; TypeError, with its name, for another value."""
+    if not isinstance(value, Mapping):
+        raise TypeError(f"{name} is a mapping, got {brief(value)}")
+    return value
+
+
+def check_choice(what: str, value: Any, known: Iterable[str]) -> None:
+    """ValueError for a value that is none of the known names."""
+    if not isinstance(value, str) or value not in known:
+        raise ValueError(f"unknown {what} {brief(value)}; known: {listed(known)}")
 
 
 def count_of(num_envs: Any) -> int:
     """How many environments; TypeError for what is no whole number, ValueError below one."""
     if isinstance(num_envs, bool) or not isinstance(num_envs, int | np.integer):
-        raise TypeError(f"num_envs is a number of environments, got {num_envs!r}")
+        raise TypeError(f"num_envs is a number of environments, got {brief(num_envs)}")
     if num_envs < 1:
-        raise ValueError(f"num_envs is at least 1, got {num_envs}")
+        raise ValueError(f"num_envs is at least 1, got {brief(num_envs)}")
     return int(num_envs)
 
 
@@ -32,16 +76,17 @@ def mode_of(autoreset_mode: Any) -> AutoresetMode:
         return AutoresetMode(autoreset_mode)
     except ValueError:
         known = ", ".join(repr(mode.value) for mode in AutoresetMode)
-        raise ValueError(f"unknown autoreset_mode {autoreset_mode!r}; known: {known}") from None
+        got = brief(autoreset_mode)
+        raise ValueError(f"unknown autoreset_mode {got}; known: {known}") from None
 
 
 def named(rows: npt.ArrayLike) -> str:
     """ "row 3" or "rows 1, 5, ..." in a message."""
-    told = np.asarray(rows).tolist()
-    if len(told) == 1:
-        return f"row {told[0]}"
-    dots = ", ..." if len(told) > NAMED else ""
-    return f"rows {', '.join(map(str, told[:NAMED]))}{dots} ({len(told)} of them)"
+    numbers = np.asarray(rows).tolist()
+    if len(numbers) == 1:
+        return f"row {numbers[0]}"
+    dots = ", ..." if len(numbers) > NAMED else ""
+    return f"rows {', '.join(map(str, numbers[:NAMED]))}{dots} ({len(numbers)} of them)"
 
 
 def seeds_of(seed: Any, count: int) -> list[int | None]:
@@ -56,13 +101,13 @@ def seeds_of(seed: Any, count: int) -> list[int | None]:
         seeds: list[int | None] = [int(seed) + i for i in range(count)]
     else:
         if not isinstance(seed, Sequence | np.ndarray):
-            raise TypeError(f"seed: an int or a list of {count}, got {seed!r}")
+            raise TypeError(f"seed: an int or a list of {count}, got {brief(seed)}")
         if len(seed) != count:
             raise ValueError(f"seed: an int or a list of {count}, got {len(seed)}")
         seeds = [None if each is None else operator.index(each) for each in seed]
     bad = [i for i, each in enumerate(seeds) if each is not None and each < 0]
     if bad:
-        raise ValueError(f"seed: {named(bad)} would get a negative seed, {seeds[bad[0]]}")
+        raise ValueError(f"seed: {named(bad)} would get a negative seed, {brief(seeds[bad[0]])}")
     return seeds
 
 
@@ -82,7 +127,7 @@ def mask_of(mask: Any, count: int) -> Mask:
 
 def options_of(options: Mapping[str, Any], count: int) -> list[dict[str, Any]]:
     """The options of each row's reset: a list, tuple or array has one for each row, None for a row
-    that is told nothing."""
+    without it."""
     columns = {}
     for name, value in options.items():
         if isinstance(value, np.ndarray) and value.ndim > 0:
@@ -147,7 +192,7 @@ def _action_of(action: Any, width: int) -> Actions:
     try:
         force = np.array(action, np.float32)
     except _NO_NUMBERS as error:
-        raise ValueError(f"{reprlib.repr(action)}: {error}") from None
+        raise ValueError(f"{brief(action)}: {error}") from None
     if force.shape != (width,):
         raise ValueError(f"shape {force.shape}")
     return force

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..arguments import brief, check_choice, is_finite, listed, mapping_of, number_of
 from ..record import Array
 from ..scenarios.checks import SHORTEST_GPS_PERIOD
 from ..scenarios.manoeuvres import scenario_from
@@ -66,19 +67,19 @@ class Setting:
     slow_changes: Mapping[str, Mapping[str, Any] | None]
 
     def __post_init__(self) -> None:
-        if self.sensors not in SENSOR_SETS:
-            raise ValueError(f"unknown sensors {self.sensors!r}; known: {', '.join(SENSOR_SETS)}")
+        check_choice("sensors", self.sensors, SENSOR_SETS)
         n = self.control_period
         if isinstance(n, bool) or not isinstance(n, int | np.integer):
-            raise TypeError(f"control_period is a number of ticks, got {n!r}")
+            raise TypeError(f"control_period is a number of ticks, got {brief(n)}")
         if not 1 <= n <= 1000:
-            raise ValueError(f"control_period is 1 to 1000 ticks, got {n}")
-        if self.fast not in ("summary", "all"):
-            raise ValueError(f"fast is 'summary' or 'all', got {self.fast!r}")
+            raise ValueError(f"control_period is 1 to 1000 ticks, got {brief(n)}")
+        if not isinstance(self.fast, str) or self.fast not in ("summary", "all"):
+            raise ValueError(f"fast is 'summary' or 'all', got {brief(self.fast)}")
         if not isinstance(self.steering, bool):
-            raise TypeError(f"steering is True or False, got {self.steering!r}")
-        if self.on_bad_action not in ("raise", "fail"):
-            raise ValueError(f"on_bad_action is 'raise' or 'fail', got {self.on_bad_action!r}")
+            raise TypeError(f"steering is True or False, got {brief(self.steering)}")
+        bad = self.on_bad_action
+        if not isinstance(bad, str) or bad not in ("raise", "fail"):
+            raise ValueError(f"on_bad_action is 'raise' or 'fail', got {brief(bad)}")
 
     @property
     def slow(self) -> dict[str, SlowSensor]:
@@ -140,9 +141,11 @@ class Setting:
         scenario = scenario_from(options.get("scenario", self.scenario))
         vehicle = vehicle_from(options.get("vehicle", self.vehicle))
         if "friction" in options:
-            scenario = scenario.replace(friction=float(options["friction"]))
+            friction = number_of("reset option friction", options["friction"])
+            scenario = scenario.replace(friction=friction)
         if "duration" in options:
-            scenario = scenario.replace(duration=float(options["duration"]))
+            duration = number_of("reset option duration", options["duration"])
+            scenario = scenario.replace(duration=duration)
         start = start_of(options.get("state", {}), scenario)
         template = self.template(scenario, vehicle)
         if not np.isnan(start[0]):  # the car starts at another speed than it holds
@@ -151,13 +154,17 @@ class Setting:
 
 
 def start_of(state: Mapping[str, Any], scenario: Scenario) -> npt.NDArray[np.float64]:
-    """A Motion's numbers (len(Motion),), NaN where the mapping says nothing; ValueError for a name
+    """A Motion's numbers (len(Motion),), NaN where the mapping has none; ValueError for a name
     that is no state's, a value that is no number, and roll where the scenario has none."""
-    left, start = dict(state), np.full(len(Motion._fields), np.nan)
+    left, start = (
+        dict(mapping_of("reset option state", state)),
+        np.full(len(Motion._fields), np.nan),
+    )
     for i, name in enumerate(Motion._fields):
         value = left.pop(name, None)
-        if value is not None and not abs(value) <= 1e6:
-            raise ValueError(f"reset option state: {name} is {value!r}, not a number up to 1e6")
+        if value is not None and not (is_finite(value) and abs(value) <= 1e6):
+            got = brief(value)
+            raise ValueError(f"reset option state: {name} is {got}, not a number up to 1e6")
         start[i] = np.nan if value is None else value
         if name.startswith("phi") and value and not scenario.roll:
             raise ValueError(
@@ -166,5 +173,5 @@ def start_of(state: Mapping[str, Any], scenario: Scenario) -> npt.NDArray[np.flo
             )
     if left:
         known = ", ".join(Motion._fields)
-        raise ValueError(f"unknown state {', '.join(left)}; known: {known}")
+        raise ValueError(f"unknown state {listed(map(str, left))}; known: {known}")
     return start

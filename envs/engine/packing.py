@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..arguments import brief, check_choice
 from ..record import Array
 from ..scenarios.driver import Driver
 from ..scenarios.scenario import Scenario
@@ -96,6 +97,13 @@ def _pace_of(scenario: Scenario) -> Pace:
     return pace._replace(surge=scenario.surge, surge_rate=math.tau * scenario.surge_frequency)
 
 
+def _link_in(scenario: Scenario, name: str, sensor: SlowSensor | None) -> Link:
+    try:
+        return link_of(sensor, getattr(scenario, f"{name}_outage", None))
+    except ValueError as error:
+        raise ValueError(f"scenario {brief(scenario.name)}: {name}: {error}") from None
+
+
 def _road_of(scenario: Scenario) -> Road:
     """Curvature, bank and grade of the road."""
     return Road(
@@ -137,17 +145,13 @@ def template_of(
     fail_bad: bool = False,
 ) -> Template:
     """Pack everything that a reset does not draw; ValueError where something is out of place."""
-    if reference not in REFERENCES:
-        raise ValueError(f"unknown reference {reference!r}; known: {', '.join(REFERENCES)}")
+    check_choice("reference", reference, REFERENCES)
     vehicle = vehicle.replace(**scenario.vehicle)
     nominal = nominal.replace(**scenario.nominal)
     if scenario.roll:
         vehicle.check_roll()
     keep = math.exp(-TICK / scenario.disturbance_time)
-    links = {
-        name: link_of(slow.get(name), getattr(scenario, f"{name}_outage", None))
-        for name in SLOW_NAMES
-    }
+    links = {name: _link_in(scenario, name, slow.get(name)) for name in SLOW_NAMES}
     params = Params(
         car=car_of(vehicle),
         road=_road_of(scenario),

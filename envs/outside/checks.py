@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
+from ..arguments import brief, is_finite, mapping_of
 from ..scenarios.scenario import Scenario
 
 CRAWL = 1.0  # m/s: the multi-body model's least speed; below 0.1 it freezes while its wheels spin
@@ -63,14 +64,15 @@ def check_options(options: Mapping[str, Any], model: str) -> None:
         raise ValueError(
             "reset option friction: the single-track model's tyres are linear and know none"
         )
-    state = options.get("state", {})
+    state = mapping_of("reset option state", options.get("state", {}))
     for name in ("s", "y", "theta"):
         if name in state:
             raise ValueError(f"reset option state: {name} follows from X and Y here")
     if model != "multi-body":
         if state.get("phi") or state.get("phi_dot"):
             raise ValueError(f"reset option state: the {model} model has no roll")
-    elif (v_x := state.get("v_x")) is not None and v_x < CRAWL:
+    elif (v_x := state.get("v_x")) is not None and not (is_finite(v_x) and v_x >= CRAWL):
         raise ValueError(
-            f"reset option state: v_x is {v_x!r} m/s; the multi-body model needs {CRAWL} or more"
+            f"reset option state: v_x is {brief(v_x)} m/s; "
+            f"the multi-body model needs {CRAWL} or more"
         )

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..arguments import check_choice, number_of
 from ..backend.arrays import at, read, write
 from ..backend.rebuild import plain
 from ..engine.layout import P, Z
@@ -54,8 +55,7 @@ class OutsideEnv(StabilityEnv):
         reference: str = "model",
         **options: Any,
     ) -> None:
-        if model not in OUTSIDE_PLANTS:
-            raise ValueError(f"unknown model {model!r}; known: {', '.join(OUTSIDE_PLANTS)}")
+        check_choice("model", model, OUTSIDE_PLANTS)
         if "vehicle" in options:
             raise TypeError("an outside plant is its own vehicle; only nominal can be given")
         self.model = model
@@ -71,7 +71,8 @@ class OutsideEnv(StabilityEnv):
         check_options(asked, self.model)
         scenario = scenario_from(asked.get("scenario", self.setting.base.scenario))
         if "duration" in asked:
-            scenario = scenario.replace(duration=float(asked["duration"]))
+            duration = number_of("reset option duration", asked["duration"])
+            scenario = scenario.replace(duration=duration)
         check_scenario(scenario, self.model)
         if "state" in asked:  # s and y are X and Y on the straight road of these plants
             state = asked["state"]

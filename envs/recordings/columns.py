@@ -6,12 +6,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..arguments import brief, listed
 from ..record import Array
 from ..vehicle.vehicle import GRAVITY
 
 if TYPE_CHECKING:
     import pandas as pd
 
+_LARGEST = 1e15  # a time in ms since 1970 is below
 _SPEED = {"mps": 1.0, "kmh": 1.0 / 3.6}
 _ANGLE = {"rad": 1.0, "deg": np.pi / 180.0}
 _ANGLE_RATE = {"radps": 1.0, "degps": np.pi / 180.0}
@@ -124,7 +126,7 @@ def read_table(path: Path) -> "pd.DataFrame":
             )
     except (ValueError, OSError) as error:  # what pandas' and pyarrow's own errors derive from
         reason = "it is not text" if isinstance(error, UnicodeDecodeError) else str(error).strip()
-        raise ValueError(f"{path}: expected CSV or Parquet, but {reason}") from None
+        raise ValueError(f"{path}: expected CSV or Parquet, but {reason:.300}") from None
     return table.rename(columns=lambda name: str(name).strip())
 
 
@@ -164,7 +166,7 @@ def read_quantities(
 
 
 def _there(table: "pd.DataFrame") -> str:
-    return f"the log has {', '.join(map(str, table.columns))}"
+    return f"the log has {listed(map(str, table.columns))}"
 
 
 def _find(table: "pd.DataFrame", mapping: Mapping[str, str]) -> dict[str, tuple[str, float]]:
@@ -192,16 +194,19 @@ def _numbers(table: "pd.DataFrame", name: str) -> Array:
     import pandas as pd
 
     column = table[name]
-    if pd.api.types.is_numeric_dtype(column.dtype):
-        numbers = column
-    elif pd.api.types.is_datetime64_any_dtype(column.dtype):
-        raise ValueError(f"column {name!r} holds dates; expected numbers")
-    else:
-        numbers = pd.to_numeric(column, errors="coerce")
+    for kind in ("datetime64_any", "timedelta64", "bool"):
+        if getattr(pd.api.types, f"is_{kind}_dtype")(column.dtype):
+            raise ValueError(f"column {name!r} holds {column.dtype}; expected numbers")
+    numbers = column
+    if not pd.api.types.is_numeric_dtype(column.dtype):
+        try:
+            numbers = pd.to_numeric(column, errors="coerce")
+        except OverflowError as error:
+            raise ValueError(f"column {name!r}: expected numbers, got {error}") from None
     values = np.asarray(numbers.to_numpy(np.float64, na_value=np.nan))
-    bad = np.isinf(values) | (np.isnan(values) & column.notna().to_numpy())
+    bad = (np.abs(values) > _LARGEST) | (np.isnan(values) & column.notna().to_numpy())
     if bad.any():
         row = int(np.argmax(bad))
-        text = str(column.iloc[row])
-        raise ValueError(f"column {name!r}, row {row + 1}: expected a number, got {text!r}")
+        text = brief(str(column.iloc[row]))
+        raise ValueError(f"column {name!r}, row {row + 1}: expected a number, got {text}")
     return values

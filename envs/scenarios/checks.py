@@ -1,22 +1,26 @@
 """What a scenario's fields may be; a value out of place is refused by its field's name."""
 
-import math
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from typing import Any
 
+from ..arguments import brief, check_choice, is_finite, listed
 from ..sensors.gps import HDOP_LAWS
 from ..sensors.noise import Noise
+from ..ticks import TICK
 from ..vehicle.tyres import TYRE_LAWS
-from .draws import Draws
+from .draws import Draws, range_of
 from .steering import STEERING_KINDS
 from .tracks import PATHS
 
-if TYPE_CHECKING:
-    from .scenario import Scenario
+Fields = Mapping[str, Any]
 
 SHORTEST_GPS_PERIOD = 0.05  # s; an env keeps room for its packets
 SIDES = ("side", "wind_side")  # drawn, but no fields
 
+_CHOICES = {"steering": STEERING_KINDS, "path": PATHS, "hdop_law": HDOP_LAWS, "tyres": TYRE_LAWS}
+_FLAGS = ("mirror", "small_angle", "lags", "roll", "scored")
 _NUMBERS = (
+    "duration",
     "disturbance_force",
     "disturbance_moment",
     "disturbance_time",
@@ -32,12 +36,21 @@ _NUMBERS = (
     "grade",
     "half_width",
     "hdop",
+    "hdop_spread",
     "hdop_time",
+    "camera_jitter",
     "driver_preview",
     "driver_gain",
     "driver_lag",
     "driver_rate",
 )
+_NUMBERS_OR_NONE = ("acceleration", "gps_period")
+_TIMES_OR_NONE = {  # how many
+    "camera_delays": (1, 2, 3, 4),
+    "gps_delays": (1, 2, 3, 4),
+    "camera_outage": (2,),
+    "gps_outage": (2,),
+}
 _POSITIVE = (
     "disturbance_time",
     "curve_ramp",
@@ -62,99 +75,116 @@ _POSITIVE_DRAWS = (
 _POSITIVE_OR_NONE = ("path_speed", "friction_right", "tyre_change_time")
 
 
-def check(scenario: "Scenario") -> None:
+def check(fields: Fields) -> None:
     """ValueError for a field out of place, with the scenario's name and the field's."""
-    _check_names(scenario)
-    _check_draws(scenario)
-    _check_numbers(scenario)
-    _check_motion(scenario)
-    _check_sensors(scenario)
+    try:
+        _check_names(fields)
+        _check_mappings(fields)
+        _check_numbers(fields)
+        _check_draws(fields)
+        _check_motion(fields)
+        _check_sensors(fields)
+    except ValueError as error:
+        raise ValueError(f"scenario {brief(fields['name'])}: {error}") from None
 
 
-def _refuse(scenario: "Scenario", message: str) -> None:
-    raise ValueError(f"scenario {scenario.name!r}: {message}")
+def _check_names(fields: Fields) -> None:
+    if not isinstance(fields["name"], str):
+        raise ValueError("name is no text")
+    for what, known in _CHOICES.items():
+        check_choice(what, fields[what], known)
+    for name in _FLAGS:
+        if not isinstance(fields[name], bool):
+            raise ValueError(f"{name} is True or False, got {brief(fields[name])}")
+    if fields["path"] != "road" and fields["steering"] != "driver":
+        raise ValueError(
+            f"path {fields['path']!r} needs the steering 'driver', got {fields['steering']!r}"
+        )
+    if fields["path_speed"] is not None and fields["path"] == "road":
+        raise ValueError("path_speed needs a track as path; a road has no lengths to scale")
 
 
-def _check_names(scenario: "Scenario") -> None:
-    for value, known, what in (
-        (scenario.steering, STEERING_KINDS, "steering"),
-        (scenario.path, PATHS, "path"),
-        (scenario.hdop_law, HDOP_LAWS, "hdop_law"),
-        (scenario.tyres, TYRE_LAWS, "tyres"),
-    ):
-        if value not in known:
-            _refuse(scenario, f"unknown {what} {value!r}; known: {', '.join(known)}")
-    unknown = sorted(set(scenario.noise) - set(Noise._fields))
+def _check_mappings(fields: Fields) -> None:
+    for name in ("vehicle", "nominal", "noise"):
+        values = fields[name]
+        if not isinstance(values, Mapping) or not all(isinstance(key, str) for key in values):
+            raise ValueError(f"{name} is a mapping of names to numbers, got {brief(values)}")
+    unknown = sorted(set(fields["noise"]) - set(Noise._fields))
     if unknown:
-        _refuse(scenario, f"unknown noise {', '.join(unknown)}")
-    if scenario.path != "road" and scenario.steering != "driver":
-        _refuse(
-            scenario,
-            f"path {scenario.path!r} needs the steering 'driver', got {scenario.steering!r}",
-        )
-    if scenario.path_speed is not None and scenario.path == "road":
-        _refuse(scenario, "path_speed needs a track as path; a road has no lengths to scale")
+        raise ValueError(f"unknown noise {listed(unknown)}; known: {listed(Noise._fields)}")
+    for name, value in fields["noise"].items():
+        _check_number(f"noise {name}", value)
 
 
-def _check_draws(scenario: "Scenario") -> None:
-    for name in Draws._fields:
-        if name in SIDES:
-            continue
-        low, high = scenario.range(name)
-        if not (math.isfinite(low) and math.isfinite(high) and low <= high):
-            value = getattr(scenario, name)
-            _refuse(scenario, f"{name} {value!r} is not finite, or its ends are swapped")
-    for name in _POSITIVE_DRAWS:
-        if scenario.range(name)[0] <= 0.0:
-            _refuse(scenario, f"{name} must be positive")
-    for name in _POSITIVE_OR_NONE:
-        value = getattr(scenario, name)
-        if value is not None and scenario.range(name)[0] <= 0.0:
-            _refuse(scenario, f"{name} must be positive or None, got {value!r}")
-    for name in ("front_change", "rear_change"):
-        if scenario.tyre_change_time is None and scenario.range(name) != (1.0, 1.0):
-            value = getattr(scenario, name)
-            _refuse(scenario, f"{name} {value!r} needs a tyre_change_time, from which it acts")
-    if scenario.steering in ("ramp", "sweep") and scenario.range("hold")[0] < 0.001:
-        _refuse(scenario, f"hold of a {scenario.steering} is 1 ms or more, got {scenario.hold!r}")
-    if scenario.steering == "sine-with-dwell" and scenario.range("hold")[0] < 0.0:
-        _refuse(scenario, f"hold of a dwell is not negative, got {scenario.hold!r}")
+def _check_number(name: str, value: Any) -> None:
+    if not is_finite(value):
+        raise ValueError(f"{name} {brief(value)} is not finite")
 
 
-def _check_numbers(scenario: "Scenario") -> None:
-    if not (scenario.duration > 0.0 and math.isfinite(scenario.duration)):
-        _refuse(scenario, f"duration {scenario.duration!r} s")
-    numbers = {name: getattr(scenario, name) for name in _NUMBERS} | dict(scenario.noise)
-    for name, value in (numbers | {"acceleration": scenario.acceleration or 0.0}).items():
-        if not math.isfinite(value):
-            _refuse(scenario, f"{name} {value!r} is not finite")
+def _check_numbers(fields: Fields) -> None:
+    for name in _NUMBERS:
+        _check_number(name, fields[name])
+    for name in _NUMBERS_OR_NONE:
+        _check_number(name, 0.0 if fields[name] is None else fields[name])
     for name in _POSITIVE:
-        if not getattr(scenario, name) > 0.0:
-            _refuse(scenario, f"{name} must be positive, got {getattr(scenario, name)!r}")
-    if scenario.driver_lag < 0.0:
-        _refuse(scenario, f"driver_lag is zero or more, got {scenario.driver_lag!r}")
+        if not fields[name] > 0.0:
+            raise ValueError(f"{name} must be positive, got {fields[name]!r}")
+    if fields["duration"] < TICK:
+        raise ValueError(f"duration {fields['duration']!r} s is less than {TICK}")
+    if fields["driver_lag"] < 0.0:
+        raise ValueError(f"driver_lag is zero or more, got {fields['driver_lag']!r}")
 
 
-def _check_motion(scenario: "Scenario") -> None:
-    slowest = scenario.range("speed")[0]
-    if slowest < 0.0 or slowest + scenario.speed_change < 0.0:
-        _refuse(scenario, "speed must not be negative, with speed_change or without")
-    if scenario.acceleration is not None and (scenario.speed_change or scenario.surge):
-        _refuse(scenario, "speed_change and surge need the held speed (acceleration None)")
-    if scenario.path_speed is not None and slowest <= 0.0:
-        _refuse(scenario, "path_speed needs a speed above zero")
-    if max(abs(scenario.bank), abs(scenario.grade)) > 0.5:
-        _refuse(
-            scenario,
-            f"bank and grade are up to 0.5 rad, got {scenario.bank!r}, {scenario.grade!r}",
-        )
+def _check_draws(fields: Fields) -> None:
+    for name in Draws._fields:
+        if name in SIDES or (name in _POSITIVE_OR_NONE and fields[name] is None):
+            continue
+        value = fields[name]
+        ends = value if isinstance(value, tuple) else (value, value)
+        if not (len(ends) == 2 and all(map(is_finite, ends)) and ends[0] <= ends[1]):
+            raise ValueError(f"{name} {brief(value)} is not finite, or its ends are swapped")
+        if name in _POSITIVE_OR_NONE and ends[0] <= 0.0:
+            raise ValueError(f"{name} must be positive or None, got {value!r}")
+        if name in _POSITIVE_DRAWS and ends[0] <= 0.0:
+            raise ValueError(f"{name} must be positive, got {value!r}")
+    for name in ("front_change", "rear_change"):
+        if fields["tyre_change_time"] is None and range_of(fields[name]) != (1.0, 1.0):
+            raise ValueError(
+                f"{name} {fields[name]!r} needs a tyre_change_time, from which it acts"
+            )
+    steering, hold = fields["steering"], fields["hold"]
+    if steering in ("ramp", "sweep") and range_of(hold)[0] < TICK:
+        raise ValueError(f"hold of a {steering} is 1 ms or more, got {hold!r}")
+    if steering == "sine-with-dwell" and range_of(hold)[0] < 0.0:
+        raise ValueError(f"hold of a dwell is not negative, got {hold!r}")
 
 
-def _check_sensors(scenario: "Scenario") -> None:
-    if not 0.0 <= scenario.hdop_spread <= 1.0:
-        _refuse(scenario, f"hdop_spread is 0 to 1, got {scenario.hdop_spread!r}")
-    period = scenario.gps_period
+def _check_motion(fields: Fields) -> None:
+    slowest = range_of(fields["speed"])[0]
+    if slowest < 0.0 or slowest + fields["speed_change"] < 0.0:
+        raise ValueError("speed must not be negative, with speed_change or without")
+    if fields["acceleration"] is not None and (fields["speed_change"] or fields["surge"]):
+        raise ValueError("speed_change and surge need the held speed (acceleration None)")
+    if fields["path_speed"] is not None and slowest <= 0.0:
+        raise ValueError("path_speed needs a speed above zero")
+    bank, grade = fields["bank"], fields["grade"]
+    if max(abs(bank), abs(grade)) > 0.5:
+        raise ValueError(f"bank and grade are up to 0.5 rad, got {bank!r}, {grade!r}")
+
+
+def _check_sensors(fields: Fields) -> None:
+    if not 0.0 <= fields["hdop_spread"] <= 1.0:
+        raise ValueError(f"hdop_spread is 0 to 1, got {fields['hdop_spread']!r}")
+    for name, counts in _TIMES_OR_NONE.items():
+        value = fields[name]
+        fits = isinstance(value, tuple) and len(value) in counts and all(map(is_finite, value))
+        if value is not None and not (fits and min(value) >= 0.0):
+            many = " to ".join(str(count) for count in sorted({counts[0], counts[-1]}))
+            raise ValueError(f"{name} is {many} times in s, zero or more, got {brief(value)}")
+    period = fields["gps_period"]
     if period is not None and not period >= SHORTEST_GPS_PERIOD:
-        _refuse(scenario, f"gps_period is {SHORTEST_GPS_PERIOD} s or more, got {period!r}")
-    if scenario.camera_jitter and scenario.camera_delays is None:
-        _refuse(scenario, "camera_jitter needs camera_delays")
+        raise ValueError(f"gps_period is {SHORTEST_GPS_PERIOD} s or more, got {period!r}")
+    if fields["camera_jitter"] < 0.0:
+        raise ValueError(f"camera_jitter is zero or more, got {fields['camera_jitter']!r}")
+    if fields["camera_jitter"] and fields["camera_delays"] is None:
+        raise ValueError("camera_jitter needs camera_delays")

@@ -85,3 +85,9 @@ Range = float | tuple[float, float]
 """A number, or the (low, high) that the seed draws from uniformly."""
 
 KMH = 1.0 / 3.6
+
+
+def range_of(value: Range | None) -> tuple[float, float]:
+    """(low, high) of a drawn quantity; zeros for None."""
+    low, high = value if isinstance(value, tuple) else (value or 0.0, value or 0.0)
+    return float(low), float(high)

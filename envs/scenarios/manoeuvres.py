@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
+from ..arguments import brief, check_choice, listed
 from .draws import KMH
 from .papers import ROAD_TESTS, SIMULATIONS
 from .scenario import Scenario
@@ -178,20 +179,21 @@ def scenario_from(source: "str | Scenario | Mapping[str, Any]") -> Scenario:
     """A scenario from its name, a mapping of fields, or a scenario itself.
 
     A mapping may name a scenario to start from under `"base"`. Raises ValueError for an unknown
-    name, TypeError for an unknown field.
+    name, TypeError for an unknown field and for another type.
     """
     if isinstance(source, Scenario):
         return source
     if isinstance(source, str):
-        if source not in SCENARIOS:
-            raise ValueError(f"unknown scenario {source!r}; known: {', '.join(SCENARIOS)}")
+        check_choice("scenario", source, SCENARIOS)
         return SCENARIOS[source]
+    if not isinstance(source, Mapping):
+        raise TypeError(f"a scenario is a name or a mapping of fields, got {brief(source)}")
     values = dict(source)
     base = values.pop("base", None)
     known = {entry.name for entry in dataclasses.fields(Scenario)}
-    unknown = sorted(set(values) - known)
+    unknown = sorted(set(values) - known, key=str)
     if unknown:
-        raise TypeError(f"unknown scenario field {', '.join(map(repr, unknown))}")
+        raise TypeError(f"unknown scenario field {listed(map(brief, unknown))}")
     if base is not None:
         return scenario_from(base).replace(**values)
     return Scenario(**{"name": "custom", **values})

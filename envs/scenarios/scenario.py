@@ -9,7 +9,7 @@ import numpy as np
 
 from ..record import Array
 from .checks import SIDES, check
-from .draws import DRAWS_WIDTH, KMH, Draws, Range
+from .draws import DRAWS_WIDTH, KMH, Draws, Range, range_of
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,17 +125,11 @@ class Scenario:
             value = getattr(self, entry.name)
             if isinstance(value, list):
                 object.__setattr__(self, entry.name, tuple(value))
-        check(self)
+        check(vars(self))
 
     def range(self, name: str) -> tuple[float, float]:
         """(low, high) of a drawn quantity; zeros where it is None."""
-        value = getattr(self, name)
-        if value is None:
-            return 0.0, 0.0
-        if isinstance(value, tuple):
-            low, high = value
-            return float(low), float(high)
-        return float(value), float(value)
+        return range_of(getattr(self, name))
 
     def draws(self) -> tuple[Array, Array]:
         """(low, high) of every quantity of `Draws`, each (len(Draws),)."""
@@ -161,13 +155,13 @@ class Scenario:
 
     def to_dict(self) -> dict[str, Any]:
         """JSON types only, defaults left out; `scenario_from` reads it back."""
-        kept = {}
+        values = {}
         for entry in dataclasses.fields(self):
             value = getattr(self, entry.name)
             default = {} if entry.name in ("vehicle", "nominal", "noise") else entry.default
             if value != default:
                 mapping = isinstance(value, Mapping)
-                kept[entry.name] = (
+                values[entry.name] = (
                     dict(value) if mapping else list(value) if isinstance(value, tuple) else value
                 )
-        return kept
+        return values

@@ -1,9 +1,9 @@
 """A slow sensor's clock and link: when samples are captured, and when they arrive."""
 
-import math
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+from ..arguments import brief, is_finite
 from ..backend.decorators import jit
 from ..backend.primitives import floor, select, whole
 from ..backend.random import CHANNELS, uniforms
@@ -14,7 +14,7 @@ IN_FLIGHT = 8  # packets of one sensor under way at once, duplicates included
 
 @dataclass(frozen=True)
 class SlowSensor:
-    """A slow sensor's clock and link, as estimators are told it; times in seconds.
+    """A slow sensor's clock and link, as estimators know it; times in seconds.
 
     A sample is captured every `period` from `phase` on (None: drawn at each reset; the running
     env's `slow_sensors` tells the drawn one). Frame i arrives `delays[i % len(delays)]` plus a
@@ -30,17 +30,24 @@ class SlowSensor:
     duplicate: float = 0.0
 
     def __post_init__(self) -> None:
+        if not isinstance(self.delays, list | tuple):
+            raise TypeError(f"a slow sensor's delays are a list, got {brief(self.delays)}")
+        if not (is_finite(self.period) and self.period >= TICK):
+            got = brief(self.period)
+            raise ValueError(f"a slow sensor's period must be at least one tick, got {got}")
+        if not 1 <= len(self.delays) <= 4:
+            raise ValueError(f"expected one to four delays, got {brief(self.delays)}")
+        times = (*self.delays, self.jitter, 0.0 if self.phase is None else self.phase)
+        if not all(is_finite(time) and time >= 0.0 for time in times):
+            raise ValueError(
+                "a slow sensor's delays, jitter and phase must be finite and not negative, "
+                f"got {brief(times)}"
+            )
         object.__setattr__(self, "delays", tuple(float(d) for d in self.delays))
-        if not TICK <= self.period < math.inf:
-            raise ValueError(f"a slow sensor's period must be at least one tick, got {self.period}")
-        if not self.delays or len(self.delays) > 4:
-            raise ValueError(f"expected one to four delays, got {self.delays}")
-        times = (*self.delays, self.jitter, self.phase or 0.0)
-        if not all(0.0 <= time < math.inf for time in times):
-            raise ValueError(f"{self}: delays, jitter and phase must be finite and not negative")
         for name in ("loss", "duplicate"):
-            if not 0.0 <= getattr(self, name) <= 1.0:
-                raise ValueError(f"{name} is a probability, got {getattr(self, name)}")
+            value = getattr(self, name)
+            if not (is_finite(value) and 0.0 <= value <= 1.0):
+                raise ValueError(f"{name} is a probability, got {brief(value)}")
 
     @property
     def longest_delay(self) -> float:

@@ -8,6 +8,7 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+from ..arguments import mapping_of
 from ..backend.decorators import jit
 from ..backend.elementary import exp
 from ..backend.primitives import whole
@@ -108,5 +109,5 @@ def with_changes(
             continue
         if name not in sensors:
             raise ValueError(f"this id has no {name}; it has: {', '.join(sensors)}")
-        changed[name] = dataclasses.replace(sensors[name], **fields)
+        changed[name] = dataclasses.replace(sensors[name], **mapping_of(name, fields))
     return changed

@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from ..arguments import LARGEST, brief, check_choice, is_finite, listed
+
 GRAVITY = 9.81
 
 
@@ -18,6 +20,7 @@ def _unit(unit: str, text: str, default: float | None = None) -> Any:
 
 _MAY_BE_ZERO = ("motor_lag", "steering_lag")
 _OF_ANY_SIGN = ("antenna_ahead", "antenna_left")
+_SMALLEST = 1.0 / LARGEST  # what is below is taken for zero: it is divided by
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,19 +64,21 @@ class Vehicle:
 
     def __post_init__(self) -> None:
         for entry in dataclasses.fields(self):
-            if entry.name == "name":
-                continue
             value = getattr(self, entry.name)
+            if entry.name == "name":
+                if not isinstance(value, str):
+                    raise TypeError(f"Vehicle.name: expected a text, got {brief(value)}")
+                continue
             if not isinstance(value, int | float) or isinstance(value, bool):
-                raise TypeError(f"Vehicle.{entry.name}: expected a number, got {value!r}")
-            least, low_ok = "positive and ", value > 0.0
+                raise TypeError(f"Vehicle.{entry.name}: expected a number, got {brief(value)}")
+            least, low_ok = "positive and ", value > _SMALLEST
             if entry.name in _MAY_BE_ZERO:
-                least, low_ok = "zero or more and ", value >= 0.0
+                least, low_ok = "zero or more and ", value > _SMALLEST or value == 0.0
             elif entry.name in _OF_ANY_SIGN:
                 least, low_ok = "", True
-            if not (math.isfinite(value) and low_ok):
-                unit = entry.metadata["unit"]
-                raise ValueError(f"Vehicle.{entry.name}: {value!r} {unit} is not {least}finite")
+            if not (is_finite(value) and low_ok):
+                got = f"{brief(value)} {entry.metadata['unit']}"
+                raise ValueError(f"Vehicle.{entry.name}: {got} is not {least}finite")
 
     def replace(self, **changes: Any) -> "Vehicle":
         """A copy with some parameters changed; TypeError on an unknown name."""
@@ -194,20 +199,21 @@ def vehicle_from(source: "str | Vehicle | Mapping[str, Any]") -> Vehicle:
     """A vehicle from a preset's name, a mapping of parameters, or a vehicle itself.
 
     A mapping may name a preset to start from under `"base"`. Raises ValueError for an unknown
-    preset, TypeError for an unknown or missing parameter.
+    preset, TypeError for an unknown or missing parameter and for another type.
     """
     if isinstance(source, Vehicle):
         return source
     if isinstance(source, str):
-        if source not in VEHICLES:
-            raise ValueError(f"unknown vehicle {source!r}; known: {', '.join(VEHICLES)}")
+        check_choice("vehicle", source, VEHICLES)
         return VEHICLES[source]
+    if not isinstance(source, Mapping):
+        raise TypeError(f"a vehicle is a name or a mapping of parameters, got {brief(source)}")
     values = dict(source)
     base = values.pop("base", None)
     known = {entry.name for entry in dataclasses.fields(Vehicle)}
-    unknown = sorted(set(values) - known)
+    unknown = sorted(set(values) - known, key=str)
     if unknown:
-        raise TypeError(f"unknown vehicle parameter {', '.join(map(repr, unknown))}")
+        raise TypeError(f"unknown vehicle parameter {listed(map(brief, unknown))}")
     if base is not None:
         return vehicle_from(base).replace(**values)
     return Vehicle(**values)
@@ -232,8 +238,9 @@ def vehicle_from_file_values(values: Mapping[str, Any], where: str) -> Vehicle:
             name, factor = _STIFFNESS_KEYS[key]
             if name in read:
                 raise ValueError(f"{where}: {name} is given twice")
-            if not isinstance(value, int | float):
-                raise TypeError(f"{where}: {key}: expected a number, got {value!r}")
+            if not is_finite(value):
+                kind = ValueError if isinstance(value, int | float) else TypeError
+                raise kind(f"{where}: {key}: expected a number, got {brief(value)}")
             read[name] = value * factor
         else:
             read[key] = value

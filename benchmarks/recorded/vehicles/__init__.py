@@ -5,6 +5,7 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
+from ....envs.arguments import brief
 from ....envs.vehicle.vehicle import Vehicle, vehicle_from_file_values
 
 _HERE = Path(__file__).parent
@@ -32,12 +33,16 @@ def read_vehicle(path: str | Path) -> Vehicle:
     try:
         text = source.read_text(encoding="utf-8")
         values: Any = json.loads(text) if text.lstrip().startswith("{") else tomllib.loads(text)
-    except ValueError as error:  # of the decoder, of JSON or of TOML
+    except RecursionError:
+        raise ValueError(f"{source}: expected TOML or JSON, but it is nested too deeply") from None
+    except (ValueError, OSError) as error:  # of the decoder, of JSON or of TOML
         raise ValueError(f"{source}: expected TOML or JSON, but {error}") from None
     if not values:
         raise ValueError(f"{source}: the file names no parameter")
     for key, value in values.items():
         number = isinstance(value, int | float) and not isinstance(value, bool)
-        if key not in ("name", "base") and not number:
-            raise TypeError(f"{source}: {key}: expected a number, got {value!r}")
+        fits = isinstance(value, str) if key in ("name", "base") else number
+        if not fits:
+            wanted = "a text" if key in ("name", "base") else "a number"
+            raise TypeError(f"{source}: {key:.80}: expected {wanted}, got {brief(value)}")
     return vehicle_from_file_values(values, str(source))
