@@ -10,14 +10,14 @@ import numpy.typing as npt
 from gymnasium.error import ResetNeeded
 
 from .arguments import action_of
-from .engine.config import Setting
-from .engine.layout import PARAMS_WIDTH, STATE_WIDTH, Z
+from .engine.arrays import Row
+from .engine.config import EnvConfig
+from .engine.layout import FLAGS, PARAMS_WIDTH, STATE_WIDTH, Z
 from .engine.reset import reset_vehicle
 from .engine.step import step_vehicle
 from .engine.views import motion_in, record_in, slow_in, vehicle_in
-from .engine.window import scratch_of
+from .engine.window import window_of
 from .record import FAST_WIDTH, PACKET_WIDTH, Record
-from .scenarios.draws import DRAWS_WIDTH
 from .scenarios.manoeuvres import scenario_from
 from .scenarios.scenario import Scenario
 from .sensors.link import SlowSensor
@@ -110,7 +110,7 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
             raise TypeError(f"unknown render_mode {render_mode!r}; known: none")
         self.render_mode = render_mode
         car = vehicle_from(vehicle)
-        self.setting = Setting(
+        self.config = EnvConfig(
             sensors,
             scenario_from(scenario),
             car,
@@ -124,22 +124,22 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
             slow,
         )
         self.control_period, self.reference = int(control_period), reference
-        self._now = self.setting.base
+        self._now = self.config.base
         self.annotations: dict[str, float] = {}
 
-        self.layout: tuple[Entry, ...] = self.setting.layout
-        self._bounds = self.setting.bounds
+        self.layout: tuple[Entry, ...] = self.config.layout
+        self._bounds = self.config.bounds
         low, high = self._bounds.astype(np.float32)
         self.observation_space = gym.spaces.Box(low, high, dtype=np.float32)
-        self._entries, self._width = len(self.layout), self.setting.action_width
+        self._entries, self._width = len(self.layout), self.config.action_width
         self._fails = on_bad_action == "fail"
         self.action_space = gym.spaces.Box(-1.0, 1.0, (self._width,), np.float32)
         self._params, self._state = np.zeros(PARAMS_WIDTH), np.zeros(STATE_WIDTH)
-        self._scratch = scratch_of(self.control_period)
+        self._switches = np.zeros(len(FLAGS), np.int64)
+        self._window = window_of(self.control_period)
         self.rows = np.zeros((self.control_period, FAST_WIDTH))
-        self.packets = np.zeros((self.setting.room, PACKET_WIDTH))
+        self.packets = np.zeros((self.config.most_packets, PACKET_WIDTH))
         self._report = np.zeros(len(REPORT))
-        self._drawn = np.zeros(DRAWS_WIDTH)
         self.ticks_done = 0  # rows of the newest record
         self.delivered = 0  # its packets
         # the record as it stood before the newest reset: a vector env resets within a step
@@ -151,31 +151,15 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[npt.NDArray[np.float32], dict[str, Any]]:
         """Start an episode; see the class docstring for the options."""
-        now, start = self.setting.optioned(options or {})
+        config = self.config.with_options(options or {})
         super().reset(seed=seed)  # refused options leave everything as it was
-        self._now = now
+        self._now = config
         key = int(self.np_random.integers(0, 2**64, dtype=np.uint64))
         obs = np.empty(len(self.layout), np.float32)
         self.rows, self.final_rows = self.final_rows, self.rows
         self.packets, self.final_packets = self.final_packets, self.packets
         self.final_ticks_done, self.final_delivered = self.ticks_done, self.delivered
-        reset_vehicle(
-            now.params,
-            now.low,
-            now.high,
-            now.switches,
-            start,
-            self._drawn,
-            key & 0xFFFFFFFF,
-            key >> 32,
-            self._bounds,
-            self._params,
-            self._state,
-            obs,
-            self.rows,
-            self.packets,
-            self._report,
-        )
+        reset_vehicle(config.start, key & 0xFFFFFFFF, key >> 32, self._bounds, self._row(obs))
         self._over = False
         self.annotations = {}
         return obs, self._info(1)
@@ -204,16 +188,21 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
         return step_vehicle(
             self._params,
             self._state,
-            self._now.switches,
-            force,
-            self.control_period,
-            self._bounds,
+            self._switches,
             obs,
             self.rows,
             self.packets,
             self._report,
-            self._scratch,
+            force,
+            self.control_period,
+            self._bounds,
+            self._window,
         )
+
+    def _row(self, obs: npt.NDArray[np.float32]) -> Row:
+        """The arrays of this episode."""
+        record = self.rows, self.packets, self._report
+        return Row(self._params, self._state, self._switches, obs, *record)
 
     def _info(self, done: int) -> dict[str, Any]:
         self.ticks_done = done
@@ -275,7 +264,8 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
         return {
             "params": self._params.copy(),
             "state": self._state.copy(),
-            "template": self._now,
+            "switches": self._switches.copy(),
+            "config": self._now,
             "layout": self.layout,
             "rows": self.rows.copy(),
             "packets": self.packets.copy(),
@@ -294,7 +284,8 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
             raise ValueError("the snapshot is of an env with other sensors or another observation")
         self._params[:] = snapshot["params"]
         self._state[:] = snapshot["state"]
-        self._now = snapshot["template"]
+        self._switches[:] = snapshot["switches"]
+        self._now = snapshot["config"]
         self.rows[:] = snapshot["rows"]
         self.packets[:] = snapshot["packets"]
         self._report[:] = snapshot["report"]

@@ -14,7 +14,7 @@ from gymnasium.vector.utils import batch_space
 
 from .arguments import actions_of, count_of, mask_of, mode_of, named, seeds_of
 from .engine.batch import step_rows
-from .engine.episodes import Fleet
+from .engine.episodes import Episodes
 from .record import Array
 from .stability import StabilityEnv
 from .task.failures import REFUSED
@@ -25,13 +25,9 @@ Flags = npt.NDArray[np.bool_]
 Infos = dict[str, Any]
 
 _INFO = ("all", "ends")
-_HELD = (  # arrays of a snapshot
-    "params", "states", "switches", "over", "obs", "rows", "packets", "reports", "ticks_done",
-    "delivered",
-)  # fmt: skip
 
 
-class StabilityVectorEnv(Fleet, VectorEnv[Observations, Any, npt.NDArray[Any]]):
+class StabilityVectorEnv(Episodes, VectorEnv[Observations, Any, npt.NDArray[Any]]):
     """`num_envs` environments, each of which is a `StabilityEnv(**arguments)` bit for bit.
 
     Observations, rewards, ends, infos and records are those of `SyncVectorEnv`: row i of
@@ -77,9 +73,9 @@ class StabilityVectorEnv(Fleet, VectorEnv[Observations, Any, npt.NDArray[Any]]):
         self._mode = mode_of(autoreset_mode)
         if info not in _INFO:
             raise ValueError(f"info is 'all' or 'ends', got {info!r}")
-        self._tells_all = info == "all"
+        self._all_infos = info == "all"
         one = StabilityEnv(**arguments)
-        Fleet.__init__(self, one.setting, N)
+        Episodes.__init__(self, one.config, N)
         self.reference = one.reference
         self.metadata = {**one.metadata, "autoreset_mode": self._mode}
         self.single_observation_space = one.observation_space
@@ -111,19 +107,19 @@ class StabilityVectorEnv(Fleet, VectorEnv[Observations, Any, npt.NDArray[Any]]):
         Raises TypeError or ValueError for what is out of place, ResetNeeded where a mask leaves
         out rows that were never started; then everything is as it was.
         """
-        N, told = self.num_envs, dict(options or {})
-        seeds, mask = seeds_of(seed, N), mask_of(told.pop("reset_mask", None), N)
+        N, rest = self.num_envs, dict(options or {})
+        seeds, mask = seeds_of(seed, N), mask_of(rest.pop("reset_mask", None), N)
         if not (self._started or mask.all()):
             raise ResetNeeded("reset all rows first: a reset_mask leaves out some of them")
         chosen = np.flatnonzero(mask)
-        made, of = self.optioned(told, chosen.tolist())
+        configs, of = self.with_options(rest, chosen.tolist())
         new = {i: seeding.np_random(s) for i in chosen.tolist() if (s := seeds[i]) is not None}
         for i, (generator, own) in new.items():
             self.generators[i], self.seeds[i] = generator, own
-        self.restart(chosen, made, of)
+        self.reset_rows(chosen, configs, of)
         self.over[mask] = False
         self._waiting, self._started = int(self.over.sum()), True
-        return self.obs.copy(), infos_of(self.reports, mask) if self._tells_all else {}
+        return self.obs.copy(), infos_of(self.reports, mask) if self._all_infos else {}
 
     def step(self, actions: npt.ArrayLike) -> tuple[Observations, Array, Flags, Flags, Infos]:
         """Hold each row's action for one control period."""
@@ -135,43 +131,33 @@ class StabilityVectorEnv(Fleet, VectorEnv[Observations, Any, npt.NDArray[Any]]):
                 f"the episode is over in {named(np.flatnonzero(self.over))}: "
                 "call reset() with a reset_mask"
             )
-        setting = self.setting
-        told = actions_of(actions, N, setting.action_width, setting.on_bad_action == "fail")
+        config = self.config
+        asked = actions_of(actions, N, config.action_width, config.on_bad_action == "fail")
         resting = np.flatnonzero(self.over) if self._waiting else None
         rewards, terminated, truncated = np.empty(N), np.empty(N, np.bool_), np.empty(N, np.bool_)
         ended = step_rows(
-            self.params,
-            self.states,
-            self.switches,
-            told,
+            *self.arrays,
+            asked,
             self.control_period,
-            setting.bounds,
-            self.over,
-            self.obs,
-            self.rows,
-            self.packets,
-            self.reports,
-            self.ticks_done,
-            self.delivered,
+            config.bounds,
             rewards,
             terminated,
             truncated,
-            self.scratch,
             self.block,
         )
         if ended == REFUSED:
-            bad = np.flatnonzero(~np.isfinite(told).all(1) & ~self.over)
+            bad = np.flatnonzero(~np.isfinite(asked).all(1) & ~self.over)
             raise ValueError(
-                f"the action of {named(bad)} is not finite, {told[bad[0]].tolist()}; "
+                f"the action of {named(bad)} is not finite, {asked[bad[0]].tolist()}; "
                 "nothing was stepped"
             )
         if resting is not None:
-            self.restart(resting)
+            self.reset_rows(resting)
         infos: Infos = {}
         if ended and self._mode == AutoresetMode.SAME_STEP:
             infos, ended = self._finished(), 0
         self._waiting = ended
-        if self._tells_all:
+        if self._all_infos:
             infos |= infos_of(self.reports, np.ones(N, np.bool_))
         elif ended:
             infos |= infos_of(self.reports, self.over)
@@ -185,7 +171,7 @@ class StabilityVectorEnv(Fleet, VectorEnv[Observations, Any, npt.NDArray[Any]]):
         infos: Infos = {"final_info": infos_of(self.reports, self.over), "final_obs": final_obs}
         for key in tuple(infos):
             infos[f"_{key}"] = self.over.copy()
-        self.restart(rows)
+        self.reset_rows(rows)
         self.over[:] = False
         return infos
 
@@ -203,10 +189,10 @@ class StabilityVectorEnv(Fleet, VectorEnv[Observations, Any, npt.NDArray[Any]]):
 
     def get_state(self) -> dict[str, Any]:
         """A snapshot of all rows that `set_state` continues from, bit for bit."""
-        held: dict[str, Any] = {name: getattr(self, name).copy() for name in _HELD}
-        return held | {
+        arrays = {name: each.copy() for name, each in self.arrays._asdict().items()}
+        return arrays | {
             "layout": self.layout,
-            "templates": list(self.templates),
+            "configs": list(self.configs),
             "rng": copy.deepcopy(self.generators),
             "seeds": list(self.seeds),
             "started": self._started,
@@ -225,9 +211,9 @@ class StabilityVectorEnv(Fleet, VectorEnv[Observations, Any, npt.NDArray[Any]]):
             )
         if snapshot["layout"] != self.layout:
             raise ValueError("the snapshot is of an env with other sensors or another observation")
-        for name in _HELD:
-            getattr(self, name)[:] = snapshot[name]
-        self.templates, self.seeds = list(snapshot["templates"]), list(snapshot["seeds"])
+        for name, each in self.arrays._asdict().items():
+            each[:] = snapshot[name]
+        self.configs, self.seeds = list(snapshot["configs"]), list(snapshot["seeds"])
         self.generators = copy.deepcopy(snapshot["rng"])
         self._started, self._waiting = snapshot["started"], int(self.over.sum())
         self.sort()

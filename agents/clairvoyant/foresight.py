@@ -8,10 +8,11 @@ import numpy.typing as npt
 
 from ...envs.backend.arrays import read
 from ...envs.backend.rebuild import plain
+from ...envs.engine.arrays import Row
 from ...envs.engine.layout import Drive, P, Task, Z
 from ...envs.engine.step import kind_of, step_vehicle
 from ...envs.engine.tick import Kind
-from ...envs.engine.window import scratch_of
+from ...envs.engine.window import window_of
 from ...envs.scenarios.speed import Pace, acceleration_command
 from ...envs.scenarios.steering import steering_at
 from ...envs.scenarios.wind import wind_at
@@ -119,7 +120,7 @@ def forecast_of(base: Any, steps: int = 1, actions: Array | None = None) -> Fore
     if z[Z.clock.tick] != 0.0:
         raise ValueError("a forecast starts at an episode's start: call reset() first")
     start = state_of(z)
-    fixed = _fixed(base, p, snapshot["template"].switches, n // steps, steps)
+    fixed = _fixed(base, p, snapshot["config"].start.switches, n // steps, steps)
     ticks = fixed.periods * n
     if actions is None:
         actions = np.zeros((fixed.periods, fixed.width))
@@ -167,18 +168,24 @@ def _driven(base: Any, snapshot: Any, actions: Array, n: int) -> tuple[Array, Ar
 
     Disturbances, and a programme's front wheels without the added angle, do not depend on them.
     """
-    p, z = snapshot["params"], snapshot["state"]
+    z, window = snapshot["state"], window_of(1)
     bounds = np.array([[entry.low, entry.high] for entry in base.layout]).T.copy()
-    obs = np.empty(len(base.layout), np.float32)
-    rows, packets, report = snapshot["rows"], snapshot["packets"], np.zeros(len(REPORT))
-    switches, scratch = snapshot["template"].switches, scratch_of(1)
+    row = Row(
+        p=snapshot["params"],
+        z=z,
+        switches=snapshot["switches"],
+        obs=np.empty(len(base.layout), np.float32),
+        rows=snapshot["rows"],
+        packets=snapshot["packets"],
+        report=np.zeros(len(REPORT)),
+    )
     taken = np.repeat(np.vstack([actions, actions[-1:]]).astype(np.float32), n, axis=0)
     ticks = n * len(actions)
     drive, driver = np.empty((ticks + 1, len(Drive._fields))), np.empty(ticks + 1)
     for tick in range(ticks + 1):
         drive[tick] = read(z, Z.drive)
         driver[tick] = z[Z.driver]
-        step_vehicle(p, z, switches, taken[tick], 1, bounds, obs, rows, packets, report, scratch)
+        step_vehicle(*row, taken[tick], 1, bounds, window)
     return np.nan_to_num(drive), np.nan_to_num(driver)  # a car thrown about may leave the numbers
 
 

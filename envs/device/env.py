@@ -12,7 +12,7 @@ from ..arguments import count_of, mask_of, mode_of, named
 from ..backend.arrays import read
 from ..backend.on_torch import torch
 from ..engine.layout import FLAGS, P
-from ..engine.packing import Template
+from ..engine.packing import EpisodeConfig
 from ..engine.step import kind_of
 from ..engine.tick import Kind
 from ..sensors.link import Link
@@ -24,7 +24,7 @@ from .cuda_graph import Graphed
 from .packets import Most, most_of
 from .state import compiles, device_of, dtype_of, told_actions
 from .step import Brought, Held, Step
-from .transfer import Rows
+from .transfer import DeviceRows
 
 Tensor = torch.Tensor
 Infos = dict[str, Any]
@@ -90,11 +90,11 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
         self.observation_space = host.observation_space
         self.action_space = host.action_space
         self._started = self._waiting = False
-        self._kind = _kind_of(host.setting.base)
+        self._kind = _kind_of(host.config.base)
         self._links: dict[int, set[Link]] = {
-            i: set() for i, name in enumerate(SLOW_NAMES) if name in host.setting.slow
+            i: set() for i, name in enumerate(SLOW_NAMES) if name in host.config.slow
         }
-        self._build(self._most_of([host.setting.base]))
+        self._build(self._most_of([host.config.base]))
 
     @classmethod
     def make(cls, env_id: str, num_envs: int = 1, **arguments: Any) -> "DeviceVectorEnv":
@@ -104,39 +104,39 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
             raise ValueError(f"{env_id} has no environment on the device")
         return cls(num_envs, **{**spec.kwargs, **arguments})
 
-    def _most_of(self, templates: Iterable[Template]) -> dict[int, Most]:
-        """What the slow sensors need room for with these templates and those before; ValueError
-        for a template of another kind of plant."""
-        told = list(templates)
-        for template in told:
-            kind = _kind_of(template)
+    def _most_of(self, configs: Iterable[EpisodeConfig]) -> dict[int, Most]:
+        """What the slow sensors need room for with these configs and those before; ValueError
+        for a config of another kind of plant."""
+        told = list(configs)
+        for config in told:
+            kind = _kind_of(config)
             if kind != self._kind:
                 raise ValueError(
                     f"on a device all rows have one kind of plant, {self._kind}; "
-                    f"scenario {template.scenario.name!r} has {kind}"
+                    f"scenario {config.scenario.name!r} has {kind}"
                 )
-        for template in told:
+        for config in told:
             for sensor, links in self._links.items():
-                links.add(read(template.params, P.slow[sensor]))
+                links.add(read(config.start.params, P.slow[sensor]))
         n = self.control_period
         return {sensor: most_of(list(links), n) for sensor, links in self._links.items()}
 
     def _build(self, most: dict[int, Most]) -> None:
         """The step with this room, and all rows on the device."""
         host = self._host
-        all_samples = bool(host.setting.base.switches[FLAGS.all_samples])
+        all_samples = bool(host.config.base.start.switches[FLAGS.all_samples])
         step = Step(
             self._kind,
             self.control_period,
             most,
             all_samples,
-            host.setting.bounds,
+            host.config.bounds,
             self.dtype,
             self.device,
             self._compiled,
         )
         self._step = Graphed(step) if self._graphed else step
-        self._rows = Rows(host, most, self.device, self.dtype)
+        self._rows = DeviceRows(host, most, self.device, self.dtype)
 
     def reset(
         self, *, seed: Any = None, options: Mapping[str, Any] | None = None
@@ -148,8 +148,8 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
             mask = told["reset_mask"] = mask.cpu().numpy()
         chosen = np.flatnonzero(mask_of(mask, self.num_envs))
         free = {name: value for name, value in told.items() if name != "reset_mask"}
-        made, _ = host.optioned(free, chosen.tolist())
-        most = self._most_of(template for template, _ in made)
+        configs, _ = host.with_options(free, chosen.tolist())
+        most = self._most_of(configs)
         if most == self._rows.most:
             host.reset(seed=seed, options=told)
             self._rows.take_over(host, chosen)
@@ -169,10 +169,10 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
             raise ResetNeeded(
                 f"the episode is over in {named(over)}: call reset() with a reset_mask"
             )
-        setting, rows = self._host.setting, self._rows
-        fail = setting.on_bad_action == "fail"
+        config, rows = self._host.config, self._rows
+        fail = config.on_bad_action == "fail"
         told = told_actions(
-            actions, self.num_envs, setting.action_width, fail, self.device, self.dtype
+            actions, self.num_envs, config.action_width, fail, self.device, self.dtype
         )
         with torch.no_grad():
             held, brought = self._step(rows.params, rows.keys, rows.held, told)
@@ -200,7 +200,7 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
     def _restart(self, over: Tensor) -> None:
         """Reset these rows (N,) without options."""
         chosen = over.nonzero()[:, 0].cpu().numpy()
-        self._host.restart(chosen)
+        self._host.reset_rows(chosen)
         self._host.over[chosen] = False
         self._rows.take_over(self._host, chosen)
 
@@ -258,12 +258,12 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
         Raises ValueError for one of another number of rows, control period or observation, and one
         whose rows have another kind of plant.
         """
-        templates = {id(each): each for each in snapshot["templates"]}
-        most = self._most_of(templates.values())
+        configs = {id(each): each for each in snapshot["configs"]}
+        most = self._most_of(configs.values())
         self._host.set_state(snapshot)
         self._build(most)
         self._started, self._waiting = snapshot["started"], bool(self._rows.held.over.any())
 
 
-def _kind_of(template: Template) -> Kind:
-    return Kind(*map(int, kind_of(template.params, template.switches)))
+def _kind_of(config: EpisodeConfig) -> Kind:
+    return Kind(*map(int, kind_of(config.start.params, config.start.switches)))

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from ..backend.on_torch import torch
-from ..engine.episodes import Fleet, Whole
+from ..engine.episodes import Episodes, Whole
 from ..record import PACKET_WIDTH
 from .packets import Most
 from .state import held_of, write_states
@@ -15,25 +15,25 @@ Tensor = torch.Tensor
 _RECORD = Brought._fields.index("rows")  # from here on the rows are the last axis
 
 
-class Rows:
-    """What a device holds of the rows of a fleet.
+class DeviceRows:
+    """What a device holds of the rows of a episodes.
 
     most: the slow sensors present and what each one needs room for.
     """
 
     def __init__(
-        self, fleet: Fleet, most: dict[int, Most], device: torch.device, dtype: torch.dtype
+        self, episodes: Episodes, most: dict[int, Most], device: torch.device, dtype: torch.dtype
     ) -> None:
         self.most, self._device, self._dtype = most, device, dtype
         self._room = sum(each.under_way for each in most.values())
         self._packets = self._room + sum(each.frames * each.copies for each in most.values())
-        everything = np.arange(len(fleet.params))
-        self.params, self.keys, self.held, self.brought = self._of(fleet, everything)
+        everything = np.arange(len(episodes.params))
+        self.params, self.keys, self.held, self.brought = self._of(episodes, everything)
 
-    def take_over(self, fleet: Fleet, rows: Whole) -> None:
-        """Bring rows of the fleet that were reset to the device."""
-        params, keys, held, brought = self._of(fleet, rows)
-        if len(rows) == len(fleet.params):
+    def take_over(self, episodes: Episodes, rows: Whole) -> None:
+        """Bring rows of the episodes that were reset to the device."""
+        params, keys, held, brought = self._of(episodes, rows)
+        if len(rows) == len(episodes.params):
             self.params.copy_(params)  # in place: a graph reads them where they are
             self.keys.copy_(keys)
             self.held, self.brought = held, brought
@@ -50,42 +50,47 @@ class Rows:
         record = map(merged, before[_RECORD:], brought[_RECORD:])
         self.brought = Brought(merged(before.obs, brought.obs, 0), *before[1:_RECORD], *record)
 
-    def give_back(self, fleet: Fleet) -> None:
-        """Write what the device holds into the fleet."""
-        write_states(self.held, fleet.states)
+    def give_back(self, episodes: Episodes) -> None:
+        """Write what the device holds into the episodes."""
+        write_states(self.held, episodes.states)
         brought = Brought(*(each.cpu() for each in self.brought))
         packets = brought.packets.permute(2, 0, 1)
-        width = min(packets.shape[1], fleet.packets.shape[1])
-        fleet.packets[:, :width] = packets[:, :width]
-        fleet.rows[:] = brought.rows.permute(2, 0, 1)
-        fleet.over[:] = self.held.over.cpu()
-        fleet.reports[:] = self.held.report.T.cpu()
-        fleet.obs[:] = brought.obs
-        fleet.ticks_done[:], fleet.delivered[:] = brought.done, brought.delivered
+        width = min(packets.shape[1], episodes.packets.shape[1])
+        episodes.packets[:, :width] = packets[:, :width]
+        episodes.rows[:] = brought.rows.permute(2, 0, 1)
+        episodes.over[:] = self.held.over.cpu()
+        episodes.reports[:] = self.held.report.T.cpu()
+        episodes.obs[:] = brought.obs
+        episodes.ticks_done[:], episodes.delivered[:] = brought.done, brought.delivered
 
-    def _of(self, fleet: Fleet, rows: Whole) -> tuple[Tensor, Tensor, Held, Brought]:
-        """(params, keys, what is held, what the last step brought) of rows of the fleet."""
+    def _of(self, episodes: Episodes, rows: Whole) -> tuple[Tensor, Tensor, Held, Brought]:
+        """(params, keys, what is held, what the last step brought) of some rows."""
         device, dtype = self._device, self._dtype
 
         def there(array: Any, *axes: int) -> Tensor:
             return torch.as_tensor(array.transpose(*axes).copy()).to(device, dtype)
 
         held, keys = held_of(
-            fleet.states[rows], fleet.over[rows], fleet.reports[rows], self._room, device, dtype
+            episodes.states[rows],
+            episodes.over[rows],
+            episodes.reports[rows],
+            self._room,
+            device,
+            dtype,
         )
         packets = np.zeros((len(rows), self._packets, PACKET_WIDTH))
-        width = min(self._packets, fleet.packets.shape[1])
-        packets[:, :width] = fleet.packets[rows, :width]
+        width = min(self._packets, episodes.packets.shape[1])
+        packets[:, :width] = episodes.packets[rows, :width]
         none = torch.zeros(len(rows), dtype=torch.bool, device=device)
         brought = Brought(
-            torch.as_tensor(fleet.obs[rows]).to(device),
+            torch.as_tensor(episodes.obs[rows]).to(device),
             torch.zeros(len(rows), dtype=dtype, device=device),
             none,
             none,
             none,
-            there(fleet.rows[rows], 1, 2, 0),
+            there(episodes.rows[rows], 1, 2, 0),
             there(packets, 1, 2, 0),
-            torch.as_tensor(fleet.ticks_done[rows]).to(device),
-            torch.as_tensor(fleet.delivered[rows]).to(device),
+            torch.as_tensor(episodes.ticks_done[rows]).to(device),
+            torch.as_tensor(episodes.delivered[rows]).to(device),
         )
-        return there(fleet.params[rows], 1, 0), keys, held, brought
+        return there(episodes.params[rows], 1, 0), keys, held, brought

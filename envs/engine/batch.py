@@ -6,7 +6,8 @@ from ..backend.arrays import abreast
 from ..backend.decorators import copied, jit
 from ..task.failures import REFUSED, RUNNING
 from ..task.info import REPORT
-from .lanes import step_block
+from .arrays import Records, Rows, Start, row_of, start_of
+from .lanes import Block, step_block
 from .layout import FLAGS
 from .reset import reset_vehicle
 from .step import kind_of, shares_of, step_vehicle
@@ -19,42 +20,40 @@ def step_rows(
     params: Any,
     states: Any,
     switches: Any,
-    actions: Any,
-    n: int,
-    bounds: Any,
-    over: Any,
     obs: Any,
     rows: Any,
     packets: Any,
     reports: Any,
     ticks_done: Any,
     delivered: Any,
+    over: Any,
+    actions: Any,
+    n: int,
+    bounds: Any,
     rewards: Any,
     terminated: Any,
     truncated: Any,
-    scratch: Any,
-    block: Any,
+    block: Block,
 ) -> int:
-    """One env-step of every row, and how many episodes ended; every array has a row for each.
+    """One env-step of every row, and how many episodes ended.
 
-    over: rows whose episode had ended stand still, with reward 0, and do not end again; then those
-    that ended in this step. Returns REFUSED, and steps nothing, where an action that is not to
-    fail its row is not finite. scratch: what `scratch_of` gives. block: what rows that are computed
-    together need, a `Block`.
+    The first ten are `Rows`, one by one as in `step_vehicle`. Rows whose episode is `over` stand
+    still, with reward 0, and do not end again; then those that ended in this step are. Returns
+    REFUSED, and steps nothing, where an action that is not to fail its row is not finite.
     """
+    every = Rows(params, states, switches, obs, rows, packets, reports, ticks_done, delivered, over)
     for i in range(len(over)):
         if switches[i, FLAGS.fail_bad] == 0 and not over[i]:
             for share in actions[i]:
                 if float(share) - float(share) != 0.0:
                     return REFUSED
-    every = (params, states, switches, actions, obs, rows, packets, reports)
     waiting, last = 0, len(over) - 1
     for m in range(len(over)):
         i = block.order[m]
         if not over[i]:
             share, _ = shares_of(actions[i])
             if share != share:
-                ticks_done[i] = _step_alone(i, every, n, bounds, scratch)
+                ticks_done[i] = _step_alone(i, every, actions, n, bounds, block)
                 obs[i, :] = 0.0
             else:
                 block.members[waiting] = i
@@ -62,10 +61,11 @@ def step_rows(
         if waiting and (waiting == abreast() or m == last or _kinds_differ(m, every, block)):
             together = False
             if waiting > _FEW:
-                together = step_block(waiting, every, n, bounds, block)
+                together = step_block(waiting, every, actions, n, bounds, block)
             for lane in range(waiting):
-                row = block.members[lane]
-                ticks_done[row] = n if together else _step_alone(row, every, n, bounds, scratch)
+                i = block.members[lane]
+                done = n if together else _step_alone(i, every, actions, n, bounds, block)
+                ticks_done[i] = done
             waiting = 0
     ended = 0
     for i in range(len(over)):
@@ -84,88 +84,49 @@ def step_rows(
 
 
 @jit
-def _kinds_differ(m: int, every: Any, block: Any) -> bool:
+def _kinds_differ(m: int, rows: Rows, block: Block) -> bool:
     """Whether the next row in order has another text than this one."""
-    params, switches = every[0], every[2]
     i, j = block.order[m], block.order[m + 1]
-    return bool(kind_of(params[i], switches[i]) != kind_of(params[j], switches[j]))
+    mine, next_one = rows.switches[i], rows.switches[j]
+    return bool(kind_of(rows.params[i], mine) != kind_of(rows.params[j], next_one))
 
 
 @jit
-def _step_alone(i: int, every: Any, n: int, bounds: Any, scratch: Any) -> int:
-    params, states, switches, actions, obs, rows, packets, reports = every
+def _step_alone(i: int, rows: Rows, actions: Any, n: int, bounds: Any, block: Block) -> int:
+    row = row_of(rows, i)
     return int(
         step_vehicle(
-            params[i],
-            states[i],
-            switches[i],
+            row.p,
+            row.z,
+            row.switches,
+            row.obs,
+            row.rows,
+            row.packets,
+            row.report,
             actions[i],
             n,
             bounds,
-            obs[i],
-            rows[i],
-            packets[i],
-            reports[i],
-            scratch,
+            block.alone,
         )
     )
 
 
 @jit
 def reset_rows(
-    chosen: Any,
-    of: Any,
-    templates: Any,
-    low: Any,
-    high: Any,
-    kinds: Any,
-    starts: Any,
-    drawn: Any,
-    keys: Any,
-    bounds: Any,
-    params: Any,
-    states: Any,
-    switches: Any,
-    obs: Any,
-    rows: Any,
-    packets: Any,
-    reports: Any,
-    ticks_done: Any,
-    delivered: Any,
-    final_rows: Any,
-    final_packets: Any,
-    final_ticks_done: Any,
-    final_delivered: Any,
+    chosen: Any, of: Any, starts: Start, keys: Any, bounds: Any, rows: Rows, final: Records
 ) -> None:
-    """Reset the chosen rows (M,), whose records are first kept in the final_... ones.
+    """Reset the chosen rows (M,), whose records go into `final` before.
 
-    of: (M,), each one's place in templates, low, high, kinds (their switches) and starts.
-    keys: (M, 2), two words of 32 bits.
+    of: (M,), each one's place in `starts`. keys: (M, 2), two words of 32 bits.
     """
     for m in range(len(chosen)):
         i, t = chosen[m], of[m]
-        for j in range(ticks_done[i]):
-            copied(rows[i, j], final_rows[i, j])
-        for j in range(delivered[i]):
-            copied(packets[i, j], final_packets[i, j])
-        final_ticks_done[i], final_delivered[i] = ticks_done[i], delivered[i]
-        copied(kinds[t], switches[i])
-        reset_vehicle(
-            templates[t],
-            low[t],
-            high[t],
-            kinds[t],
-            starts[t],
-            drawn,
-            int(keys[m, 0]),
-            int(keys[m, 1]),
-            bounds,
-            params[i],
-            states[i],
-            obs[i],
-            rows[i],
-            packets[i],
-            reports[i],
-        )
-        ticks_done[i] = 1
-        delivered[i] = int(reports[i, REPORT.packets])
+        for j in range(rows.ticks_done[i]):
+            copied(rows.rows[i, j], final.rows[i, j])
+        for j in range(rows.delivered[i]):
+            copied(rows.packets[i, j], final.packets[i, j])
+        final.ticks_done[i], final.delivered[i] = rows.ticks_done[i], rows.delivered[i]
+        key_low, key_high = int(keys[m, 0]), int(keys[m, 1])
+        reset_vehicle(start_of(starts, t), key_low, key_high, bounds, row_of(rows, i))
+        rows.ticks_done[i] = 1
+        rows.delivered[i] = int(rows.reports[i, REPORT.packets])

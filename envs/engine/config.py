@@ -1,4 +1,4 @@
-"""What an environment is told once, checked; and the template of an episode with its options."""
+"""The environment's configuration, checked, and that of an episode with its options."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -7,7 +7,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from ..arguments import brief, check_choice, is_finite, listed, mapping_of, number_of
 from ..record import Array
@@ -20,25 +19,25 @@ from ..task.observation import Entry, observation_layout
 from ..ticks import ticks
 from ..vehicle.dynamics import Motion
 from ..vehicle.vehicle import Vehicle, vehicle_from
-from .packing import Template, template_of
+from .packing import EpisodeConfig, episode_config
 
 
 def in_scenario(sensors: dict[str, SlowSensor], scenario: Scenario) -> dict[str, SlowSensor]:
     """The sensors with the clocks and delays that a scenario sets for those that are there."""
-    told = dict(sensors)
-    if "camera" in told and scenario.camera_delays is not None:
-        told["camera"] = dataclasses.replace(
-            told["camera"], delays=scenario.camera_delays, jitter=scenario.camera_jitter
+    changed = dict(sensors)
+    if "camera" in changed and scenario.camera_delays is not None:
+        changed["camera"] = dataclasses.replace(
+            changed["camera"], delays=scenario.camera_delays, jitter=scenario.camera_jitter
         )
-    if "gps" in told and scenario.gps_period is not None:
-        told["gps"] = dataclasses.replace(told["gps"], period=scenario.gps_period)
-    if "gps" in told and scenario.gps_delays is not None:
-        told["gps"] = dataclasses.replace(told["gps"], delays=scenario.gps_delays, jitter=0.0)
-    return told
+    if "gps" in changed and scenario.gps_period is not None:
+        changed["gps"] = dataclasses.replace(changed["gps"], period=scenario.gps_period)
+    if "gps" in changed and scenario.gps_delays is not None:
+        changed["gps"] = dataclasses.replace(changed["gps"], delays=scenario.gps_delays, jitter=0.0)
+    return changed
 
 
 def most_packets(sensor: SlowSensor, n: int) -> int:
-    """Room for the worst case: all frames of a step and all that were under way."""
+    """The worst case: all frames of a step, doubled, and all that were under way."""
     period = min(sensor.period, SHORTEST_GPS_PERIOD)  # of any scenario
     return 2 * (n // int(ticks(period)) + 1) + IN_FLIGHT
 
@@ -47,9 +46,9 @@ OPTIONS = ("scenario", "vehicle", "friction", "state", "duration")
 
 
 @dataclass(frozen=True)
-class Setting:
+class EnvConfig:
     """The arguments of an environment, which hold for all its episodes but for options of reset;
-    `StabilityEnv` says what they mean.
+    `StabilityEnv` describes them.
 
     Raises TypeError or ValueError for an argument out of place.
     """
@@ -97,7 +96,7 @@ class Setting:
         return np.array([[entry.low, entry.high] for entry in self.layout]).T.copy()
 
     @property
-    def room(self) -> int:
+    def most_packets(self) -> int:
         """The most packets of a step."""
         n = int(self.control_period)
         return sum(most_packets(sensor, n) for sensor in self.slow.values())
@@ -108,31 +107,30 @@ class Setting:
         return 2 if self.steering else 1
 
     @cached_property
-    def base(self) -> Template:
-        """What an episode without options starts from."""
-        return self.template(self.scenario, self.vehicle)
+    def base(self) -> EpisodeConfig:
+        """An episode without options."""
+        return self.episode(self.scenario, self.vehicle)
 
-    def template(self, scenario: Scenario, vehicle: Vehicle) -> Template:
-        """What an episode of a scenario with a true vehicle starts from."""
-        return template_of(
+    def episode(
+        self, scenario: Scenario, vehicle: Vehicle, motion: Array | None = None
+    ) -> EpisodeConfig:
+        """An episode of a scenario with a true vehicle and a start, as of `motion_from`."""
+        return episode_config(
             scenario,
             vehicle,
             self.nominal,
             in_scenario(self.slow, scenario),
             self.reference,
+            motion,
             self.fast == "all",
             self.yaw_first,
             self.on_bad_action == "fail",
         )
 
-    def optioned(self, options: Mapping[str, Any]) -> tuple[Template, npt.NDArray[np.float64]]:
-        """The template of one episode with options of reset, and its start.
-
-        Returns a template and a Motion's numbers, NaN where the option `state` says nothing.
-        Raises ValueError for an unknown option or state.
-        """
+    def with_options(self, options: Mapping[str, Any]) -> EpisodeConfig:
+        """An episode with options of reset; ValueError for an unknown option or state."""
         if not options:
-            return self.base, np.full(len(Motion._fields), np.nan)
+            return self.base
         unknown = sorted(set(options) - set(OPTIONS))
         if unknown:
             raise ValueError(
@@ -146,20 +144,14 @@ class Setting:
         if "duration" in options:
             duration = number_of("reset option duration", options["duration"])
             scenario = scenario.replace(duration=duration)
-        start = start_of(options.get("state", {}), scenario)
-        template = self.template(scenario, vehicle)
-        if not np.isnan(start[0]):  # the car starts at another speed than it holds
-            template = dataclasses.replace(template, held_speed=None)
-        return template, start
+        return self.episode(scenario, vehicle, motion_from(options.get("state", {}), scenario))
 
 
-def start_of(state: Mapping[str, Any], scenario: Scenario) -> npt.NDArray[np.float64]:
+def motion_from(state: Mapping[str, Any], scenario: Scenario) -> Array:
     """A Motion's numbers (len(Motion),), NaN where the mapping has none; ValueError for a name
     that is no state's, a value that is no number, and roll where the scenario has none."""
-    left, start = (
-        dict(mapping_of("reset option state", state)),
-        np.full(len(Motion._fields), np.nan),
-    )
+    left = dict(mapping_of("reset option state", state))
+    start = np.full(len(Motion._fields), np.nan)
     for i, name in enumerate(Motion._fields):
         value = left.pop(name, None)
         if value is not None and not (is_finite(value) and abs(value) <= 1e6):

@@ -10,16 +10,17 @@ from ..backend.decorators import apart
 from ..backend.simd import LANES
 from ..record import FAST_WIDTH, Array
 from ..task.info import REPORT
+from .arrays import Rows, row_of
 from .layout import PARAMS_WIDTH, STATE_WIDTH, Z
 from .step import conclude, drive_on, kind_of, shares_of
-from .window import foresee_abreast, scratch_of
+from .window import foresee_lanes, window_of
 
 _TOLD = len(REPORT)
 _MOVING = Z.slow[0].frames  # what a tick changes comes first in a state, but for the driver's angle
 
 
 class Block(NamedTuple):
-    """Room for the rows that are computed abreast; the last axis is the lanes'."""
+    """Working arrays of a batch step; the last axis of those of a block is the lanes'."""
 
     order: npt.NDArray[np.int64]  # (N,), all rows, those of one kind next to each other
     members: npt.NDArray[np.int64]  # (lanes,), the rows that are computed now
@@ -28,7 +29,8 @@ class Block(NamedTuple):
     shares: Array
     rows: Array
     reports: Array
-    scratch: Array
+    window: Array  # `window.window_of` the block
+    alone: Array  # and of a row that is stepped by itself
 
 
 def block_of(count: int, n: int) -> Block:
@@ -41,18 +43,16 @@ def block_of(count: int, n: int) -> Block:
         np.zeros((2, LANES)),
         np.zeros((n, FAST_WIDTH, LANES)),
         np.zeros((_TOLD, LANES)),
-        scratch_of(n, LANES),
+        window_of(n, LANES),
+        window_of(n),
     )
 
 
 @apart
-def step_block(count: int, every: Any, n: int, bounds: Any, block: Any) -> bool:
+def step_block(count: int, rows: Rows, actions: Any, n: int, bounds: Any, block: Block) -> bool:
     """One env-step of the first `count` of the block's members, of one kind, whose actions are
-    finite; False, and nothing is changed, where not all of them come to the step's end.
-
-    every: params, states, switches, actions, obs, rows, packets, reports, with a row for each car.
-    """
-    params, states, switches, actions, obs, rows, packets, reports = every
+    finite; False, and nothing is changed, where not all of them come to the step's end."""
+    params, states = rows.params, rows.states
     for lane in range(abreast()):
         i = block.members[lane if lane < count else 0]  # spare lanes repeat the first
         for k in range(PARAMS_WIDTH):
@@ -62,8 +62,8 @@ def step_block(count: int, every: Any, n: int, bounds: Any, block: Any) -> bool:
         block.states[Z.driver, lane] = states[i, Z.driver]
         block.shares[0, lane], block.shares[1, lane] = shares_of(actions[i])
     first = block.members[0]
-    kind = kind_of(params[first], switches[first])
-    foresee_abreast(block.params, block.states, n, kind.follows, block.scratch)
+    kind = kind_of(params[first], rows.switches[first])
+    foresee_lanes(block.params, block.states, n, kind.follows, block.window)
     done = drive_on(
         block.params,
         block.states,
@@ -73,7 +73,7 @@ def step_block(count: int, every: Any, n: int, bounds: Any, block: Any) -> bool:
         n,
         block.rows,
         block.reports,
-        block.scratch,
+        block.window,
         False,
     )
     if done == 0:
@@ -84,21 +84,9 @@ def step_block(count: int, every: Any, n: int, bounds: Any, block: Any) -> bool:
             states[i, k] = block.states[k, lane]
         states[i, Z.driver] = block.states[Z.driver, lane]
         for k in range(_TOLD):
-            reports[i, k] = block.reports[k, lane]
+            rows.reports[i, k] = block.reports[k, lane]
         for j in range(n):
             for k in range(FAST_WIDTH):
-                rows[i, j, k] = block.rows[j, k, lane]
-        conclude(
-            params[i],
-            states[i],
-            switches[i],
-            n,
-            n,
-            bounds,
-            obs[i],
-            rows[i],
-            packets[i],
-            reports[i],
-            block.scratch[:, :, lane],
-        )
+                rows.rows[i, j, k] = block.rows[j, k, lane]
+        conclude(row_of(rows, i), n, n, bounds, block.window[:, :, lane])
     return True

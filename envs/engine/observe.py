@@ -14,22 +14,13 @@ from .layout import FLAGS, P, Z
 
 
 @jit
-def observe(
-    p: Any,
-    z: Any,
-    switches: Any,
-    rows: Any,
-    n: int,
-    count: int,
-    packets: Any,
-    refs: Any,
-    bounds: Any,
-    obs: Any,
-) -> None:
-    """Write the float32 summary; every entry clipped at its bounds (layout.observation_layout)."""
+def observe(row: Any, n: int, count: int, refs: Any, bounds: Any) -> None:
+    """Write the float32 observation of a record of n ticks and `count` packets, every entry
+    clipped at its bounds (2, k); entries as in `observation_layout`."""
+    p, z, obs, rows, packets = row.p, row.z, row.obs, row.rows, row.packets
     k = 0
     for column in range(SAMPLED):
-        if switches[FLAGS.all_samples]:
+        if row.switches[FLAGS.all_samples]:
             for j in range(n):
                 obs[k] = clip(rows[j, column], bounds[0, k], bounds[1, k])
                 k += 1

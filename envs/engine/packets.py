@@ -12,7 +12,7 @@ from ..record import PACKET, PACKET_WIDTH
 from ..sensors.link import arrivals
 from ..sensors.slow import BLOCKS, VALUES, Scene, sample
 from ..ticks import NEVER
-from .layout import P, Z
+from .layout import FLAGS, P, Z
 
 FAR = 1e15
 
@@ -97,13 +97,12 @@ def scene_of(p: Any, motion: Any, small_angle: int, key: Any, tick: Any) -> Scen
 
 
 @jit
-def sense_slow(
-    p: Any, z: Any, motion: Any, tick: Any, small_angle: int, packets: Any, count: int
-) -> int:
+def sense_slow(row: Any, motion: Any, tick: Any, count: int) -> int:
     """The slow sensors sample the motion at a tick, and due packets are delivered.
 
     Returns how many packets there are then.
     """
+    p, z, small_angle = row.p, row.z, row.switches[FLAGS.small_angle]
     key = (int(z[Z.clock.key_low]), int(z[Z.clock.key_high]))
     for sensor in range(len(Z.slow)):
         at = Z.slow[sensor]
@@ -112,5 +111,5 @@ def sense_slow(
             values, quality, z[at.drift] = sample(sensor, scene, link, z[at.drift])
             _capture(z, sensor, link, tick, key, values, quality)
     if tick >= z[Z.clock.next_due]:
-        count = _deliver(z, tick, packets, count)
+        count = _deliver(z, tick, row.packets, count)
     return count

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from ..arguments import brief, check_choice
 from ..record import Array
@@ -22,38 +21,29 @@ from ..sensors.slow import SLOW_NAMES
 from ..task.reference import REFERENCES, target_of
 from ..ticks import FOREVER, TICK, ticks
 from ..vehicle.actuators import lag_of
-from ..vehicle.dynamics import Car, Road
+from ..vehicle.dynamics import Car, Motion, Road
 from ..vehicle.tyres import TYRE_LAWS
 from ..vehicle.vehicle import GRAVITY, Vehicle
-from .layout import PARAMS_WIDTH, Change, Disturbance, P, Params, Switches, Task
+from .arrays import Start
+from .layout import PARAMS_WIDTH, Change, Disturbance, Params, Switches, Task
 
 SPIN_ANGLE = 0.5  # rad of sideslip: the car has spun
 
 
 @dataclass(frozen=True)
-class Template:
-    """What a reset starts from.
+class EpisodeConfig:
+    """An episode before its draws.
 
-    params: (PARAMS_WIDTH,) packed parameters. low, high: (len(Draws),) ranges. switches:
-    (len(Switches),) int64.
-    vehicle, nominal: with the scenario's replacements. held_speed: m/s, where it is one number
-    and held exactly. duration: ticks.
+    start: what a reset starts from, packed. vehicle, nominal: with the scenario's replacements.
+    held_speed: m/s, where it is one number and held exactly.
     """
 
-    params: Array
-    low: Array
-    high: Array
-    switches: npt.NDArray[np.int64]
+    start: Start
     vehicle: Vehicle
     nominal: Vehicle
     scenario: Scenario
     slow: dict[str, SlowSensor]
     held_speed: float | None
-
-    @property
-    def duration(self) -> int:
-        """Ticks of an episode."""
-        return int(self.params[P.task.duration])
 
 
 def car_of(vehicle: Vehicle) -> Car:
@@ -134,17 +124,21 @@ def _numbers(part: Any) -> list[float]:
     return [number for each in part for number in _numbers(each)]
 
 
-def template_of(
+def episode_config(
     scenario: Scenario,
     vehicle: Vehicle,
     nominal: Vehicle,
     slow: dict[str, SlowSensor],
     reference: str,
+    motion: Array | None = None,
     all_samples: bool = False,
     yaw_first: bool = True,
     fail_bad: bool = False,
-) -> Template:
-    """Pack everything that a reset does not draw; ValueError where something is out of place."""
+) -> EpisodeConfig:
+    """Pack everything that a reset does not draw; ValueError where something is out of place.
+
+    motion: (len(Motion),), where the car starts, NaN for the default (None: of all).
+    """
     check_choice("reference", reference, REFERENCES)
     vehicle = vehicle.replace(**scenario.vehicle)
     nominal = nominal.replace(**scenario.nominal)
@@ -189,9 +183,6 @@ def template_of(
         path=path_of(scenario.path, vehicle.width),
         change=Change(FOREVER, 1.0, 1.0),  # drawn
     )
-    packed = np.array(_numbers(params), dtype=np.float64)
-    assert len(packed) == PARAMS_WIDTH
-    low, high = scenario.draws()
     switches = Switches(
         small_angle=int(scenario.small_angle),
         law=TYRE_LAWS.index(scenario.tyres),
@@ -201,6 +192,14 @@ def template_of(
         fail_bad=int(fail_bad),
         roll=int(scenario.roll),
     )
-    flags = np.array(switches, dtype=np.int64)
-    held = scenario.held_speed
-    return Template(packed, low, high, flags, vehicle, nominal, scenario, slow, held)
+    low, high = scenario.draws()
+    start = Start(
+        params=np.array(_numbers(params), np.float64),
+        low=low,
+        high=high,
+        switches=np.array(switches, np.int64),
+        motion=np.full(len(Motion._fields), np.nan) if motion is None else motion,
+    )
+    assert len(start.params) == PARAMS_WIDTH
+    held = scenario.held_speed if np.isnan(start.motion[0]) else None  # or it starts at another
+    return EpisodeConfig(start, vehicle, nominal, scenario, slow, held)

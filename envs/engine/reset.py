@@ -7,7 +7,7 @@ from ..backend.decorators import apart, copied, jit
 from ..backend.primitives import select
 from ..backend.random import CHANNELS, normals
 from ..record import FAST
-from ..scenarios.draws import realise
+from ..scenarios.draws import DRAWS_WIDTH, realise
 from ..scenarios.driver import wanted_angle
 from ..scenarios.steering import DRIVER, steering_at, write_steering
 from ..scenarios.tracks import laid
@@ -19,6 +19,7 @@ from ..task.reference import reference
 from ..ticks import FOREVER, NEVER, whole_ticks
 from ..vehicle.dynamics import gravity_at, sideslip_angle
 from ..vehicle.vehicle import GRAVITY
+from .arrays import Row, Start
 from .layout import FLAGS, STATE_WIDTH, P, Z
 from .observe import observe, write_report
 from .packets import FAR, sense_slow
@@ -47,30 +48,14 @@ def _write_surroundings(p: Any, d: Any, s: Any, v_x: Any) -> None:
 
 
 @apart
-def reset_vehicle(
-    template: Any,
-    low: Any,
-    high: Any,
-    switches: Any,
-    start: Any,
-    drawn: Any,
-    key_low: int,
-    key_high: int,
-    bounds: Any,
-    p: Any,
-    z: Any,
-    obs: Any,
-    rows: Any,
-    packets: Any,
-    report: Any,
-) -> None:
-    """Draw the episode from a key and deliver tick 0.
-
-    template: packed parameters with the vehicle and everything the scenario does not draw.
-    start: a Motion whose NaN entries are the default (standing on the road at the drawn speed).
-    """
-    copied(template, p)
-    d, redraws = realise(low, high, key_low, key_high, read(p, P.car), drawn)
+def reset_vehicle(start: Start, key_low: int, key_high: int, bounds: Any, row: Row) -> None:
+    """Draw the episode from a key, two words of 32 bits, and deliver tick 0."""
+    p, z, rows, report = row.p, row.z, row.rows, row.report
+    copied(start.params, p)
+    copied(start.switches, row.switches)
+    switches = row.switches
+    drawn = z[:DRAWS_WIDTH]  # until the state is written
+    d, redraws = realise(start.low, start.high, key_low, key_high, read(p, P.car), drawn)
     p[P.car.C_f] = p[P.car.C_f] * d.front_stiffness
     p[P.car.C_r] = p[P.car.C_r] * d.rear_stiffness
     change = select(d.tyre_change_time > 0.0, whole_ticks(d.tyre_change_time), FOREVER)
@@ -81,8 +66,8 @@ def reset_vehicle(
         z[i] = 0.0
     z[Z.motion.v_x] = d.speed
     for i in range(len(Z.motion)):
-        if start[i] == start[i]:
-            z[Z.motion[i]] = start[i]
+        if start.motion[i] == start.motion[i]:
+            z[Z.motion[i]] = start.motion[i]
     motion = read(z, Z.motion)
     _write_surroundings(p, d, motion.s, motion.v_x)
     n = normals(key_low, key_high, 0, CHANNELS.initial)
@@ -112,15 +97,15 @@ def reset_vehicle(
     accel = (g_x, g_y + GRAVITY * motion.phi)
     chance, noise = Chance(fast, wheels), read(p, P.noise)
     write(rows[0], fast_row(motion, accel, acted, p[P.car.d_f], noise, chance), FAST)
-    count = sense_slow(p, z, motion, 0.0, small_angle, packets, 0)
+    count = sense_slow(row, motion, 0.0, 0)
     v = 0.5 * (rows[0, FAST.wheel_left] + rows[0, FAST.wheel_right])
     refs = reference(steer, v, target, switches[FLAGS.reference])
+    shown = 1
     if switches[FLAGS.all_samples]:  # tick 0 stands for all samples of a step
         for j in range(1, len(rows)):
             copied(rows[0], rows[j])
-        observe(p, z, switches, rows, len(rows), count, packets, refs, bounds, obs)
-    else:
-        observe(p, z, switches, rows, 1, count, packets, refs, bounds, obs)
+        shown = len(rows)
+    observe(row, shown, count, refs, bounds)
     write_report(report, z)
     report[REPORT.beta] = beta
     report[REPORT.beta_ref], report[REPORT.gamma_ref] = refs

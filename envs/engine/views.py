@@ -1,4 +1,4 @@
-"""What an episode's packed numbers tell: its car, its sensors' clocks, its record, its info."""
+"""Views of an episode's packed numbers: its car, its sensors' clocks, its motion, its record."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -12,34 +12,34 @@ from ..ticks import TICK, ticks
 from ..vehicle.dynamics import Motion
 from ..vehicle.vehicle import Vehicle
 from .layout import P, Z
-from .packing import Template
+from .packing import EpisodeConfig
 
 T = TypeVar("T")
 
 
-def vehicle_in(template: Template, params: Array, state: Array) -> Vehicle:
+def vehicle_in(config: EpisodeConfig, params: Array, state: Array) -> Vehicle:
     """The true vehicle now, with what the seed drew; friction is the mean of both sides'."""
     car, change = read(params, P.car), read(params, P.change)
     if not car.m > 0.0:  # not reset yet
-        return template.vehicle
+        return config.vehicle
     changed = state[Z.clock.tick] >= change.tick
-    return template.vehicle.replace(
+    return config.vehicle.replace(
         front_stiffness=car.C_f * (change.front if changed else 1.0),
         rear_stiffness=car.C_r * (change.rear if changed else 1.0),
         friction=0.5 * (car.mu + car.mu_r),
     )
 
 
-def slow_in(template: Template, state: Array) -> dict[str, SlowSensor]:
+def slow_in(config: EpisodeConfig, state: Array) -> dict[str, SlowSensor]:
     """The slow sensors by name, with the clock phase that the episode drew."""
-    told = {}
-    for name, sensor in template.slow.items():
+    sensors = {}
+    for name, sensor in config.slow.items():
         if sensor.phase is None:
             at = Z.slow[SLOW_NAMES.index(name)]
             first = state[at.next_capture] - state[at.frames] * ticks(sensor.period)
             sensor = dataclasses.replace(sensor, phase=first * TICK)
-        told[name] = sensor
-    return told
+        sensors[name] = sensor
+    return sensors
 
 
 def motion_in(state: Array) -> Motion:

@@ -1,4 +1,4 @@
-"""The scratch array of an env-step: what its ticks bring that does not depend on the car (noise and
+"""The window array of an env-step: what its ticks bring that does not depend on the car (noise and
 the programme's steering), and where the car went.
 
 Its columns are the ticks of the step. Of vehicles abreast it has a third axis, their lanes.
@@ -32,13 +32,13 @@ class Window(NamedTuple):
 WINDOW, _HEIGHT = offsets(Window)
 
 
-def scratch_of(n: int, *lanes: int) -> Array:
+def window_of(n: int, *lanes: int) -> Array:
     """The array for n ticks a step, whose columns are whole lanes."""
     return np.zeros((_HEIGHT, -(-n // LANES) * LANES, *lanes))
 
 
 @jit
-def foresee(p: Any, z: Any, n: int, follows: int, scratch: Any) -> None:
+def foresee(p: Any, z: Any, n: int, follows: int, window: Any) -> None:
     """The random numbers and the programme's steering of the next n ticks of one vehicle.
 
     follows: 1 where the driver reacts to the car, and no programme steers.
@@ -50,20 +50,20 @@ def foresee(p: Any, z: Any, n: int, follows: int, scratch: Any) -> None:
         ticks = ramp(first + j)
         inertial = normals(key_low, key_high, ticks, CHANNELS.inertial)
         wheels = normals(key_low, key_high, ticks, CHANNELS.wheels)
-        put_along(scratch, inertial[0], WINDOW.inertial[0], j)
-        put_along(scratch, inertial[1], WINDOW.inertial[1], j)
-        put_along(scratch, inertial[2], WINDOW.inertial[2], j)
-        put_along(scratch, inertial[3], WINDOW.inertial[3], j)
-        put_along(scratch, wheels[0], WINDOW.wheels[0], j)
-        put_along(scratch, wheels[1], WINDOW.wheels[1], j)
-        put_along(scratch, wheels[2], WINDOW.wheels[2], j)
-        put_along(scratch, wheels[3], WINDOW.wheels[3], j)
+        put_along(window, inertial[0], WINDOW.inertial[0], j)
+        put_along(window, inertial[1], WINDOW.inertial[1], j)
+        put_along(window, inertial[2], WINDOW.inertial[2], j)
+        put_along(window, inertial[3], WINDOW.inertial[3], j)
+        put_along(window, wheels[0], WINDOW.wheels[0], j)
+        put_along(window, wheels[1], WINDOW.wheels[1], j)
+        put_along(window, wheels[2], WINDOW.wheels[2], j)
+        put_along(window, wheels[3], WINDOW.wheels[3], j)
         if not follows:
-            put_along(scratch, steering_at(to_float(ticks), programme), WINDOW.ahead, j)
+            put_along(window, steering_at(to_float(ticks), programme), WINDOW.ahead, j)
 
 
 @jit
-def foresee_abreast(p: Any, z: Any, n: int, follows: int, scratch: Any) -> None:
+def foresee_lanes(p: Any, z: Any, n: int, follows: int, window: Any) -> None:
     """The same of vehicles abreast: p, z with a column for each."""
     clock = read(z, Z.clock)
     key_low, key_high = whole(clock.key_low), whole(clock.key_high)
@@ -72,13 +72,13 @@ def foresee_abreast(p: Any, z: Any, n: int, follows: int, scratch: Any) -> None:
         tick = clock.tick + (j + 1)
         inertial = normals(key_low, key_high, whole(tick), CHANNELS.inertial)
         wheels = normals(key_low, key_high, whole(tick), CHANNELS.wheels)
-        write(scratch, inertial, WINDOW.inertial, j)
-        write(scratch, wheels, WINDOW.wheels, j)
+        write(window, inertial, WINDOW.inertial, j)
+        write(window, wheels, WINDOW.wheels, j)
         if not follows:
-            put(scratch, steering_at(tick, programme), WINDOW.ahead, j)
+            put(window, steering_at(tick, programme), WINDOW.ahead, j)
 
 
 @jit
-def chance_at(scratch: Any, j: int) -> Chance:
+def chance_at(window: Any, j: int) -> Chance:
     """The random numbers of a tick of the step."""
-    return Chance(read(scratch, WINDOW.inertial, j), read(scratch, WINDOW.wheels, j))
+    return Chance(read(window, WINDOW.inertial, j), read(window, WINDOW.wheels, j))

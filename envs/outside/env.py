@@ -69,7 +69,7 @@ class OutsideEnv(StabilityEnv):
         """Start an episode; see `StabilityEnv`."""
         asked = dict(options or {})
         check_options(asked, self.model)
-        scenario = scenario_from(asked.get("scenario", self.setting.base.scenario))
+        scenario = scenario_from(asked.get("scenario", self.config.base.scenario))
         if "duration" in asked:
             duration = number_of("reset option duration", asked["duration"])
             scenario = scenario.replace(duration=duration)
@@ -103,12 +103,11 @@ class OutsideEnv(StabilityEnv):
         share, turn = shares_of(force)
         if share != share:
             return super()._advance(force, obs)  # refuses or fails before it moves anything
-        p, z, switches, n = self._params, self._state, self._now.switches, self.control_period
-        kind = _kind_of(p, switches)
-        foresee(p, z, n, kind.follows, self._scratch)
+        p, z, n = self._params, self._state, self.control_period
+        kind = _kind_of(p, self._switches)
+        foresee(p, z, n, kind.follows, self._window)
         done = self._drive_on(_fixed_of(p), kind, share, turn)
-        record = (self.rows, self.packets, self._report, self._scratch)
-        conclude(p, z, switches, n, done, self._bounds, obs, *record)
+        conclude(self._row(obs), n, done, self._bounds, self._window)
         return done
 
     def _drive_on(self, fixed: Fixed, kind: Kind, share: float, turn: float) -> int:
@@ -118,7 +117,7 @@ class OutsideEnv(StabilityEnv):
         tick, cost, done, over = float(z[Z.clock.tick]), 0.0, 0, False
         N_z, added = share * task.yaw_scale, turn * task.authority
         while not over:
-            chance = chance_at(self._scratch, done)
+            chance = chance_at(self._window, done)
             control = _command(fixed, N_z, added, now, tick, chance)
             acted = control.acted
             # a quotient, not the product of `command`: its last bit is that of all drives so far
@@ -127,12 +126,12 @@ class OutsideEnv(StabilityEnv):
             motion, force = now.motion, (0.0, 0.0)
             if plant.finite:
                 motion, force = plant.motion, plant.specific_force
-            ahead = at(self._scratch, WINDOW.ahead, done)
+            ahead = at(self._window, WINDOW.ahead, done)
             driver, seen = _sense(fixed, motion, force, acted, ahead, chance, kind)
             seen = seen._replace(lost=not plant.finite)
             now = Moving(motion, control.drive, None, driver, now.car)
             write(self.rows[done], seen.row, FAST)
-            write(self._scratch, motion, WINDOW.track, done)
+            write(self._window, motion, WINDOW.track, done)
             tick, cost, done = tick + 1.0, cost + seen.cost * TICK, done + 1
             failed = seen.lost or seen.spun or seen.off
             over = failed or tick >= task.duration or done == self.control_period

@@ -124,9 +124,7 @@ def test_a_plant_of_another_kind_is_refused_and_nothing_is_reset() -> None:
         env.reset(seed=1, options={"scenario": ["straight", "dakf-fig6"]})
     after = env.get_state()
     assert bits(before["states"]) == bits(after["states"])
-    after["templates"] = DeviceVectorEnv.make(FUSION, 2, scenario="dakf-fig6").get_state()[
-        "templates"
-    ]
+    after["configs"] = DeviceVectorEnv.make(FUSION, 2, scenario="dakf-fig6").get_state()["configs"]
     with pytest.raises(ValueError, match="one kind of plant"):
         env.set_state(after)
     with pytest.raises(ValueError, match="the snapshot has 3 rows"):

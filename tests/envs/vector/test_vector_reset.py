@@ -81,14 +81,14 @@ def test_each_row_may_have_options_of_its_own(options: dict[str, Any], mode: str
         assert info == {key: infos[key][i] for key in info}
     same_cars(alone, together)
     assert drive(alone, together, 60) > 4
-    assert all(each == together.setting.scenario for each in together.scenario)  # all were reset
+    assert all(each == together.config.scenario for each in together.scenario)  # all were reset
 
 
 @pytest.mark.plain
 def test_rows_that_are_told_the_same_share_what_is_built() -> None:
     env = batch(FUSION, 4)
     env.reset(seed=0, options={"scenario": ["sine", "slalom", "sine", "sine"]})
-    built = {id(template) for template in env.templates}
+    built = {id(config) for config in env.configs}
     assert len(built) == 2
 
 
