@@ -77,7 +77,7 @@ class Record:
 
 
 def concatenate(records: list[Record]) -> Record:
-    """One record of the given consecutive ones; ValueError where ticks do not follow."""
+    """One record of consecutive ones; ValueError where ticks do not follow."""
     for before, after in itertools.pairwise(records):
         if after.first != before.first + len(before.fast):
             raise ValueError(

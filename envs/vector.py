@@ -52,7 +52,7 @@ class StabilityVectorEnv(Episodes, VectorEnv[Observations, Any, npt.NDArray[Any]
     the values are not read.
 
     ## Records
-    `rows` (N, n, FAST_WIDTH) of which `ticks_done` (N,) are there, `packets` (N, room,
+    `rows` (N, n, FAST_WIDTH) of which `ticks_done` (N,) are there, `packets` (N, most,
     PACKET_WIDTH) of which `delivered` (N,) are; `final_...` are those before a row's newest reset.
     `record[i]` is a row's `Record`.
 

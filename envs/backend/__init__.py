@@ -5,8 +5,8 @@ and `arrays` are what such texts may call; `elementary` and `random` are built f
 sideslip is imported here, and every other room may import this one.
 """
 
-from .arrays import abreast as abreast
 from .arrays import at as at
+from .arrays import lane_count as lane_count
 from .arrays import offsets as offsets
 from .arrays import put as put
 from .arrays import put_along as put_along

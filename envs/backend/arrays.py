@@ -72,18 +72,18 @@ def put(array: Any, value: Any, *index: int) -> None:
     array[index] = value
 
 
-def abreast() -> int:
+def lane_count() -> int:
     """How many numbers `ramp` gives and `put_along` writes at once."""
     return 1
 
 
 def ramp(first: int) -> Any:
-    """The whole numbers from `first` on, `abreast` of them."""
+    """The whole numbers from `first` on, `lane_count` of them."""
     return first
 
 
 def put_along(array: Any, values: Any, i: int, j: int) -> None:
-    """Write `abreast` numbers into the row i of a C-contiguous matrix from the column j on."""
+    """Write `lane_count` numbers into the row i of a C-contiguous matrix from the column j on."""
     array[i, j] = values
 
 
@@ -196,14 +196,14 @@ def _lower_write(context, builder, sig, args):
     return context.get_dummy_value()
 
 
-@infer_global(abreast)
-class _Abreast(AbstractTemplate):
+@infer_global(lane_count)
+class _LaneCount(AbstractTemplate):
     def generic(self, args, kws):
         return signature(types.intp)
 
 
-@lower_builtin(abreast)
-def _lower_abreast(context, builder, sig, args):
+@lower_builtin(lane_count)
+def _lower_lane_count(context, builder, sig, args):
     return context.get_constant(types.intp, LANES)
 
 

@@ -3,7 +3,7 @@
 from typing import Any
 
 from ..backend.on_torch import torch
-from .step import Brought, Held, Step
+from .step import Outcome, State, Step
 
 Tensor = torch.Tensor
 _WARM = 3  # calls before the recording, as torch asks for
@@ -22,29 +22,30 @@ class Graphed:
         self._fixed: tuple[Tensor, ...] = ()
 
     def __call__(
-        self, p: Tensor, keys: Tensor, held: Held, actions: Tensor
-    ) -> tuple[Held, Brought]:
+        self, p: Tensor, keys: Tensor, state: State, actions: Tensor
+    ) -> tuple[State, Outcome]:
         """As `Step`."""
         fixed = (p, keys)
         if self._graph is None or any(a is not b for a, b in zip(fixed, self._fixed, strict=True)):
-            self._record(p, keys, held, actions)
+            self._record(p, keys, state, actions)
         assert self._graph is not None
-        for mine, new in zip((*self._held, self._actions), (*held, actions), strict=True):
+        for mine, new in zip((*self._state, self._actions), (*state, actions), strict=True):
             mine.copy_(new)
         self._graph.replay()
-        after, brought = self._after
-        return Held(*(each.clone() for each in after)), Brought(*(each.clone() for each in brought))
+        after, outcome = self._after
+        copies = [each.clone() for each in (*after, *outcome)]
+        return State(*copies[: len(after)]), Outcome(*copies[len(after) :])
 
-    def _record(self, p: Tensor, keys: Tensor, held: Held, actions: Tensor) -> None:
+    def _record(self, p: Tensor, keys: Tensor, state: State, actions: Tensor) -> None:
         self._fixed = (p, keys)
-        self._held = Held(*(each.clone() for each in held))
+        self._state = State(*(each.clone() for each in state))
         self._actions = actions.clone()
         stream: Any = torch.cuda.Stream(p.device)  # type: ignore[no-untyped-call]
         stream.wait_stream(torch.cuda.current_stream(p.device))
         with torch.cuda.stream(stream):
             for _ in range(_WARM):
-                self._step(p, keys, self._held, self._actions)
+                self._step(p, keys, self._state, self._actions)
         torch.cuda.current_stream(p.device).wait_stream(stream)
         self._graph = torch.cuda.CUDAGraph()
         with torch.cuda.graph(self._graph):
-            self._after = self._step(p, keys, self._held, self._actions)
+            self._after = self._step(p, keys, self._state, self._actions)

@@ -21,9 +21,9 @@ from ..task.failures import RUNNING
 from ..task.info import REPORT, Report
 from ..vector import StabilityVectorEnv
 from .cuda_graph import Graphed
-from .packets import Most, most_of
-from .state import compiles, device_of, dtype_of, told_actions
-from .step import Brought, Held, Step
+from .packets import Capacity, capacity_of
+from .state import actions_on, compiles, device_of, dtype_of
+from .step import Outcome, State, Step
 from .transfer import DeviceRows
 
 Tensor = torch.Tensor
@@ -49,7 +49,7 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
 
     ## Tensors
     Observations are (N, k) float32, rewards (N,), `terminated` and `truncated` (N,) of bool.
-    Infos are tensors (N,), told of every row. All are new ones each time. After a step `rows`
+    Infos are tensors (N,), of every row. All are new ones each time. After a step `rows`
     (N, n, FAST_WIDTH), of which `ticks_done` (N,) are there, and `packets` (N, most, PACKET_WIDTH),
     of which `delivered` (N,) are, make the record.
 
@@ -94,35 +94,37 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
         self._links: dict[int, set[Link]] = {
             i: set() for i, name in enumerate(SLOW_NAMES) if name in host.config.slow
         }
-        self._build(self._most_of([host.config.base]))
+        self._build(self._capacities([host.config.base]))
 
     @classmethod
     def make(cls, env_id: str, num_envs: int = 1, **arguments: Any) -> "DeviceVectorEnv":
-        """The environments of an id; its own arguments are replaced by those given."""
+        """The environments of an id; `arguments` replace its own."""
         spec = gym.spec(env_id)
         if spec.vector_entry_point != "sideslip.envs.vector:StabilityVectorEnv":
             raise ValueError(f"{env_id} has no environment on the device")
         return cls(num_envs, **{**spec.kwargs, **arguments})
 
-    def _most_of(self, configs: Iterable[EpisodeConfig]) -> dict[int, Most]:
-        """What the slow sensors need room for with these configs and those before; ValueError
-        for a config of another kind of plant."""
-        told = list(configs)
-        for config in told:
+    def _capacities(self, configs: Iterable[EpisodeConfig]) -> dict[int, Capacity]:
+        """The slow sensors' capacities with these configs and those before.
+
+        Raises ValueError for a config of another kind of plant.
+        """
+        configs = list(configs)
+        for config in configs:
             kind = _kind_of(config)
             if kind != self._kind:
                 raise ValueError(
                     f"on a device all rows have one kind of plant, {self._kind}; "
                     f"scenario {config.scenario.name!r} has {kind}"
                 )
-        for config in told:
+        for config in configs:
             for sensor, links in self._links.items():
                 links.add(read(config.start.params, P.slow[sensor]))
         n = self.control_period
-        return {sensor: most_of(list(links), n) for sensor, links in self._links.items()}
+        return {sensor: capacity_of(list(links), n) for sensor, links in self._links.items()}
 
-    def _build(self, most: dict[int, Most]) -> None:
-        """The step with this room, and all rows on the device."""
+    def _build(self, most: dict[int, Capacity]) -> None:
+        """The step with these capacities, and all rows on the device."""
         host = self._host
         all_samples = bool(host.config.base.start.switches[FLAGS.all_samples])
         step = Step(
@@ -142,60 +144,60 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
         self, *, seed: Any = None, options: Mapping[str, Any] | None = None
     ) -> tuple[Tensor, Infos]:
         """Start episodes; seeds, options and errors are those of `StabilityVectorEnv`."""
-        host, told = self._host, dict(options or {})
-        mask = told.get("reset_mask")
+        host, asked = self._host, dict(options or {})
+        mask = asked.get("reset_mask")
         if isinstance(mask, torch.Tensor):
-            mask = told["reset_mask"] = mask.cpu().numpy()
+            mask = asked["reset_mask"] = mask.cpu().numpy()
         chosen = np.flatnonzero(mask_of(mask, self.num_envs))
-        free = {name: value for name, value in told.items() if name != "reset_mask"}
+        free = {name: value for name, value in asked.items() if name != "reset_mask"}
         configs, _ = host.with_options(free, chosen.tolist())
-        most = self._most_of(configs)
+        most = self._capacities(configs)
         if most == self._rows.most:
-            host.reset(seed=seed, options=told)
+            host.reset(seed=seed, options=asked)
             self._rows.take_over(host, chosen)
         else:
             self._rows.give_back(host)
-            host.reset(seed=seed, options=told)
+            host.reset(seed=seed, options=asked)
             self._build(most)
-        self._started, self._waiting = True, bool(self._rows.held.over.any())
-        return self._rows.brought.obs, self._infos()
+        self._started, self._waiting = True, bool(self._rows.state.over.any())
+        return self._rows.outcome.obs, self._infos()
 
     def step(self, actions: Any) -> tuple[Tensor, Tensor, Tensor, Tensor, Infos]:
         """Hold each row's action for one control period."""
         if not self._started:
             raise ResetNeeded("no episode was started: call reset() first")
         if self._waiting and self._mode == AutoresetMode.DISABLED:
-            over = self._rows.held.over.nonzero()[:, 0].tolist()
+            over = self._rows.state.over.nonzero()[:, 0].tolist()
             raise ResetNeeded(
                 f"the episode is over in {named(over)}: call reset() with a reset_mask"
             )
         config, rows = self._host.config, self._rows
         fail = config.on_bad_action == "fail"
-        told = told_actions(
+        asked = actions_on(
             actions, self.num_envs, config.action_width, fail, self.device, self.dtype
         )
         with torch.no_grad():
-            held, brought = self._step(rows.params, rows.keys, rows.held, told)
-        flags = torch.stack((brought.refused.any(), held.over.any()))
+            state, outcome = self._step(rows.params, rows.keys, rows.state, asked)
+        flags = torch.stack((outcome.refused.any(), state.over.any()))
         refused, ended = flags.tolist()  # the one time the device is waited for
         if refused and not fail:
-            bad = brought.refused.nonzero()[:, 0].tolist()
+            bad = outcome.refused.nonzero()[:, 0].tolist()
             raise ValueError(
-                f"the action of {named(bad)} is not finite, {told[bad[0]].tolist()}; "
+                f"the action of {named(bad)} is not finite, {asked[bad[0]].tolist()}; "
                 "nothing was stepped"
             )
-        resting = rows.held.over if self._waiting else None
-        rows.held, rows.brought, self._waiting = held, brought, ended
+        resting = rows.state.over if self._waiting else None
+        rows.state, rows.outcome, self._waiting = state, outcome, ended
         infos: Infos = {}
         if resting is not None:
             self._restart(resting)
         if ended and self._mode == AutoresetMode.SAME_STEP:
-            infos = {"final_obs": brought.obs, "final_info": self._infos()}
-            infos |= {f"_{key}": held.over for key in infos}
-            self._restart(held.over)
+            infos = {"final_obs": outcome.obs, "final_info": self._infos()}
+            infos |= {f"_{key}": state.over for key in infos}
+            self._restart(state.over)
             self._waiting = False
         infos |= self._infos()
-        return rows.brought.obs, brought.rewards, brought.terminated, brought.truncated, infos
+        return rows.outcome.obs, outcome.rewards, outcome.terminated, outcome.truncated, infos
 
     def _restart(self, over: Tensor) -> None:
         """Reset these rows (N,) without options."""
@@ -206,7 +208,7 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
 
     def _infos(self) -> Infos:
         """The numbers of `info` of every row, (N,) each."""
-        report = self._rows.held.report
+        report = self._rows.state.report
         infos: Infos = dict(zip(Report._fields, report[: REPORT.failure].unbind(0), strict=False))
         infos["failure"] = failure = report[REPORT.failure].to(torch.int64)
         infos["is_success"] = (report[REPORT.ended] == 1.0) & (failure == RUNNING)
@@ -215,31 +217,31 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
     @property
     def rows(self) -> Tensor:
         """The fast rows of the newest record, (N, n, FAST_WIDTH)."""
-        return self._rows.brought.rows.permute(2, 0, 1)
+        return self._rows.outcome.rows.permute(2, 0, 1)
 
     @property
     def packets(self) -> Tensor:
         """The packets of the newest record, (N, most, PACKET_WIDTH)."""
-        return self._rows.brought.packets.permute(2, 0, 1)
+        return self._rows.outcome.packets.permute(2, 0, 1)
 
     @property
     def ticks_done(self) -> Tensor:
         """How many of `rows` are there, (N,)."""
-        return self._rows.brought.done
+        return self._rows.outcome.done
 
     @property
     def delivered(self) -> Tensor:
         """How many of `packets` are there, (N,)."""
-        return self._rows.brought.delivered
+        return self._rows.outcome.delivered
 
     @property
     def motion(self) -> Tensor:
         """The true `Motion` of each row now, (N, len(Motion)), in SI units."""
-        return self._rows.held.motion.T.clone()
+        return self._rows.state.motion.T.clone()
 
-    def tensors(self) -> tuple[Held, Brought]:
-        """What the device holds of the rows, and what the newest step brought; the env's own."""
-        return self._rows.held, self._rows.brought
+    def tensors(self) -> tuple[State, Outcome]:
+        """The state of the rows on the device and the newest step's outcome; the env's own."""
+        return self._rows.state, self._rows.outcome
 
     @property  # type: ignore[misc]  # without a setter, as in the vector env
     def np_random(self) -> tuple[np.random.Generator, ...]:  # type: ignore[override]
@@ -259,10 +261,10 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
         whose rows have another kind of plant.
         """
         configs = {id(each): each for each in snapshot["configs"]}
-        most = self._most_of(configs.values())
+        most = self._capacities(configs.values())
         self._host.set_state(snapshot)
         self._build(most)
-        self._started, self._waiting = snapshot["started"], bool(self._rows.held.over.any())
+        self._started, self._waiting = snapshot["started"], bool(self._rows.state.over.any())
 
 
 def _kind_of(config: EpisodeConfig) -> Kind:

@@ -1,4 +1,4 @@
-"""What an env-step tells on tensors: the float32 observation and the numbers of `info`."""
+"""The float32 observation and the report of an env-step, on tensors."""
 
 from typing import Any
 
@@ -14,13 +14,13 @@ from ..task.info import Report
 from ..task.observation import AGE_CAP, SAMPLED
 from ..ticks import NEVER, TICK
 from .packets import Delivered
-from .ticks import Now, Told
+from .ticks import Now, Shown
 
 Tensor = torch.Tensor
 
 
-class Telling:
-    """What the rows of a batch tell: `sensors` are the slow ones present."""
+class Observer:
+    """Observations and reports of a batch: `sensors` are the slow ones present."""
 
     def __init__(
         self, sensors: tuple[int, ...], all_samples: bool, bounds: Tensor, dtype: torch.dtype
@@ -49,8 +49,8 @@ class Telling:
         entries += rows[-1, FAST.steer : FAST.steer + 4].unbind(0)
         for sensor in self._sensors:
             entries += self._sensor(sensor, now.tick, slow[sensor], delivered)
-        told = Told(*now.told)
-        entries += [told.beta_ref, told.gamma_ref]
+        shown = Shown(*now.shown)
+        entries += [shown.beta_ref, shown.gamma_ref]
         low, high = self._bounds.unbind(0)
         clipped: Tensor = self._clip(torch.stack(entries), low, high)
         return clipped.T.to(torch.float32).contiguous()
@@ -72,16 +72,16 @@ class Telling:
         """The reports (len(Report), N) of rows that were stepped."""
         rest = self._rest_of_cost(duration, now.tick)
         cost = now.cost + self._select(now.failure != RUNNING, rest, 0.0)
-        told = Told(*now.told)
+        shown = Shown(*now.shown)
         named = {
             "t": now.tick * TICK,
-            "beta": told.beta,
+            "beta": shown.beta,
             "gamma": now.motion[2],
             "psi": now.motion[3],
-            "beta_ref": told.beta_ref,
-            "gamma_ref": told.gamma_ref,
-            "steer": told.steer,
-            "yaw_moment": told.moment,
+            "beta_ref": shown.beta_ref,
+            "gamma_ref": shown.gamma_ref,
+            "steer": shown.steer,
+            "yaw_moment": shown.moment,
             "cost": cost,
             "failure": now.failure,
             "packets": count.to(cost.dtype),

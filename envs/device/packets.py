@@ -23,15 +23,15 @@ Tensor = torch.Tensor
 _LATE = 1 << 62  # the place of what never arrives
 
 
-class Under(NamedTuple):
+class SlowState(NamedTuple):
     """The slow sensors' part of the rows' state."""
 
     slow: Tensor  # (sensors, SLOW_WIDTH, N)
-    queue: Tensor  # (room, PACKET_WIDTH, N), by arrival
+    queue: Tensor  # (capacity, PACKET_WIDTH, N), by arrival
 
 
 class Delivered(NamedTuple):
-    """What arrived in an env-step."""
+    """The packets that arrived in an env-step."""
 
     packets: Tensor  # (most, PACKET_WIDTH, N)
     number: Tensor  # (N,), how many of them are there
@@ -46,17 +46,17 @@ class Window(NamedTuple):
     track: Tensor  # (n, len(Motion), N), where the car was at each tick
 
 
-class Most(NamedTuple):
-    """What a sensor needs room for."""
+class Capacity(NamedTuple):
+    """The most packets of a sensor."""
 
     frames: int  # captured in an env-step
     under_way: int  # packets at once
     copies: int  # of a packet
 
 
-def most_of(links: Sequence[Link], n: int) -> Most:
-    """What sensors with any of these links need in an env-step of n ticks."""
-    return Most(
+def capacity_of(links: Sequence[Link], n: int) -> Capacity:
+    """The capacity for sensors with any of these links in an env-step of n ticks."""
+    return Capacity(
         max(-int(-n // link.period) for link in links),
         max(most_under_way(link) for link in links),
         2 if any(link.duplicate > 0.0 for link in links) else 1,
@@ -64,31 +64,31 @@ def most_of(links: Sequence[Link], n: int) -> Most:
 
 
 class SlowSensors:
-    """The slow sensors of a batch: those present, and what each one needs room for."""
+    """The slow sensors of a batch: those present, each with its capacity."""
 
-    def __init__(self, most: dict[int, Most], small_angle: int, dtype: torch.dtype) -> None:
+    def __init__(self, most: dict[int, Capacity], small_angle: int, dtype: torch.dtype) -> None:
         self.most, self._small_angle = most, small_angle
         self._sample, self._scene_of, self._arrivals, self._read, self._select = on_tensors(
             dtype, sample, scene_of, arrivals, read, select
         )
 
     def __call__(
-        self, p: Tensor, keys: Tensor, under: Under, window: Window
-    ) -> tuple[Under, Delivered]:
+        self, p: Tensor, keys: Tensor, state: SlowState, window: Window
+    ) -> tuple[SlowState, Delivered]:
         """The slow sensors' state after an env-step, and what arrived in it."""
-        sensors = [list(each.unbind(0)) for each in under.slow.unbind(0)]
+        sensors = [list(each.unbind(0)) for each in state.slow.unbind(0)]
         new: list[Tensor] = []
         for sensor, most in self.most.items():
             for _ in range(most.frames):
                 sensors[sensor], packets = self._capture(sensor, p, keys, sensors[sensor], window)
                 new += packets
-        queue = in_order(torch.cat([under.queue, torch.stack(new)]))
+        queue = in_order(torch.cat([state.queue, torch.stack(new)]))
         arrived = queue[:, PACKET.arrived]
         due = (arrived != NEVER) & (arrived <= window.last) & window.running
         count = due.sum(0)
         slow = self._newest(sensors, queue, due)
-        left = taken_off(queue, count)[: len(under.queue)]
-        return Under(slow, left), Delivered(queue, count)
+        left = taken_off(queue, count)[: len(state.queue)]
+        return SlowState(slow, left), Delivered(queue, count)
 
     def _capture(
         self, sensor: int, p: Tensor, keys: Tensor, slow: Sequence[Tensor], window: Window
@@ -122,7 +122,7 @@ class SlowSensors:
         return after, packets
 
     def _newest(self, sensors: list[list[Tensor]], queue: Tensor, due: Tensor) -> Tensor:
-        """The sensors' state, as in `Under`, once the due packets were looked at in order."""
+        """The sensors' state, as in `SlowState`, once the due packets were looked at in order."""
         pick = self._select
         for i in range(len(queue)):
             packet = queue[i].unbind(0)
@@ -130,12 +130,12 @@ class SlowSensors:
                 slow = sensors[sensor]
                 better = due[i] & (packet[PACKET.sensor] == sensor)
                 better = better & (packet[PACKET.captured] > slow[IN_SLOW.captured])
-                told = (
+                newest = (
                     packet[PACKET.captured],
                     *packet[PACKET.value : PACKET.value + VALUES],
                     packet[PACKET.arrived],
                 )
-                for k, value in enumerate(told, IN_SLOW.captured):
+                for k, value in enumerate(newest, IN_SLOW.captured):
                     slow[k] = pick(better, value, slow[k])
         return torch.stack([torch.stack(each) for each in sensors])
 
@@ -156,7 +156,7 @@ def in_order(queue: Tensor) -> Tensor:
 
 
 def taken_off(queue: Tensor, count: Tensor) -> Tensor:
-    """What is left of packets in order, (room, PACKET_WIDTH, N), without the first `count` (N,)."""
+    """The rest of packets in order, (capacity, PACKET_WIDTH, N), without the first `count` (N,)."""
     place = torch.arange(len(queue), device=queue.device)[:, None] + count
     gone = place >= len(queue)
     place = place.clamp(max=len(queue) - 1)
@@ -166,25 +166,25 @@ def taken_off(queue: Tensor, count: Tensor) -> Tensor:
     return torch.cat((before, arrived[:, None], after), 1)
 
 
-def read_packed(states: Tensor, room: int) -> Under:
+def read_packed(states: Tensor, capacity: int) -> SlowState:
     """The slow sensors' part of packed states (STATE_WIDTH, N); ValueError where they hold more
-    than `room` packets."""
-    if bool((states[Z.under_way] > room).any()):
-        raise ValueError(f"a state has more than {room} packets under way")
+    than `capacity` packets."""
+    if bool((states[Z.under_way] > capacity).any()):
+        raise ValueError(f"a state has more than {capacity} packets under way")
     slow = states[Z.slow[0].frames : Z.queue].reshape(len(Z.slow), SLOW_WIDTH, -1)
-    queue = states[Z.queue : Z.driver].reshape(-1, PACKET_WIDTH, states.shape[1])[:room].clone()
-    place = torch.arange(room, device=queue.device)[:, None]
+    queue = states[Z.queue : Z.driver].reshape(-1, PACKET_WIDTH, states.shape[1])[:capacity].clone()
+    place = torch.arange(capacity, device=queue.device)[:, None]
     queue[:, PACKET.arrived].masked_fill_(place >= states[Z.under_way], NEVER)
-    return Under(slow.clone(), in_order(queue))
+    return SlowState(slow.clone(), in_order(queue))
 
 
-def write_packed(under: Under, states: Tensor) -> None:
+def write_packed(state: SlowState, states: Tensor) -> None:
     """Write the slow sensors' part into packed states (STATE_WIDTH, N)."""
     count = states.shape[1]
-    states[Z.slow[0].frames : Z.queue] = under.slow.reshape(-1, count)
+    states[Z.slow[0].frames : Z.queue] = state.slow.reshape(-1, count)
     states[Z.queue : Z.driver] = 0.0
-    flat = under.queue.reshape(-1, count)
+    flat = state.queue.reshape(-1, count)
     states[Z.queue : Z.queue + len(flat)] = flat
-    arrived = under.queue[:, PACKET.arrived]
+    arrived = state.queue[:, PACKET.arrived]
     states[Z.under_way] = (arrived != NEVER).sum(0).to(states.dtype)
     states[Z.clock.next_due] = torch.where(arrived[0] == NEVER, FAR, arrived[0])

@@ -1,5 +1,5 @@
-"""What is told and kept at the border of the device engine: the device, the floats, the actions,
-and the rows' state in the packed form of the other engines."""
+"""Arguments of the device engine, checked: the device, the floats, the actions; and the rows' state
+in the packed form of the other engines."""
 
 import os
 import shutil
@@ -14,7 +14,7 @@ from ..backend.on_torch import DTYPES, torch
 from ..engine.layout import Z
 from ..record import Array
 from .packets import read_packed, write_packed
-from .step import Held
+from .step import State
 
 Tensor = torch.Tensor
 _MOTION, _DRIVE = (slice(part[0], part[-1] + 1) for part in (Z.motion, Z.drive))
@@ -60,7 +60,7 @@ def dtype_of(dtype: Any) -> torch.dtype:
     return known[dtype]
 
 
-def told_actions(
+def actions_on(
     actions: Any, count: int, width: int, fail: bool, device: torch.device, dtype: torch.dtype
 ) -> Tensor:
     """Actions (count, width) rounded to float32 as the other engines take them.
@@ -86,41 +86,40 @@ def told_actions(
     return rounded.to(dtype)
 
 
-def held_of(
+def state_of(
     states: Array,
     over: npt.NDArray[np.bool_],
     reports: Array,
-    room: int,
+    capacity: int,
     device: torch.device,
     dtype: torch.dtype,
-) -> tuple[Held, Tensor]:
+) -> tuple[State, Tensor]:
     """The state on the device, and the keys (2, N), of packed states (N, STATE_WIDTH)."""
     whole = torch.as_tensor(states.T.copy())
-    under = read_packed(whole, room)
-    held = Held(
+    slow_state = read_packed(whole, capacity)
+    state = State(
         whole[_MOTION],
         whole[_DRIVE],
         whole[Z.driver],
         whole[Z.clock.tick],
         whole[Z.clock.failure],
-        *under,
+        *slow_state,
         torch.as_tensor(over.copy()),
         torch.as_tensor(reports.T.copy()),
     )
-    moved = [each.to(device, None if each.dtype == torch.bool else dtype) for each in held]
-    return Held(*moved), whole[Z.clock.key_low : Z.clock.key_high + 1].to(device, torch.int64)
+    moved = [each.to(device, None if each.dtype == torch.bool else dtype) for each in state]
+    return State(*moved), whole[Z.clock.key_low : Z.clock.key_high + 1].to(device, torch.int64)
 
 
-def write_states(held: Held, states: Array) -> None:
+def write_states(state: State, states: Array) -> None:
     """Write the state into packed states (N, STATE_WIDTH), where keys and redraws already are."""
     whole = torch.as_tensor(states.T.copy())
-    here = Held(
-        *(each.cpu() if each.dtype == torch.bool else each.cpu().to(torch.float64) for each in held)
-    )
+    types = [None if each.dtype == torch.bool else torch.float64 for each in state]
+    here = State(*(each.to("cpu", to) for each, to in zip(state, types, strict=True)))
     whole[_MOTION] = here.motion
     whole[_DRIVE] = here.drive
     whole[Z.driver] = here.driver
     whole[Z.clock.tick] = here.tick
     whole[Z.clock.failure] = here.failure
-    write_packed(here.under, whole)
+    write_packed(here.slow_state, whole)
     states[:] = whole.numpy().T

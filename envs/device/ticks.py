@@ -25,8 +25,8 @@ Tensor = torch.Tensor
 Numbers = tuple[Tensor, ...]
 
 
-class Told(NamedTuple):
-    """What the last tick of a row tells `info`; (N,) each."""
+class Shown(NamedTuple):
+    """Numbers of `info` from the last tick of a row; (N,) each."""
 
     beta: Any
     beta_ref: Any
@@ -45,7 +45,7 @@ class Now(NamedTuple):
     tick: Tensor
     failure: Tensor  # codes as floats
     cost: Tensor
-    told: Numbers
+    shown: Numbers
     row: Numbers  # the newest fast row
     track: Numbers  # the newest motion, fit for `info` or not
 
@@ -101,22 +101,22 @@ class Ticks:
         tick = now.tick + alive
         failure = self._failure_of(seen)
         refs = [pick(seen.lost, 0.0, each) for each in seen.refs]
-        told = (pick(seen.lost, 0.0, seen.beta), *refs, seen.steer, seen.moment)
+        shown = (pick(seen.lost, 0.0, seen.beta), *refs, seen.steer, seen.moment)
 
-        def kept(where: Tensor, new: Any, old: Any) -> Numbers:
+        def chosen(where: Tensor, new: Any, old: Any) -> Numbers:
             return tuple(pick(where, a, b) for a, b in zip(new, old, strict=True))
 
         return Now(
             alive & (failure == RUNNING) & (tick < task.duration),
-            kept(fit, after.motion, now.motion),
-            kept(alive, after.drive, now.drive),
+            chosen(fit, after.motion, now.motion),
+            chosen(alive, after.drive, now.drive),
             pick(alive, after.driver, now.driver),
             tick,
             pick(alive, failure, now.failure),
             now.cost + pick(alive, seen.cost * TICK, 0.0),
-            kept(alive, told, now.told),
-            kept(alive, seen.row, now.row),
-            kept(alive, after.motion, now.track),
+            chosen(alive, shown, now.shown),
+            chosen(alive, seen.row, now.row),
+            chosen(alive, after.motion, now.track),
         )
 
     def drive_on(
@@ -137,9 +137,9 @@ class Ticks:
 
 def start_of(motion: Tensor, drive: Tensor, driver: Tensor, tick: Tensor, alive: Tensor) -> Now:
     """Where rows are at the start of an env-step."""
-    zeros = tick.new_zeros((2 + len(Told._fields) + FAST_WIDTH, len(tick)))
+    zeros = tick.new_zeros((2 + len(Shown._fields) + FAST_WIDTH, len(tick)))
     failure, cost, *others = zeros.unbind(0)
-    told, row = others[: len(Told._fields)], others[len(Told._fields) :]
+    shown, row = others[: len(Shown._fields)], others[len(Shown._fields) :]
     # no tensor stands twice: torch.compile would compile the first tick and the others apart
     return Now(
         alive,
@@ -149,7 +149,7 @@ def start_of(motion: Tensor, drive: Tensor, driver: Tensor, tick: Tensor, alive:
         tick,
         failure,
         cost,
-        tuple(told),
+        tuple(shown),
         tuple(row),
         motion.unbind(0),
     )

@@ -1,4 +1,4 @@
-"""The rows of a batch on a device: what they hold, and its way there and back."""
+"""The rows of a batch on a device, and their way there and back."""
 
 from typing import Any
 
@@ -7,36 +7,40 @@ import numpy as np
 from ..backend.on_torch import torch
 from ..engine.episodes import Episodes, Whole
 from ..record import PACKET_WIDTH
-from .packets import Most
-from .state import held_of, write_states
-from .step import Brought, Held
+from .packets import Capacity
+from .state import state_of, write_states
+from .step import Outcome, State
 
 Tensor = torch.Tensor
-_RECORD = Brought._fields.index("rows")  # from here on the rows are the last axis
+_RECORD = Outcome._fields.index("rows")  # from here on the rows are the last axis
 
 
 class DeviceRows:
-    """What a device holds of the rows of a episodes.
+    """Parameters, keys, state and last outcome of episodes, as tensors on a device.
 
-    most: the slow sensors present and what each one needs room for.
+    most: the slow sensors present and each one's capacity.
     """
 
     def __init__(
-        self, episodes: Episodes, most: dict[int, Most], device: torch.device, dtype: torch.dtype
+        self,
+        episodes: Episodes,
+        most: dict[int, Capacity],
+        device: torch.device,
+        dtype: torch.dtype,
     ) -> None:
         self.most, self._device, self._dtype = most, device, dtype
-        self._room = sum(each.under_way for each in most.values())
-        self._packets = self._room + sum(each.frames * each.copies for each in most.values())
+        self._capacity = sum(each.under_way for each in most.values())
+        self._packets = self._capacity + sum(each.frames * each.copies for each in most.values())
         everything = np.arange(len(episodes.params))
-        self.params, self.keys, self.held, self.brought = self._of(episodes, everything)
+        self.params, self.keys, self.state, self.outcome = self._of(episodes, everything)
 
     def take_over(self, episodes: Episodes, rows: Whole) -> None:
         """Bring rows of the episodes that were reset to the device."""
-        params, keys, held, brought = self._of(episodes, rows)
+        params, keys, state, outcome = self._of(episodes, rows)
         if len(rows) == len(episodes.params):
             self.params.copy_(params)  # in place: a graph reads them where they are
             self.keys.copy_(keys)
-            self.held, self.brought = held, brought
+            self.state, self.outcome = state, outcome
             return
         place = torch.as_tensor(rows, device=self._device)
 
@@ -45,36 +49,36 @@ class DeviceRows:
 
         self.params.index_copy_(-1, place, params)
         self.keys.index_copy_(-1, place, keys)
-        self.held = Held(*map(merged, self.held, held))
-        before = self.brought
-        record = map(merged, before[_RECORD:], brought[_RECORD:])
-        self.brought = Brought(merged(before.obs, brought.obs, 0), *before[1:_RECORD], *record)
+        self.state = State(*map(merged, self.state, state))
+        before = self.outcome
+        record = map(merged, before[_RECORD:], outcome[_RECORD:])
+        self.outcome = Outcome(merged(before.obs, outcome.obs, 0), *before[1:_RECORD], *record)
 
     def give_back(self, episodes: Episodes) -> None:
-        """Write what the device holds into the episodes."""
-        write_states(self.held, episodes.states)
-        brought = Brought(*(each.cpu() for each in self.brought))
-        packets = brought.packets.permute(2, 0, 1)
+        """Write state and outcome into the episodes."""
+        write_states(self.state, episodes.states)
+        outcome = Outcome(*(each.cpu() for each in self.outcome))
+        packets = outcome.packets.permute(2, 0, 1)
         width = min(packets.shape[1], episodes.packets.shape[1])
         episodes.packets[:, :width] = packets[:, :width]
-        episodes.rows[:] = brought.rows.permute(2, 0, 1)
-        episodes.over[:] = self.held.over.cpu()
-        episodes.reports[:] = self.held.report.T.cpu()
-        episodes.obs[:] = brought.obs
-        episodes.ticks_done[:], episodes.delivered[:] = brought.done, brought.delivered
+        episodes.rows[:] = outcome.rows.permute(2, 0, 1)
+        episodes.over[:] = self.state.over.cpu()
+        episodes.reports[:] = self.state.report.T.cpu()
+        episodes.obs[:] = outcome.obs
+        episodes.ticks_done[:], episodes.delivered[:] = outcome.done, outcome.delivered
 
-    def _of(self, episodes: Episodes, rows: Whole) -> tuple[Tensor, Tensor, Held, Brought]:
-        """(params, keys, what is held, what the last step brought) of some rows."""
+    def _of(self, episodes: Episodes, rows: Whole) -> tuple[Tensor, Tensor, State, Outcome]:
+        """(params, keys, state, the last step's outcome) of some rows."""
         device, dtype = self._device, self._dtype
 
         def there(array: Any, *axes: int) -> Tensor:
             return torch.as_tensor(array.transpose(*axes).copy()).to(device, dtype)
 
-        held, keys = held_of(
+        state, keys = state_of(
             episodes.states[rows],
             episodes.over[rows],
             episodes.reports[rows],
-            self._room,
+            self._capacity,
             device,
             dtype,
         )
@@ -82,7 +86,7 @@ class DeviceRows:
         width = min(self._packets, episodes.packets.shape[1])
         packets[:, :width] = episodes.packets[rows, :width]
         none = torch.zeros(len(rows), dtype=torch.bool, device=device)
-        brought = Brought(
+        outcome = Outcome(
             torch.as_tensor(episodes.obs[rows]).to(device),
             torch.zeros(len(rows), dtype=dtype, device=device),
             none,
@@ -93,4 +97,4 @@ class DeviceRows:
             torch.as_tensor(episodes.ticks_done[rows]).to(device),
             torch.as_tensor(episodes.delivered[rows]).to(device),
         )
-        return there(episodes.params[rows], 1, 0), keys, held, brought
+        return there(episodes.params[rows], 1, 0), keys, state, outcome

@@ -13,7 +13,7 @@ class Row(NamedTuple):
     switches: Any  # (len(Switches),) int64
     obs: Any  # (k,) float32
     rows: Any  # (n, FAST_WIDTH), the fast rows of the newest record
-    packets: Any  # (room, PACKET_WIDTH), its packets
+    packets: Any  # (most, PACKET_WIDTH), its packets
     report: Any  # (len(Report),)
 
 
@@ -42,7 +42,7 @@ class Records(NamedTuple):
 
 
 class Start(NamedTuple):
-    """What a reset starts from: one episode's, or with an axis before for several."""
+    """The packed start of an episode; of several, arrays have an axis more, the first."""
 
     params: Any  # (PARAMS_WIDTH,), with what the scenario does not draw
     low: Any  # (len(Draws),), the ranges that it draws from
@@ -67,7 +67,7 @@ def row_of(rows: Rows, i: int) -> Row:
 
 @jit
 def start_of(starts: Start, i: int) -> Start:
-    """What an episode of several starts from."""
+    """The start of one of several episodes."""
     return Start(
         starts.params[i],
         starts.low[i],

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from ..backend.arrays import abreast
+from ..backend.arrays import lane_count
 from ..backend.decorators import copied, jit
 from ..task.failures import REFUSED, RUNNING
 from ..task.info import REPORT
@@ -58,7 +58,7 @@ def step_rows(
             else:
                 block.members[waiting] = i
                 waiting += 1
-        if waiting and (waiting == abreast() or m == last or _kinds_differ(m, every, block)):
+        if waiting and (waiting == lane_count() or m == last or _kinds_differ(m, every, block)):
             together = False
             if waiting > _FEW:
                 together = step_block(waiting, every, actions, n, bounds, block)

@@ -47,7 +47,7 @@ OPTIONS = ("scenario", "vehicle", "friction", "state", "duration")
 
 @dataclass(frozen=True)
 class EnvConfig:
-    """The arguments of an environment, which hold for all its episodes but for options of reset;
+    """The arguments of an environment, common to its episodes but for options of reset;
     `StabilityEnv` describes them.
 
     Raises TypeError or ValueError for an argument out of place.

@@ -29,7 +29,7 @@ T = TypeVar("T")
 class Episodes:
     """N episodes of one `EnvConfig`: arrays with a row for each, and each one's generator.
 
-    `rows` (N, n, FAST_WIDTH) of which `ticks_done` (N,) are there and `packets` (N, room,
+    `rows` (N, n, FAST_WIDTH) of which `ticks_done` (N,) are there and `packets` (N, most,
     PACKET_WIDTH) of which `delivered` (N,) are make the records; `final_...` are those before a
     row's newest reset. What is no array is a sequence of N whose items are made when asked for.
     """

@@ -1,11 +1,11 @@
-"""One env-step of several vehicles of one kind, computed abreast in lanes; compiled."""
+"""One env-step of several vehicles of one kind in SIMD lanes; compiled."""
 
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from ..backend.arrays import abreast, at
+from ..backend.arrays import at, lane_count
 from ..backend.decorators import apart
 from ..backend.simd import LANES
 from ..record import FAST_WIDTH, Array
@@ -15,7 +15,7 @@ from .layout import PARAMS_WIDTH, STATE_WIDTH, Z
 from .step import conclude, drive_on, kind_of, shares_of
 from .window import foresee_lanes, window_of
 
-_TOLD = len(REPORT)
+_REPORT = len(REPORT)
 _MOVING = Z.slow[0].frames  # what a tick changes comes first in a state, but for the driver's angle
 
 
@@ -23,7 +23,7 @@ class Block(NamedTuple):
     """Working arrays of a batch step; the last axis of those of a block is the lanes'."""
 
     order: npt.NDArray[np.int64]  # (N,), all rows, those of one kind next to each other
-    members: npt.NDArray[np.int64]  # (lanes,), the rows that are computed now
+    members: npt.NDArray[np.int64]  # (lanes,), the rows in the lanes now
     params: Array
     states: Array
     shares: Array
@@ -42,7 +42,7 @@ def block_of(count: int, n: int) -> Block:
         np.zeros((STATE_WIDTH, LANES)),
         np.zeros((2, LANES)),
         np.zeros((n, FAST_WIDTH, LANES)),
-        np.zeros((_TOLD, LANES)),
+        np.zeros((_REPORT, LANES)),
         window_of(n, LANES),
         window_of(n),
     )
@@ -53,7 +53,7 @@ def step_block(count: int, rows: Rows, actions: Any, n: int, bounds: Any, block:
     """One env-step of the first `count` of the block's members, of one kind, whose actions are
     finite; False, and nothing is changed, where not all of them come to the step's end."""
     params, states = rows.params, rows.states
-    for lane in range(abreast()):
+    for lane in range(lane_count()):
         i = block.members[lane if lane < count else 0]  # spare lanes repeat the first
         for k in range(PARAMS_WIDTH):
             block.params[k, lane] = params[i, k]
@@ -83,7 +83,7 @@ def step_block(count: int, rows: Rows, actions: Any, n: int, bounds: Any, block:
         for k in range(_MOVING):
             states[i, k] = block.states[k, lane]
         states[i, Z.driver] = block.states[Z.driver, lane]
-        for k in range(_TOLD):
+        for k in range(_REPORT):
             rows.reports[i, k] = block.reports[k, lane]
         for j in range(n):
             for k in range(FAST_WIDTH):

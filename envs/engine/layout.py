@@ -92,7 +92,7 @@ IN_SLOW, SLOW_WIDTH = offsets(Slow)
 
 
 class Params(NamedTuple):
-    """What is constant within an episode. New parts go at the end."""
+    """Parameters, constant within an episode. New parts go at the end."""
 
     car: Car
     road: Road
@@ -113,8 +113,8 @@ class Params(NamedTuple):
 
 
 class State(NamedTuple):
-    """What changes from tick to tick; a new part goes at the end, or, where a tick of the plant
-    changes it, before `slow`."""
+    """The state, which changes from tick to tick. A new part goes at the end or, where a tick of
+    the plant changes it, before `slow`."""
 
     motion: Motion
     drive: Drive

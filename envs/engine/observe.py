@@ -1,4 +1,4 @@
-"""What a step tells: the float32 observation and the numbers of `info`."""
+"""The float32 observation of a step, and what `info` reads of the state; compiled."""
 
 from typing import Any
 
@@ -56,7 +56,7 @@ def observe(row: Any, n: int, count: int, refs: Any, bounds: Any) -> None:
 
 @jit
 def write_report(report: Any, z: Any) -> None:
-    """Write what `info` tells of the state; what the step made of it is the caller's."""
+    """Write what `info` reads of the state; cost and references are the caller's."""
     report[REPORT.t] = z[Z.clock.tick] * TICK
     report[REPORT.gamma] = z[Z.motion.gamma]
     report[REPORT.psi] = z[Z.motion.psi]

@@ -1,4 +1,4 @@
-"""Sensors at a tick: sample the state, put packets on their way, deliver those that arrive.
+"""The queue of slow sensors' packets: capture at a tick, delivery at their arrival; compiled.
 
 Packets are delivered in the order (captured tick, sensor); what is under way lies in the state.
 """
@@ -19,7 +19,7 @@ FAR = 1e15
 
 @jit
 def _push(z: Any, sensor: int, captured: Any, due: Any, quality: Any, frame: Any, v: Any) -> None:
-    """Put a captured sample on its way; the arrays' room was checked when the env was built."""
+    """Put a captured sample on its way; that the queue is long enough, `link_of` has checked."""
     slot = int(z[Z.under_way])
     packet = z[Z.queue + slot * PACKET_WIDTH :]
     packet[PACKET.sensor] = sensor
@@ -91,7 +91,7 @@ def due(z: Any, tick: Any) -> bool:
 
 @jit
 def scene_of(p: Any, motion: Any, small_angle: int, key: Any, tick: Any) -> Scene:
-    """What slow sensors measure at a tick."""
+    """The scene that slow sensors see at a tick."""
     road, car, noise, sky = read(p, P.road), read(p, P.car), read(p, P.noise), read(p, P.sky)
     return Scene(motion, road, car, noise, sky, small_angle, key[0], key[1], tick)
 

@@ -5,7 +5,8 @@ Order of tick k: sensors sample the state at k; packets with arrival k are deliv
 ticks k+1 .. k+n; a reset returns tick 0 alone.
 
 An env-step is three parts. `foresee` writes the numbers that do not depend on the car into a
-window array, `drive_on` moves the car tick by tick, `conclude` handles the slow sensors and tells.
+window array, `drive_on` moves the car tick by tick, `conclude` handles the slow sensors, the
+observation and the report.
 """
 
 from typing import Any
@@ -31,7 +32,7 @@ from .window import WINDOW, chance_at, foresee
 
 @jit
 def fixed_of(p: Any) -> Fixed:
-    """What does not change within an env-step."""
+    """Parameters that are constant within an env-step."""
     return Fixed(
         car=read(p, P.car),
         road=read(p, P.road),
@@ -51,7 +52,7 @@ def fixed_of(p: Any) -> Fixed:
 
 @jit
 def kind_of(p: Any, switches: Any) -> Kind:
-    """What chooses the text of one vehicle's ticks."""
+    """Integers that choose the text of one vehicle's ticks."""
     flags = read(switches, FLAGS)
     lag = int(p[P.motor.start] > 0.0) + int(p[P.steering.start] > 0.0)
     follows = int(flags.steering == DRIVER)
@@ -75,7 +76,7 @@ def drive_on(
     """The plant and the fast sensors for n ticks, fewer where the episode ends; returns how many.
 
     share, turn: of the yaw moment and the added steering, within +-1. rows: filled with the fast
-    sensors. p, z, report: vectors, or matrices with a column for each vehicle of those abreast;
+    sensors. p, z, report: vectors, or matrices with a column for each vehicle of a block;
     rows and window have one axis more then. alone: whether it is one vehicle; where one of several
     fails or ends before the others, 0 is returned and z and report are as they were.
     """
@@ -171,7 +172,7 @@ def shares_of(action: Any) -> tuple[float, float]:
 
 @jit
 def refuse(row: Row) -> int:
-    """What an action that is not finite does: nothing, or the episode's failure (`fail_bad`)."""
+    """Refuse an action that is not finite, or end the episode as a failure (`fail_bad`)."""
     z, report = row.z, row.report
     if row.switches[FLAGS.fail_bad] == 0:
         return REFUSED

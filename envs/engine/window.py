@@ -1,14 +1,14 @@
-"""The window array of an env-step: what its ticks bring that does not depend on the car (noise and
-the programme's steering), and where the car went.
+"""The look-ahead window of an env-step: noise and steering programme of its ticks, which do not
+depend on the car, computed ahead; and where the car went.
 
-Its columns are the ticks of the step. Of vehicles abreast it has a third axis, their lanes.
+Its columns are the ticks of the step. That of a block of vehicles has a third axis, their lanes.
 """
 
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
-from ..backend.arrays import abreast, offsets, put, put_along, ramp, read, write
+from ..backend.arrays import lane_count, offsets, put, put_along, ramp, read, write
 from ..backend.decorators import jit
 from ..backend.primitives import to_float, whole
 from ..backend.random import CHANNELS, normals
@@ -21,7 +21,7 @@ from .layout import P, Z
 
 
 class Window(NamedTuple):
-    """The rows of the array: normal numbers, rad, where the car is at the tick's end."""
+    """Rows of the array: normal numbers, the programme's angle in rad, Motion at the tick's end."""
 
     inertial: Annotated[tuple[Any, ...], 4]
     wheels: Annotated[tuple[Any, ...], 4]
@@ -46,7 +46,7 @@ def foresee(p: Any, z: Any, n: int, follows: int, window: Any) -> None:
     clock = read(z, Z.clock)
     key_low, key_high, first = int(clock.key_low), int(clock.key_high), int(clock.tick) + 1
     programme = read(p, P.programme)
-    for j in range(0, n, abreast()):
+    for j in range(0, n, lane_count()):
         ticks = ramp(first + j)
         inertial = normals(key_low, key_high, ticks, CHANNELS.inertial)
         wheels = normals(key_low, key_high, ticks, CHANNELS.wheels)
@@ -64,7 +64,7 @@ def foresee(p: Any, z: Any, n: int, follows: int, window: Any) -> None:
 
 @jit
 def foresee_lanes(p: Any, z: Any, n: int, follows: int, window: Any) -> None:
-    """The same of vehicles abreast: p, z with a column for each."""
+    """The same of a block of vehicles: p, z with a column for each."""
     clock = read(z, Z.clock)
     key_low, key_high = whole(clock.key_low), whole(clock.key_high)
     programme = read(p, P.programme)

@@ -30,7 +30,7 @@ OUTAGE_JUMP = 3.0  # of the spread of log HDOP, upwards where an outage ends
 
 
 class Sky(NamedTuple):
-    """What the GPS sees of the satellites: log HDOP is an Ornstein-Uhlenbeck process."""
+    """The satellites over the GPS: log HDOP is an Ornstein-Uhlenbeck process."""
 
     median: Any  # log of the median HDOP
     spread: Any  # standard deviation of log HDOP

@@ -1,4 +1,4 @@
-"""What describes a kind of slow sensor: its name, the values of its packets, its random numbers."""
+"""A kind of slow sensor: its name, the values of its packets, its random numbers."""
 
 from typing import NamedTuple
 

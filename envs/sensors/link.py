@@ -17,7 +17,7 @@ class SlowSensor:
     """A slow sensor's clock and link, as estimators know it; times in seconds.
 
     A sample is captured every `period` from `phase` on (None: drawn at each reset; the running
-    env's `slow_sensors` tells the drawn one). Frame i arrives `delays[i % len(delays)]` plus a
+    env's `slow_sensors` have the drawn one). Frame i arrives `delays[i % len(delays)]` plus a
     random share of `jitter` later, unless it is lost (`loss`, a probability) or captured within
     an outage. `duplicate` is the probability that it arrives a second time.
     """
@@ -75,7 +75,7 @@ class Link(NamedTuple):
 def link_of(sensor: SlowSensor | None, outage: tuple[float, float] | None = None) -> Link:
     """A Link from the public description; None: an absent sensor.
 
-    Raises ValueError where more packets could be under way at once than there is room for.
+    Raises ValueError where more packets could be under way at once than the queue holds.
     """
     if sensor is None:
         return Link._make([0.0] * len(Link._fields))
@@ -133,6 +133,6 @@ def arrivals(link: Any, frame: Any, tick: Any, key_low: int, key_high: int, bloc
 
 @jit
 def clock_phase(link: Any, key_low: int, key_high: int, which: int) -> Any:
-    """The tick of the first capture: as given, or drawn where the phase is -1."""
+    """The tick of the first capture: its phase, or drawn where that is -1."""
     u = uniforms(key_low, key_high, 0, CHANNELS.initial, 1 + which)
     return select(link.phase < 0.0, floor(u[0] * link.period), link.phase)

@@ -37,7 +37,7 @@ BLOCKS = tuple(kind.blocks or blocks_at(place) for place, kind in enumerate(SLOW
 
 
 class Scene(NamedTuple):
-    """What slow sensors measure at a tick, and the noise they do it with."""
+    """The truth at a tick, and the noise and random numbers to measure it with."""
 
     motion: Any
     road: Any
@@ -51,7 +51,7 @@ class Scene(NamedTuple):
 
 
 class Sample(NamedTuple):
-    """What a slow sensor makes of a scene."""
+    """One measurement of a slow sensor."""
 
     values: Any  # VALUES of them
     quality: Any

@@ -55,15 +55,15 @@ def drive(env: StabilityVectorEnv, steps: int, every: int = 1, options: Any = No
 
 def _of(snapshot: dict[str, Any], going: np.ndarray) -> dict[str, Any]:
     kept = {name: snapshot[name][going] for name in _ARRAYS}
-    templates = [each for each, goes in zip(snapshot["templates"], going, strict=True) if goes]
-    return snapshot | kept | {"templates": templates}
+    configs = [each for each, goes in zip(snapshot["configs"], going, strict=True) if goes]
+    return snapshot | kept | {"configs": configs}
 
 
 def _joined(snapshots: Any) -> dict[str, Any]:
     joined = {name: np.concatenate([each[name] for each in snapshots]) for name in _ARRAYS}
-    templates = [template for each in snapshots for template in each["templates"]]
-    nobody: list[None] = [None] * len(templates)
-    lists = {"templates": templates, "rng": nobody, "seeds": nobody}
+    configs = [config for each in snapshots for config in each["configs"]]
+    nobody: list[None] = [None] * len(configs)
+    lists = {"configs": configs, "rng": nobody, "seeds": nobody}
     return {**snapshots[0], **joined, **lists}
 
 
