@@ -4,15 +4,17 @@
 namesake in `vector` around all rows of a vector env. Both take a user's own estimator as well:
 `EstimatorLike` is what that needs, `register_estimator` gives it a name.
 
-Where things are: `filters` is the catalogue, one row a filter; `make` builds a row's filter with
-`design` (options, models, gains) and returns an `Estimator`. `core` is what runs at every tick,
-compiled, on a filter's memory. `wrappers` and `vector` put filters around environments. `protocol`
-and `registry` are for users' own. `analysis` has the error bound, the smoother and `DualRate`.
+Where to start reading: `filters` has the table of filters, one row each; `make` turns a row into an
+`Estimator`: `design.config` parses its options, `design.assemble` writes its compiled memory from
+models, noise and schedules. `core.memory` names every number of a filter, `core.run` is what
+happens at every tick. `wrappers` and `vector` put filters around environments; `protocol` and
+`registry` are for users' own. `analysis` has the error bound, the smoother and `DualRate`.
 May import `envs`; nothing of `agents` or `benchmarks`.
 """
 
 from .analysis.linear_system import DualRate
 from .analysis.smoother import smooth
+from .design.config import FilterConfig
 from .estimates import Estimates, UnobservableWarning
 from .estimator import Estimator
 from .filters import FILTERS
@@ -28,6 +30,7 @@ __all__ = [
     "Estimator",
     "EstimatorFactory",
     "EstimatorLike",
+    "FilterConfig",
     "UnobservableWarning",
     "make_estimator",
     "register_estimator",

@@ -1,4 +1,4 @@
-"""What an estimator says about a whole record."""
+"""The estimates of a whole record, and the warning of what they cannot contain."""
 
 from dataclasses import dataclass
 
@@ -14,9 +14,10 @@ class UnobservableWarning(UserWarning):
 
 @dataclass(frozen=True)
 class Estimates:
-    """What a filter said at every row of a record.
+    """A filter's states at every row of a record.
 
-    time: (K,) s. x, std: (K, n), states and standard deviations. names: of the n states.
+    time: (K,) s. x, std: (K, n), states and standard deviations. names: of the n states. nis:
+    (packets,), the normalised innovation squared of each; NaN where it was not used.
     """
 
     time: Array

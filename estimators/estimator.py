@@ -14,9 +14,10 @@ from ..envs.record import FAST, FAST_WIDTH, PACKET_WIDTH, Log, Record
 from ..envs.sensors.link import SlowSensor
 from ..envs.sensors.slow import SLOW_NAMES
 from .core.entry import advance_entry, receive_entry, step_entry
-from .core.memory import Counters
+from .core.memory import Counters, Filters, Memory
 from .core.run import begin_all
 from .core.transition import KINEMATIC, LATERAL, VELOCITY_ROLL
+from .design.config import FilterConfig
 from .design.error_map import MARGINAL, error_map, spectral_radius, unobservable
 from .design.models import UNITS
 from .design.periodic import design, table_shape
@@ -29,7 +30,7 @@ Array = npt.NDArray[np.float64]
 CHECKED_SPEEDS = (3.0, 7.0, 14.0)  # m/s, where a filter without a fixed speed is checked
 
 
-_NOTHING = np.zeros((0, 0))
+_EMPTY = np.zeros((0, 0))
 _NO_NIS = np.zeros(0)
 _NO_PACKETS = np.zeros((0, PACKET_WIDTH))
 
@@ -37,31 +38,24 @@ _NO_PACKETS = np.zeros((0, PACKET_WIDTH))
 class Estimator:
     """A filter at work; built by `make_estimator`.
 
-    `names` and `units` of its states; `x` (n,) and `P` (n, n) at "now"; `tick`, the last fast row.
-    `unobservable`: directions that its sensors cannot see. `spectral_radius` of its error over a
-    cycle. `dt`: seconds of a tick. `needs`: the fast columns it reads. `filters`, `gains`: its
-    memory and its tables, as compiled code takes them.
+    `name`, `config`: what it was built from. `names` and `units` of its n states; `x` (n,) and `P`
+    (n, n) at "now"; `tick`, of the last fast row. `unobservable`: directions that its sensors
+    cannot see. `spectral_radius` of its error over a cycle. `dt`: seconds of a tick. `needs`: the
+    fast columns it reads. `filters` (layers,), `gains` (cells, rows, columns): its memory and its
+    tables, as compiled code takes them.
     Counters of what was skipped: `refused` (older than the filter's window), `duplicates`,
     `future`, `invalid` (not finite), `poor` (quality 0, too few satellites), `unknown` (sensor or
     stamp), `gated` (an innovation that the gate does not believe).
     """
 
     def __init__(
-        self,
-        name: str,
-        names: tuple[str, ...],
-        dt: float,
-        filters: Any,
-        sensors: Mapping[str, SlowSensor],
-        schedules: tuple[Schedule, ...],
-        wish: Any,
-        allow_unstable: bool,
+        self, config: FilterConfig, dt: float, filters: Any, schedules: tuple[Schedule, ...]
     ) -> None:
-        self.allow_unstable = allow_unstable
-        self.name, self.names, self.dt = name, names, dt
-        self.units = tuple(UNITS[state] for state in names)
-        self.sensors = dict(sensors)
-        self.filters, self._schedules, self._wish = filters, schedules, wish
+        self.config, self.name, self.dt = config, config.name, dt
+        self.names = config.states
+        self.units = tuple(UNITS[state] for state in self.names)
+        self.sensors = dict(config.sensors)
+        self.filters, self._schedules = filters, schedules
         f = self._f
         cells = round((f.high - f.low) / f.spacing) + 1 if f.spacing > 0.0 else 1
         shape = (cells, *table_shape(f, schedules[-1])) if f.periodic else (1, 1, 1)
@@ -71,7 +65,7 @@ class Estimator:
         self.reset()
 
     @property
-    def _f(self) -> Any:
+    def _f(self) -> Memory:
         return self.filters[0]
 
     @property
@@ -86,10 +80,10 @@ class Estimator:
             read.add(FAST.wheel_left)
         return tuple(FAST._fields[column] for column in sorted(read))
 
-    def check(self, filters: Any) -> None:
-        """Refuse a filter that diverges; name what it cannot see.
+    def check(self, filters: Filters) -> None:
+        """Refuse a filter that diverges with a ValueError; warn of what it cannot see.
 
-        filters: its records, or those of the same filter with its first slow sensor alone.
+        filters: its memory, or that of the same filter with its first slow sensor alone.
         """
         first = 0
         for f in filters:
@@ -109,12 +103,15 @@ class Estimator:
                 stacklevel=3,
             )
 
-    def _designed(self, f: Any, schedule: Schedule, speed: float) -> tuple[Array, Array]:
+    def _designed(self, f: Memory, schedule: Schedule, speed: float) -> tuple[Array, Array]:
         """The table of gains at a speed and the map of the error; ValueError if that grows."""
-        table, G = design(f, schedule, speed, self._wish)
+        try:
+            table, G = design(f, schedule, speed, self.config)
+        except ValueError as error:
+            raise ValueError(f"{self.name}: {error}") from None
         M = error_map(f, table, G, schedule)
         radius = spectral_radius(M)
-        if radius > 1.0 + MARGINAL and not self.allow_unstable:
+        if radius > 1.0 + MARGINAL and not self.config.allow_unstable:
             raise ValueError(
                 f"{self.name}: its error grows by a factor of {radius:.6g} over a cycle of the "
                 f"schedule at {speed:g} m/s (allow_unstable=True builds it all the same)"
@@ -138,13 +135,14 @@ class Estimator:
         phase differs from what the filter was built for.
         """
         for name, sensor in self.sensors.items():
-            told = sensor if sensors is None else sensors.get(name)
-            if told is None or replace(told, phase=0.0) != replace(sensor, phase=0.0):
+            new = sensor if sensors is None else sensors.get(name)
+            if new is None or replace(new, phase=0.0) != replace(sensor, phase=0.0):
                 raise ValueError(
-                    f"{self.name} was built for the {name} {sensor}, the reset tells {told}"
+                    f"{self.name} was built for the {name} {sensor}, the reset has {new}"
                 )
             s = SLOW_NAMES.index(name)
-            phase = whole_ticks(told.phase or 0.0, self.dt, f"the {name}'s phase")
+            what = f"{self.name}: the {name}'s phase"
+            phase = whole_ticks(new.phase or 0.0, self.dt, what)
             for f in self.filters:
                 f.phase[s] = f.origin = phase
         begin_all(self.filters, first)
@@ -164,12 +162,11 @@ class Estimator:
             raise ValueError(_misshapen(fast, packets))
         if count is not None:
             if not 0 <= count <= arrived:
-                raise ValueError(f"count is 0 to {arrived}, the packets given, got {count}")
+                raise ValueError(f"count is 0 to {arrived}, as many as packets, got {count}")
             arrived = count
         done = step_entry()(self.filters, self.gains, fast, packets, arrived)
         if done < rows:  # gains are missing
-            nothing = _NOTHING, _NOTHING, _NO_NIS
-            self._go_on(done, rows, (fast, rows, packets, arrived), nothing)
+            self._go_on(done, rows, (fast, rows, packets, arrived), (_EMPTY, _EMPTY, _NO_NIS))
 
     def take(
         self,
@@ -177,8 +174,8 @@ class Estimator:
         rows: int,
         packets: Array,
         count: int,
-        X: Array = _NOTHING,
-        S: Array = _NOTHING,
+        X: Array = _EMPTY,
+        S: Array = _EMPTY,
         nis: Array = _NO_NIS,
     ) -> None:
         """`step` without any checks: the first rows and packets of C-contiguous float64 arrays.
@@ -186,19 +183,19 @@ class Estimator:
         X, S: (rows, n), to be filled with states and standard deviations, or empty. nis: (count,),
         to be filled with the normalised innovation squared of each packet, or empty.
         """
-        given = fast, rows, packets, count
-        done = advance_entry()(self.filters, self.gains, *given, 0, X, S, nis)
+        record, outputs = (fast, rows, packets, count), (X, S, nis)
+        done = advance_entry()(self.filters, self.gains, *record, 0, *outputs)
         if done < rows:
-            self._go_on(done, rows, given, (X, S, nis))
+            self._go_on(done, rows, record, outputs)
 
-    def _go_on(self, done: int, rows: int, given: Any, filled: Any) -> None:
+    def _go_on(self, done: int, rows: int, record: Any, outputs: Any) -> None:
         """The rest of the rows, designing the gains that are asked for on the way.
 
-        given, filled: the arguments of `advance` before and behind the rows done.
+        record, outputs: the arguments of `advance` before and behind the rows done.
         """
         while done < rows:
             self.design_missing()
-            done = advance_entry()(self.filters, self.gains, *given, done, *filled)
+            done = advance_entry()(self.filters, self.gains, *record, done, *outputs)
 
     def predict(self, fast_row: npt.ArrayLike) -> None:
         """Take one fast row: from the last tick to this one, with the gyro."""
@@ -262,7 +259,8 @@ class Estimator:
         """Their covariance now, (n, n); with periodic gains that of the settled cycle."""
         return np.asarray(block_diag(*(self._covariance(f) for f in self.filters)), np.float64)
 
-    def _covariance(self, f: Any) -> Array:
+    def _covariance(self, f: Memory) -> Array:
+        """P (n, n) of one layer."""
         n = int(f.n)
         if not f.periodic:
             return np.array(f.P[:n, :n])

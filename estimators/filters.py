@@ -15,17 +15,19 @@ training seeds of double-layer-fig9 and dakf-fig6.
 
 from dataclasses import dataclass
 
+from ..envs.sensors.slow import SLOW_NAMES
+
 
 @dataclass(frozen=True, kw_only=True)
 class Filter:
-    """One row.
+    """One row: what a filter is, and the defaults of its options.
 
     slow: slow sensors it can use, the preferred first (none: fast ones alone). model: "bicycle" or
-    a name of `models.MODELS`. fast: what it measures in every row. intersample: of
-    `intersample.RULES`. gains: "periodic", "covariance" or "placed" (what it does when not told).
-    disturbances: "none", "walk", "walk-all" or "forces". delay: of `delay.RULES`. poles: rad/s,
-    where gains are placed. second: the model of a second layer. hdop: pairs (HDOP, factor on the
-    GPS's noise). source: where it comes from, with the equations.
+    a name of `models.MODELS`. fast: what it measures in every row. intersample: "predict",
+    "pseudo-residual", "dual-rate" or "single-rate" (`core.intersample`). gains: "periodic",
+    "covariance" or "placed". disturbances: of `models.DISTURBANCES`. delay: of `delay.RULES`.
+    poles: rad/s, where gains are placed. second: the model of a second layer. hdop: pairs (HDOP,
+    factor on the GPS's noise). source: where it comes from, with the equations.
     """
 
     slow: tuple[str, ...] = ()
@@ -41,7 +43,7 @@ class Filter:
     source: str
 
 
-ANY = ("camera", "gps")
+ANY = SLOW_NAMES
 GPS = ("gps",)
 CAMERA = ("camera",)
 
@@ -97,7 +99,7 @@ FILTERS: dict[str, Filter] = {
     "dual-rate": Filter(
         slow=GPS,
         fast=(),
-        intersample="spread",
+        intersample="dual-rate",
         disturbances="walk-all",
         delay="ignore",
         source="dual-rate (4)-(35), (37)-(38)",

@@ -16,13 +16,13 @@ import numpy.typing as npt
 
 from ...envs.record import Record
 from ...envs.sensors.link import SlowSensor
-from ...envs.sensors.slow import SLOW_NAMES
 from ...envs.ticks import TICK
 from ...envs.vehicle.linear import LinearModel, vision
 from ...envs.vehicle.vehicle import Vehicle
 from ..design import kalman
-from ..design.models import COURSE_SPEED, ROWS, states_for
-from ..design.options import DISTURBANCE, NOISE
+from ..design.config import DISTURBANCE, NOISE
+from ..design.measurements import COURSE_SPEED, MEASUREMENTS
+from ..design.models import states_for
 from ..design.schedule import whole_ticks
 from ..make import make_estimator
 
@@ -67,55 +67,23 @@ def riccati(
     dt: float = TICK,
     seconds: float = 8.0,
     **options: float,
-) -> Array:
-    """The bound's limit where delays repeat: standard deviation of beta in rad over the last
-    `seconds` / 4 of `riccati_variances`, which says what it takes and raises."""
-    P = riccati_variances(vehicle, sensors=sensors, speed=speed, dt=dt, seconds=seconds, **options)[
-        "beta"
-    ]
-    beta: Array = np.sqrt(P[-(len(P) // 4) :])
-    return beta
-
-
-def riccati_variances(
-    vehicle: Vehicle,
-    *,
-    sensors: Mapping[str, SlowSensor],
-    speed: float,
-    dt: float = TICK,
-    seconds: float = 8.0,
-    **options: float,
-) -> dict[str, Array]:
-    """Variances of the optimal estimates by state, (ticks,) each: the diagonals of
-    `riccati_covariances`, which says what it takes and raises."""
-    P, names = riccati_covariances(
-        vehicle, sensors=sensors, speed=speed, dt=dt, seconds=seconds, **options
-    )
-    return {name: P[:, i, i].copy() for i, name in enumerate(names)}
-
-
-def riccati_covariances(
-    vehicle: Vehicle,
-    *,
-    sensors: Mapping[str, SlowSensor],
-    speed: float,
-    dt: float = TICK,
-    seconds: float = 8.0,
-    **options: float,
 ) -> tuple[Array, tuple[str, ...]]:
     """Covariances of the optimal estimates at every tick, (ticks, n, n), and the n states' names,
-    from a start that is known: a periodic Riccati recursion in NumPy and textbook letters.
+    from a start that is known: a Riccati recursion in NumPy and textbook letters.
 
-    States are the bicycle's with the camera's, and the disturbing force and moment "F_d", "N_d".
-    options: the standard deviations of `NOISE` and `DISTURBANCE` of `estimators.options`. Raises
-    TypeError for others, ValueError for a sensor with random delay.
+    Where delays repeat it is the bound, and has a periodic limit. The states are the bicycle's with
+    the camera's, and the disturbing force and moment "F_d", "N_d". options: the standard deviations
+    of `NOISE` and `DISTURBANCE` of `design.config`. Raises TypeError for others, ValueError for a
+    sensor with random delay.
     """
     unknown = sorted(set(options) - set(NOISE) - set(DISTURBANCE))
     if unknown:
         raise TypeError(f"riccati has no option {', '.join(unknown)}")
     sd = NOISE | DISTURBANCE | options
-    if "course_noise" not in options:
-        sd["course_noise"] *= COURSE_SPEED / speed
+    measured = [row for name in sensors for row in MEASUREMENTS[name].rows]
+    for key in (f"{row.noise}_noise" for row in measured if row.over_speed):
+        if key not in options:
+            sd[key] *= COURSE_SPEED / speed
     F, Q, names = _disturbed(vehicle, speed, dt, sd)
     n = len(names)
     links, N = [], n
@@ -173,9 +141,9 @@ class _Link:
         first: int,
         sd: Mapping[str, float],
     ) -> None:
-        self.rows = [[names.index(state) for state in summed] for summed in ROWS[name]]
-        noises = ("psi_noise", "y_l_noise") if name == SLOW_NAMES[0] else ("course_noise",)
-        self.R = np.diag([sd[key] ** 2 for key in noises])
+        rows = MEASUREMENTS[name].rows
+        self.rows = [[names.index(state) for state in row.states] for row in rows]
+        self.R = np.diag([sd[f"{row.noise}_noise"] ** 2 for row in rows])
         self.period = whole_ticks(sensor.period, dt, f"the {name}'s period")
         self.phase = whole_ticks(sensor.phase or 0.0, dt, f"the {name}'s phase")
         self.lags = [whole_ticks(d, dt, f"a delay of the {name}") for d in sensor.delays]

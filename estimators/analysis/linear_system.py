@@ -3,8 +3,8 @@
     x_{k+1} = a x_k + b u_k + x_d,k + w_k,    y_k = c x_k + v_k at k = 0, r, 2 r, ...
     x_d,k+1 = a_d x_d,k + u_d + w_d,k
 
-It runs on the compiled core of all filters, as the rule "spread" of a model that has its matrices
-from the user. `make_estimator("dual-rate")` is its application to a car's course angle.
+It runs on the compiled core of all filters, as its rule "dual-rate" with a model whose matrices are
+arguments. `make_estimator("dual-rate")` is its application to a car's course angle.
 """
 
 import warnings
@@ -15,13 +15,12 @@ import numpy as np
 import numpy.typing as npt
 
 from ...envs.record import FAST_WIDTH, PACKET, PACKET_WIDTH
-from ...envs.sensors.slow import CAMERA
 from ..core.delay import IGNORE
 from ..core.entry import advance_entry, receive_entry
-from ..core.intersample import SPREAD
+from ..core.intersample import DUAL_RATE
 from ..core.memory import CORE, FILTER, INPUTS, ROWS
 from ..core.run import begin_all
-from ..core.transition import GIVEN
+from ..core.transition import LINEAR
 from ..design.checks import covariance, matrix, square, vector
 from ..design.dual_rate import GAINS, RULES, frame_map, shares_of, write_shares
 from ..design.error_map import MARGINAL, spectral_radius, unobservable
@@ -29,8 +28,9 @@ from ..estimates import Estimates, UnobservableWarning
 
 Array = npt.NDArray[np.float64]
 
+_SENSOR = 0  # the place of the slow sensor in a filter's memory
 _NO_PACKETS = np.zeros((0, PACKET_WIDTH))
-_NOTHING, _NO_NIS = np.zeros((0, 0)), np.zeros(0)
+_EMPTY, _NO_NIS = np.zeros((0, 0)), np.zeros(0)
 
 
 class DualRate:
@@ -53,7 +53,7 @@ class DualRate:
     Raises
     ------
     ValueError: a wrong shape, a Q or R that is no covariance, more states, inputs or outputs than
-        there is room for, poles that cannot be placed, an error that grows.
+        a filter can have, poles that cannot be placed, an error that grows.
     """
 
     def __init__(
@@ -129,7 +129,7 @@ class DualRate:
         begin_all(self._filters, 0)
         self._filters[0].x[: len(self.names)] = self._start
 
-    def _take(self, fast: Array, packets: Array, X: Array = _NOTHING, S: Array = _NOTHING) -> None:
+    def _take(self, fast: Array, packets: Array, X: Array = _EMPTY, S: Array = _EMPTY) -> None:
         advance, count = advance_entry(), len(packets)
         advance(self._filters, self.gains, fast, len(fast), packets, count, 0, X, S, _NO_NIS)
 
@@ -150,12 +150,12 @@ class DualRate:
         if f.since == 0:
             raise ValueError(f"step {f.tick} has had its sample")
         receive_entry()(
-            self._filters, self.gains, self._packet(vector("y", y, int(f.rows[CAMERA])))
+            self._filters, self.gains, self._packet(vector("y", y, int(f.rows[_SENSOR])))
         )
 
     def _packet(self, y: Array) -> Array:
         packet = np.zeros(PACKET_WIDTH)
-        packet[: PACKET.value] = CAMERA, self.k, self.k, 1.0, 0.0
+        packet[: PACKET.value] = _SENSOR, self.k, self.k, 1.0, 0.0
         packet[PACKET.value : PACKET.value + len(y)] = y
         return packet
 
@@ -165,7 +165,8 @@ class DualRate:
         A row of Y that holds a NaN is a sample that never came. Returns estimates of k = 0 .. K,
         time in steps. Raises ValueError for other shapes or an infinite number.
         """
-        u, y, q = np.array(U, np.float64), np.array(Y, np.float64), int(self._filters[0].rows[0])
+        u, y = np.array(U, np.float64), np.array(Y, np.float64)
+        q = int(self._filters[0].rows[_SENSOR])
         u = u.reshape(len(u), -1) if u.ndim else u
         y = y.reshape(len(y), -1) if y.ndim else y
         if u.ndim != 2 or u.shape[1] != self.inputs or not np.isfinite(u).all():
@@ -204,7 +205,7 @@ def _disturbed(rows: Sequence[int] | None, m: int) -> list[int]:
 
 
 def _check_sizes(A: Array, B: Array, C: Array, d: int) -> None:
-    """ValueError where shapes do not fit each other or the room there is."""
+    """ValueError where shapes do not fit each other or a filter's memory."""
     m = len(A)
     if A.shape != (m, m) or len(B) != m or C.shape[1] != m:
         raise ValueError(
@@ -213,7 +214,7 @@ def _check_sizes(A: Array, B: Array, C: Array, d: int) -> None:
     there = (("states with their disturbances", m + d, CORE), ("inputs", B.shape[1], INPUTS))
     for what, count, most in (*there, ("outputs", len(C), ROWS)):
         if count > most:
-            raise ValueError(f"{count} {what} are more than there is room for ({most})")
+            raise ValueError(f"{count} {what} are more than a filter can have ({most})")
 
 
 def _poles(
@@ -239,14 +240,15 @@ def _record(F: Array, B: Array, drift: Array, C: Array, ratio: int) -> Any:
     """The filter's memory: every state is dense, the slow sensor is the first."""
     filters = np.zeros(1, FILTER).view(np.recarray)
     f, n, q, p = filters[0], len(F), len(C), B.shape[1]
-    f.kind, f.n, f.total, f.dense, f.step, f.relax = GIVEN, n, n, n, 1.0, 1.0
+    f.kind, f.n, f.total, f.dense, f.step, f.relax = LINEAR, n, n, n, 1.0, 1.0
     f.G[:n, :n], f.H[: len(B), :p], f.drift[:n] = F, B, drift
     f.inputs = p
     f.u_column[:p, 0] = range(p)
     f.u_factor[:p, 0] = 1.0
-    f.rows[CAMERA], f.row[CAMERA, :q, :n] = q, C
-    f.period[CAMERA] = f.cycle = ratio
+    f.first_slow = _SENSOR
+    f.rows[_SENSOR], f.C[_SENSOR, :q, :n] = q, C
+    f.period[_SENSOR] = f.cycle = ratio
     f.stride = f.pace = f.pattern = f.periodic = 1
-    f.late, f.between, f.speed_state = IGNORE, SPREAD, -1
+    f.late, f.between, f.speed_state = IGNORE, DUAL_RATE, -1
     f.speed = 1.0  # no vehicle: any
     return filters

@@ -1,4 +1,4 @@
-"""The offline truth of a log: a fixed-lag smoother around any filter with a covariance.
+"""A fixed-lag smoother around any filter with a covariance: what a log tells afterwards.
 
 Offline every packet is there, so each is used at the tick at which it was captured. The filter goes
 forwards block by block; Rauch, Tung and Striebel's recursion then comes backwards from the end of
@@ -17,7 +17,7 @@ from ...envs.record import FAST, PACKET, Log
 from ..core.delay import IGNORE
 from ..core.fast import read
 from ..core.intersample import NONE
-from ..core.memory import WINDOW
+from ..core.memory import WINDOW, Gains, Memory, Row
 from ..core.packets import receive
 from ..core.run import tick
 from ..design.schedule import whole_ticks
@@ -46,32 +46,32 @@ def smooth(
     Source: Rauch, Tung and Striebel, AIAA J. 3 (1965) 1445.
     """
     if isinstance(estimator, str):
-        told: dict[str, Any] = {"sensors": log.slow, "dt": log.record.dt, "gains": "covariance"}
-        estimator = make_estimator(estimator, **(told | options))
+        usual: dict[str, Any] = {"sensors": log.slow, "dt": log.record.dt, "gains": "covariance"}
+        estimator = make_estimator(estimator, **(usual | options))
     elif options:
         raise TypeError(f"{estimator.name} is built, got {', '.join(options)}")
     if not isinstance(estimator, Estimator):
         raise TypeError(f"the smoother needs a filter of the catalogue, got {estimator!r}")
     if not lag_seconds > 0.0:
         raise ValueError(f"the lag is in s and positive, got {lag_seconds!r}")
-    twin = _in_time(estimator)
-    record = twin.accept(log)
+    prompt = _without_delay(estimator)
+    record = prompt.accept(log)
     rows = len(record.fast)
     lag = rows
     if math.isfinite(lag_seconds):
-        lag = min(rows, whole_ticks(lag_seconds, twin.dt, "the lag"))
+        lag = min(rows, whole_ticks(lag_seconds, prompt.dt, "the lag"))
     packets = np.array(record.packets, np.float64)
     packets[:, PACKET.arrived] = packets[:, PACKET.captured]
     by = (record.packets[:, PACKET.arrived], packets[:, PACKET.sensor], packets[:, PACKET.captured])
     order = np.lexsort(by)
-    x, std, nis = _blocks(twin, np.ascontiguousarray(record.fast), packets[order], lag)
+    x, std, nis = _blocks(prompt, np.ascontiguousarray(record.fast), packets[order], lag)
     found = np.empty_like(nis)
     found[order] = nis
-    return Estimates(np.asarray(record.ticks * record.dt), x, std, twin.names, found)
+    return Estimates(np.asarray(record.ticks * record.dt), x, std, prompt.names, found)
 
 
-def _in_time(estimator: Estimator) -> Estimator:
-    """The same filter for samples that are never late."""
+def _without_delay(estimator: Estimator) -> Estimator:
+    """A copy of the filter for samples that are never late; ValueError where there is none."""
     f = estimator.filters[0]
     plain = f.between == NONE and f.periodic == 0 and f.delayed == 0 and f.pace == 1
     if len(estimator.filters) > 1 or not plain:
@@ -79,38 +79,39 @@ def _in_time(estimator: Estimator) -> Estimator:
             f"{estimator.name}: a smoother needs one layer with gains='covariance', samples used "
             "when they come and no states that lag"
         )
-    twin = copy.copy(estimator)
-    twin.filters = estimator.filters.copy()
-    f = twin.filters[0]
-    f.late, f.total, f.trailing = IGNORE, f.n, 1
+    prompt = copy.copy(estimator)
+    prompt.filters = estimator.filters.copy()
+    f = prompt.filters[0]
+    f.late, f.total, f.store_predictions = IGNORE, f.n, 1
     f.frames[:] = 0
-    return twin
+    return prompt
 
 
 @jit
 def _forwards(
-    f: Any,
-    gains: Any,
+    f: Memory,
+    gains: Gains,
     fast: Any,
     packets: Any,
     at: int,
-    nis: Any,
+    nis: Row,
     F: Any,
     before: Any,
     x: Any,
     P: Any,
 ) -> int:
-    """Filter some rows; returns the packets done.
+    """Filter fast rows (K, FAST_WIDTH) and the packets (count, PACKET_WIDTH) from `at` on that
+    arrive by their end; returns the packets done.
 
-    F (K, n, n): each row's transition from the one before. before (K, n): its prediction. x (K, n),
-    P (K, n, n): after its samples.
+    nis (count,): of the packets used. F (K, n, n): each row's transition from the one before.
+    before (K, n): its prediction. x (K, n), P (K, n, n): after its samples.
     """
     n, dense = f.n, f.dense
     for j in range(len(fast)):
         read(f, fast[j], 0.5 * (fast[j, FAST.wheel_left] + fast[j, FAST.wheel_right]))
         tick(f, gains)
         for i in range(n):
-            before[j, i] = f.trail[f.tick % WINDOW, i]
+            before[j, i] = f.predicted[f.tick % WINDOW, i]
             for k in range(n):
                 same = f.decay[i] if i == k else 0.0
                 F[j, i, k] = f.G[i, k] if i < dense else same
@@ -125,23 +126,24 @@ def _forwards(
     return at
 
 
-def _blocks(twin: Estimator, fast: Array, packets: Array, lag: int) -> tuple[Array, Array, Array]:
+def _blocks(prompt: Estimator, fast: Array, packets: Array, lag: int) -> tuple[Array, Array, Array]:
     """Smoothed states and standard deviations of all rows, and the packets' NIS."""
-    f, rows, n = twin.filters[0], len(fast), len(twin.names)
+    f, rows, n = prompt.filters[0], len(fast), len(prompt.names)
     Q = np.array(f.Q[:n, :n])
     X, S, nis = np.empty((rows, n)), np.empty((rows, n)), np.full(len(packets), np.nan)
     span = min(2 * lag, rows)
-    told = np.empty((span, n, n)), np.empty((span, n)), np.empty((span, n)), np.empty((span, n, n))
+    # F, before, x, P of two blocks, as `_forwards` fills them
+    both = np.empty((span, n, n)), np.empty((span, n)), np.empty((span, n)), np.empty((span, n, n))
     done = at = 0  # rows, packets
     for start in range(0, rows, lag):
-        for kept in told if start > 0 else ():  # what was the next block is the present one
-            kept[: span - lag] = kept[lag:]
+        for array in both if start > 0 else ():  # what was the next block is the present one
+            array[: span - lag] = array[lag:]
         first = done - start
         end = min(start + span, rows)
-        views = (kept[first : end - start] for kept in told)
-        at = _forwards(f, twin.gains, fast[done:end], packets, at, nis, *views)
+        views = (array[first : end - start] for array in both)
+        at = _forwards(f, prompt.gains, fast[done:end], packets, at, nis, *views)
         done = end
-        x, std = _backwards(Q, *(kept[: end - start] for kept in told))
+        x, std = _backwards(Q, *(array[: end - start] for array in both))
         stop = min(start + lag, rows)
         X[start:stop], S[start:stop] = x[: stop - start], std[: stop - start]
     return X, S, nis

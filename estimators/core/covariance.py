@@ -1,4 +1,4 @@
-"""The covariance and its gains in compiled code: `kalman.py`'s equations on a filter's record.
+"""The covariance and its gains in compiled code: `design.kalman`'s equations on a filter's memory.
 
 Only the first n of N = `total` states move; the others are clones. Measurements come one scalar at
 a time, so that a gain is a division and not a matrix inverse.
@@ -7,11 +7,21 @@ a time, so that a gain is a division and not a matrix inverse.
 from typing import Any
 
 from ...envs.backend.decorators import jit
+from .memory import Memory, Row
 
 
 @jit
-def _plus(a: Any, g: Any, v: Any, j: int) -> Any:
-    """a + g v[j : j + 8], eight sums at once: compiled, they stay in registers."""
+def dot(row: Row, v: Row, n: int) -> Any:
+    """The product of a row of C and a vector of states, n entries of each."""
+    total = 0.0
+    for k in range(n):
+        total += row[k] * v[k]
+    return total
+
+
+@jit
+def _plus(a: Any, g: Any, v: Row, j: int) -> Any:
+    """a + g v[j : j + 8] of eight numbers a, at once: compiled, they stay in registers."""
     return (
         a[0] + g * v[j],
         a[1] + g * v[j + 1],
@@ -25,8 +35,8 @@ def _plus(a: Any, g: Any, v: Any, j: int) -> Any:
 
 
 @jit
-def _predict_rows(f: Any) -> None:
-    """f.FP = F P for the dense states, clones' columns included (and zeros up to a full eight)."""
+def _predict_rows(f: Memory) -> None:
+    """f.FP (CORE, WIDTH) = F P for the dense states, clones' columns included, by whole eights."""
     G, P, T = f.G, f.P, f.FP
     for i in range(f.dense):
         for j in range(0, f.total, 8):
@@ -38,7 +48,7 @@ def _predict_rows(f: Any) -> None:
 
 
 @jit
-def predict_covariance(f: Any) -> None:
+def predict_covariance(f: Memory) -> None:
     """P <- F P F^T + Q with F = [[G, 0], [0, diag(decay)]] on the states, I on the clones."""
     n, dense, N = f.n, f.dense, f.total
     G, P, Q, T, decay = f.G, f.P, f.Q, f.FP, f.decay
@@ -69,67 +79,64 @@ def predict_covariance(f: Any) -> None:
 
 
 @jit
-def _condition(f: Any, variance: Any, residual: Any) -> None:
-    """Use one residual of the given variance whose covariance with the state is `f.ph`.
+def _condition(f: Memory, variance: Any, residual: Any) -> None:
+    """Use one residual of the given variance whose covariance with the state is `f.PC`.
 
     P <- P - K s K^T, to which Joseph's form comes down for the optimal gain of a scalar. With
     products of two entries of P C^T it is symmetric to the last bit.
     """
-    N, x, P, ph, gain = f.total, f.x, f.P, f.ph, f.gain
+    N, x, P, PC, gain = f.total, f.x, f.P, f.PC, f.gain
     per = 1.0 / variance
     for i in range(N):
-        gain[i] = ph[i] * per
+        gain[i] = PC[i] * per
         x[i] += gain[i] * residual
     for i in range(N):
         for j in range(N):
-            P[i, j] -= per * (ph[i] * ph[j])
+            P[i, j] -= per * (PC[i] * PC[j])
 
 
 @jit
-def project(f: Any, row: Any) -> Any:
-    """f.ph = P C^T of a measurement `row` (n,) of the states; returns C P C^T."""
-    n, N, P, ph = f.n, f.total, f.P, f.ph
+def project(f: Memory, row: Row) -> Any:
+    """f.PC = P C^T of a measurement `row` (n,) of the states; returns C P C^T."""
+    n, N, P, PC = f.n, f.total, f.P, f.PC
     for i in range(N):
-        ph[i] = 0.0
+        PC[i] = 0.0
     for k in range(n):
         h = row[k]
         if h != 0.0:
             for i in range(N):
-                ph[i] += h * P[k, i]
-    own = 0.0
-    for k in range(n):
-        own += row[k] * ph[k]
-    return own
+                PC[i] += h * P[k, i]
+    return dot(row, PC, n)
 
 
 @jit
-def project_clone(f: Any, clone: int) -> Any:
-    """The same for a measurement of one clone."""
+def project_clone(f: Memory, clone: int) -> Any:
+    """f.PC = P C^T of a measurement of one clone; returns C P C^T."""
     for i in range(f.total):
-        f.ph[i] = f.P[clone, i]
-    return f.ph[clone]
+        f.PC[i] = f.P[clone, i]
+    return f.PC[clone]
 
 
 @jit
-def measure_state(f: Any, row: Any, r: Any, residual: Any) -> None:
+def measure_state(f: Memory, row: Row, r: Any, residual: Any) -> None:
     """Use the residual of a measurement `row` (n,) of the states with noise variance r."""
     own = project(f, row)
     _condition(f, own + r, residual)
 
 
 @jit
-def measure_clone(f: Any, clone: int, r: Any, residual: Any) -> None:
+def measure_clone(f: Memory, clone: int, r: Any, residual: Any) -> None:
     """Use the residual of a measurement of one clone with noise variance r."""
     own = project_clone(f, clone)
     _condition(f, own + r, residual)
 
 
 @jit
-def clone_covariance(f: Any, row: Any, clone: int) -> None:
+def clone_covariance(f: Memory, row: Row, clone: int) -> None:
     """Make a clone of the combination `row` of the states."""
     own = project(f, row)
-    N, P, ph = f.total, f.P, f.ph
+    N, P, PC = f.total, f.P, f.PC
     for i in range(N):
-        P[clone, i] = ph[i]
-        P[i, clone] = ph[i]
+        P[clone, i] = PC[i]
+        P[i, clone] = PC[i]
     P[clone, clone] = own

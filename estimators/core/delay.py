@@ -1,12 +1,12 @@
-"""Late samples: what a filter holds of the moment of capture, and which sample it may still use.
+"""Late samples: what a filter stores of the moment of capture, and which sample it may still use.
 
 clone: at each capture the measured combinations of the states are cloned; a late sample is a
 measurement of its clones, so it is used exactly. The delayed states of tie-vision (12)-(13), held
 between the camera's triggers, are these clones: one algorithm under two names. The clones of frame
 i lie in slot i mod frames. They are made in the step *after* the capture, as (12) has it, when
 everything that is known at the captured tick has been used.
-buffer: the window is told again from the capture on (`rewind`): exact for any clock. A sample that
-is older than what a rule holds (clone, larsen: its frames; buffer, stored: `WINDOW` ticks) is
+buffer: the window is filtered anew from the capture on (`rewind`): exact for any clock. A sample
+that is older than what a rule stores (clone, larsen: its frames; buffer, stored: `WINDOW` ticks) is
 refused and counted; a sensor whose longest delay is that long is refused when the filter is built.
 larsen: the covariance takes the sample at its capture, the states when it arrives (Larsen 1998);
 exact where exactly one sample is under way and none is lost.
@@ -16,19 +16,18 @@ literal, lag: the model has late states that follow at every step, by one step (
 literally at 1 ms) or by a first-order lag of the delay. ignore: late samples are taken for fresh.
 """
 
-from typing import Any
-
 from ...envs.backend.decorators import jit
-from ...envs.sensors.slow import GPS
-from .covariance import clone_covariance, measure_state
-from .memory import COUNTERS, SEEN, SLOW, WINDOW
+from .covariance import clone_covariance, dot, measure_state
+from .memory import COUNTERS, SEEN, SLOW, WINDOW, Memory, Row
+from .transition import variance
 
 RULES = ("clone", "ignore", "stored", "constant", "larsen", "buffer", "literal", "lag")
 CLONE, IGNORE, STORED, CONSTANT, LARSEN, BUFFER = range(6)
+"""Codes of the field `late`."""
 
-DIRECT = -1
+DIRECT = -1  # a sample measures the states as they are
 DROPPED = -2
-HELD = -3
+STORED_ONE = -3  # it is compared with what was stored at its capture
 
 
 @jit
@@ -38,67 +37,58 @@ def direct() -> int:
 
 
 @jit
-def _clone(f: Any, s: int, slot: int) -> None:
+def _clone(f: Memory, s: int, slot: int) -> None:
     """Clone what sensor s captured at the last tick: tie-vision (12) at a trigger."""
+    f.speed_captured[s, slot] = f.speed_before
     for i in range(f.rows[s]):
-        clone = f.home[s] + slot * f.rows[s] + i
-        row = f.row[s, i]
-        value, error = 0.0, 0.0
-        for k in range(f.n):
-            value += row[k] * f.x[k]
-            error += row[k] * f.e[k]
-        f.x[clone] = value
-        f.e[clone] = error
-        if s == GPS:
-            f.r_held[slot] = f.r_before
+        clone = f.first_clone[s] + slot * f.rows[s] + i
+        row = f.C[s, i]
+        f.x[clone] = dot(row, f.x, f.n)
+        f.e[clone] = dot(row, f.e, f.n)
         if f.periodic == 0:
             clone_covariance(f, row, clone)
 
 
 @jit
-def _promise(f: Any, s: int) -> None:
+def _take_covariance(f: Memory, s: int) -> None:
     """Larsen's update at the capture: the covariance now, the states when the sample is here."""
     for i in range(f.rows[s]):
-        row, value = f.row[s, i], 0.0
-        for k in range(f.n):
-            value += row[k] * f.x[k]
-        f.promised[s, i] = value
-        measure_state(f, row, f.r_before if s == GPS and i == 0 else f.r[s, i], 0.0)
+        row = f.C[s, i]
+        f.larsen_expected[s, i] = dot(row, f.x, f.n)
+        measure_state(f, row, variance(f, s, i, f.speed_before), 0.0)
         for j in range(i):
-            keep_promise(f, s, j, row)
+            _carry_gain(f, s, j, row)
         for k in range(f.n):
-            f.promise[s, i, k] = f.gain[k]
+            f.larsen_gain[s, i, k] = f.gain[k]
 
 
 @jit
-def keep_promise(f: Any, s: int, i: int, row: Any) -> None:
-    """A measurement `row` with the gain f.gain came: promise <- (I - K C) promise."""
-    along = 0.0
+def _carry_gain(f: Memory, s: int, i: int, row: Row) -> None:
+    """Larsen's M_k K_s of row i after a measurement `row` (n,) with the gain f.gain."""
+    along = dot(row, f.larsen_gain[s, i], f.n)
     for k in range(f.n):
-        along += row[k] * f.promise[s, i, k]
-    for k in range(f.n):
-        f.promise[s, i, k] -= f.gain[k] * along
+        f.larsen_gain[s, i, k] -= f.gain[k] * along
 
 
 @jit
-def keep_promises(f: Any, row: Any) -> None:
-    """`keep_promise` for every sample under way."""
+def carry_gains(f: Memory, row: Row) -> None:
+    """`_carry_gain` of every sample under way, past a measurement `row` (n,)."""
     for s in range(SLOW):
         if f.stamp[s, 0] >= 0:
             for i in range(f.rows[s]):
-                keep_promise(f, s, i, row)
+                _carry_gain(f, s, i, row)
 
 
 @jit
-def latch_due(f: Any, last: int) -> None:
-    """Latch every sensor that captured at the tick `last`, and set its clock on."""
+def latch_due(f: Memory, last: int) -> None:
+    """Store what every sensor measured that captured at the tick `last`; set its clock on."""
     for s in range(SLOW):
         if f.period[s] > 0 and last >= f.next[s]:
             frame = (f.next[s] - f.phase[s]) // f.period[s]
             if f.frames[s] > 0 and last == f.next[s] and f.seen[s, frame % SEEN] != last:
                 slot = frame % f.frames[s]
                 if f.late == LARSEN:
-                    _promise(f, s)
+                    _take_covariance(f, s)
                 else:
                     _clone(f, s, slot)
                 f.stamp[s, slot] = last
@@ -106,7 +96,7 @@ def latch_due(f: Any, last: int) -> None:
 
 
 @jit
-def known(f: Any, s: int, captured: int) -> bool:
+def known(f: Memory, s: int, captured: int) -> bool:
     """Whether a sample of a sensor on its clock came before or is refused; it is counted."""
     frame = (captured - f.phase[s]) // f.period[s]
     if f.phase[s] + frame * f.period[s] != captured:
@@ -123,27 +113,25 @@ def known(f: Any, s: int, captured: int) -> bool:
 
 
 @jit
-def find(f: Any, s: int, captured: int) -> Any:
-    """The first clone that a sample measures, DIRECT for the states, HELD for what else is held of
-    its capture, or DROPPED (and counted)."""
+def find(f: Memory, s: int, captured: int) -> int:
+    """The first clone that a sample measures, DIRECT for the states, STORED_ONE for what else was
+    stored at its capture, or DROPPED (and counted)."""
     if known(f, s, captured):
         return DROPPED
     frame = (captured - f.phase[s]) // f.period[s]
+    found = DROPPED
     if f.late == CONSTANT:
-        f.seen[s, frame % SEEN] = captured
-        return HELD
-    if f.late == IGNORE or captured == f.tick:
-        f.seen[s, frame % SEEN] = captured
-        return DIRECT
-    if f.late == STORED:
-        if f.tick - captured < WINDOW:
-            f.seen[s, frame % SEEN] = captured
-            return HELD
-    elif f.frames[s] > 0:
+        found = STORED_ONE
+    elif f.late == IGNORE or captured == f.tick:
+        found = DIRECT
+    elif f.late == STORED and f.tick - captured < WINDOW:
+        found = STORED_ONE
+    elif f.frames[s] > 0 and f.stamp[s, frame % f.frames[s]] == captured:
         slot = frame % f.frames[s]
-        if f.stamp[s, slot] == captured:
-            f.seen[s, frame % SEEN] = captured
-            f.stamp[s, slot] = -1
-            return HELD if f.late == LARSEN else f.home[s] + slot * f.rows[s]
-    f.counts[COUNTERS.refused] += 1
-    return DROPPED
+        f.stamp[s, slot] = -1
+        found = STORED_ONE if f.late == LARSEN else f.first_clone[s] + slot * f.rows[s]
+    if found == DROPPED:
+        f.counts[COUNTERS.refused] += 1
+    else:
+        f.seen[s, frame % SEEN] = captured
+    return found

@@ -4,43 +4,46 @@ from typing import Any
 
 from ...envs.backend.decorators import jit
 from ...envs.record import FAST
-from ...envs.sensors.slow import GPS
 from .covariance import measure_state, predict_covariance
-from .delay import LARSEN, keep_promises
+from .delay import LARSEN, carry_gains
 from .intersample import (
+    DUAL_RATE,
     PSEUDO,
-    SPREAD,
     correct_between,
     expect,
+    next_share,
     share_between,
     share_fast,
-    spread_between,
 )
-from .memory import COUNTERS, SLOW
-from .speed import cell_of, finite, measured_speed, moved
-from .transition import GIVEN, KINEMATIC, VELOCITY_ROLL, build
+from .memory import COUNTERS, SLOW, Gains, Memory, Row
+from .speed import cell_of, finite, measured_speed, moved, step_row
+from .transition import KINEMATIC, LINEAR, VELOCITY_ROLL, build
 
 
 @jit
-def read(f: Any, row: Any, now: Any) -> None:
-    """Take a fast row: its inputs (the last finite ones), measurements and speed.
+def _sum(row: Row, column: Row, factor: Row) -> Any:
+    """A signal of a fast row (FAST_WIDTH,): the sum of two of its columns times their factors."""
+    return factor[0] * row[column[0]] + factor[1] * row[column[1]]
+
+
+@jit
+def read(f: Memory, row: Row, now: float) -> None:
+    """Take a fast row (FAST_WIDTH,): its inputs (the last finite ones), measurements and speed.
 
     now: this sample of the speed, m/s. The model is built anew where it has to be.
     """
-    f.r_before = f.r[GPS, 0]
     fine = True
     for i in range(f.inputs):
-        value = f.u_factor[i, 0] * row[f.u_column[i, 0]] + f.u_factor[i, 1] * row[f.u_column[i, 1]]
-        f.ph[i] = value
-        fine = fine and finite(value)
+        f.u_new[i] = _sum(row, f.u_column[i], f.u_factor[i])
+        fine = fine and finite(f.u_new[i])
     if fine:
         for i in range(f.inputs):
-            f.u[i] = f.ph[i]
+            f.u[i] = f.u_new[i]
     else:
         f.counts[COUNTERS.invalid] += 1
     for i in range(f.fasts):
-        f.y[i] = f.y_factor[i, 0] * row[f.y_column[i, 0]] + f.y_factor[i, 1] * row[f.y_column[i, 1]]
-    turning = f.turning
+        f.y[i] = _sum(row, f.y_column[i], f.y_factor[i])
+    turning, f.speed_before = f.turning, f.model_speed
     if (f.kind == KINEMATIC or f.kind == VELOCITY_ROLL) and finite(row[FAST.gyro]):
         turning = row[FAST.gyro]
     renew = turning != f.turning
@@ -54,8 +57,8 @@ def read(f: Any, row: Any, now: Any) -> None:
 
 
 @jit
-def _predict(f: Any, v: Any) -> None:
-    """v <- F v on the states."""
+def _predict(f: Memory, v: Row) -> None:
+    """v <- F v on the states of a vector (n,) or longer."""
     n, dense, G, T = f.n, f.dense, f.G, f.work[0, 0]
     for i in range(dense):
         total = 0.0
@@ -69,13 +72,13 @@ def _predict(f: Any, v: Any) -> None:
 
 
 @jit
-def advance_state(f: Any, u: Any) -> None:
-    """x <- F x + H u, and P or e with it."""
+def advance_state(f: Memory, u: Row) -> None:
+    """x <- F x + H u for the inputs u (INPUTS,), and P or e with it."""
     _predict(f, f.x)
     for i in range(f.dense):
         for j in range(f.inputs):
             f.x[i] += f.H[i, j] * u[j]
-    if f.kind == GIVEN:
+    if f.kind == LINEAR:
         for i in range(f.n):
             f.x[i] += f.drift[i]
     if f.between == PSEUDO:
@@ -86,65 +89,64 @@ def advance_state(f: Any, u: Any) -> None:
             for s in range(SLOW):
                 if f.stamp[s, 0] >= 0:
                     for i in range(f.rows[s]):
-                        _predict(f, f.promise[s, i])
+                        _predict(f, f.larsen_gain[s, i])
 
 
 @jit
-def fast_residual(f: Any, i: int) -> Any:
-    """Residual of the fast measurement i."""
+def _residual(f: Memory, i: int) -> Any:
+    """The residual of the fast measurement i."""
     residual = f.y[i]
     for k in range(f.n):
-        residual -= f.y_row[i, k] * f.x[k]
+        residual -= f.C_fast[i, k] * f.x[k]
     for j in range(f.inputs):
-        residual -= f.y_feed[i, j] * f.u[j]
+        residual -= f.D_fast[i, j] * f.u[j]
     return residual
 
 
 @jit
-def _correct_joint(f: Any, gains: Any) -> None:
+def _correct_joint(f: Memory, gains: Gains) -> None:
     """x += K residuals with residuals that are all taken before, in f.eps."""
     for i in range(f.fasts):
-        K = gains[f.cell, 1 + f.at * f.fasts + i]
+        K = gains[f.cell, step_row(f) + i]
         for j in range(f.total):
             f.x[j] += K[j] * f.eps[i]
 
 
 @jit
-def correct_fast(f: Any, gains: Any) -> None:
+def correct_fast(f: Memory, gains: Gains) -> None:
     """Correct by the fast measurements in f.y; what is not finite is counted and skipped."""
     for i in range(f.fasts):
         if not finite(f.y[i]):
             f.counts[COUNTERS.invalid] += 1
-    slow = 0 if f.period[0] > 0 else 1
     if f.between == PSEUDO:
-        expect(f, slow)
+        expect(f, f.first_slow)
     if f.joint == 1:
         for i in range(f.fasts):
-            residual = fast_residual(f, i)
+            residual = _residual(f, i)
             f.eps[i] = residual if finite(residual) else 0.0
         if f.between == PSEUDO:
-            correct_between(f, gains, slow)
+            correct_between(f, gains, f.first_slow)
         else:
             _correct_joint(f, gains)
         return
     for i in range(f.fasts):
-        residual = fast_residual(f, i)
+        residual = _residual(f, i)
         if not finite(residual):
             f.eps[i] = 0.0
             continue
         if f.periodic == 1:
-            K = gains[f.cell, 1 + f.at * f.fasts + i]
+            K = gains[f.cell, step_row(f) + i]
             for j in range(f.total):
                 f.x[j] += K[j] * residual
             continue
-        measure_state(f, f.y_row[i], f.r_fast[i], residual)
+        measure_state(f, f.C_fast[i], f.r_fast[i], residual)
         for j in range(f.total):
             f.share[i, j] = f.gain[j]
         if f.between == PSEUDO:
             share_fast(f, i, residual)
         if f.late == LARSEN:
-            keep_promises(f, f.y_row[i])
+            carry_gains(f, f.C_fast[i])
     if f.between == PSEUDO:
-        share_between(f, slow)
-    elif f.between == SPREAD:
-        spread_between(f, gains, slow)
+        share_between(f, f.first_slow)
+    elif f.between == DUAL_RATE:
+        next_share(f, gains, f.first_slow)

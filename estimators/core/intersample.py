@@ -4,66 +4,52 @@ predict: nothing. pseudo-residual: tie-vision (19)-(22), which uneven-delay (20)
 (28)-(29), dual-rate (31) and Oh's (35) repeat: the propagated estimate of the error. The fast
 sensors' residuals are always the real ones. One constant gain K serves every tick, its columns in
 the order fast rows, slow rows; where gains are not precomputed, the share of the last sample's.
-spread: dual-rate's rules, whose corrections after a sample are a table of shares of its innovation
-(`spread`). single-rate: a filter that listens only at the sensor's rate.
+dual-rate: that paper's rules, whose corrections after a sample are a table of shares of its
+innovation (`design.dual_rate`). single-rate: a filter that listens only at the sensor's rate.
 """
 
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
-
 from ...envs.backend.decorators import jit
-from ...envs.backend.primitives import maximum
-from .covariance import measure_clone, measure_state
+from .covariance import dot, measure_clone, measure_state
 from .innovation import noise_of
+from .memory import Gains, Memory, Row
+from .speed import frame_row
 
-Array = npt.NDArray[np.float64]
-
-RULES = ("predict", "pseudo-residual", "single-rate", "spread")
-NONE, PSEUDO, SPREAD = range(3)
-"""Codes of what happens between samples in compiled code."""
-RIDGE = 1e-3  # lambda of Tikhonov's inverse, in SI units squared
+NONE, PSEUDO, DUAL_RATE = range(3)
+"""Codes of the field `between`."""
 
 
 @jit
-def _slow_row(f: Any, s: int, i: int, v: Any) -> Any:
-    """The slow row i of sensor s applied to a vector of states and clones: its clone, if held."""
-    if f.frames[s] > 0:
-        return v[f.home[s] + i]
-    total = 0.0
-    for k in range(f.n):
-        total += f.row[s, i, k] * v[k]
-    return total
+def _measured(f: Memory, s: int, i: int, v: Row) -> Any:
+    """Row i of sensor s applied to a vector of states and clones (total,): its clone, if it has."""
+    return v[f.first_clone[s] + i] if f.frames[s] > 0 else dot(f.C[s, i], v, f.n)
 
 
 @jit
-def expect(f: Any, s: int) -> None:
+def expect(f: Memory, s: int) -> None:
     """What the slow rows are expected to be, and their pseudo-residuals: tie-vision (22)."""
     for i in range(f.rows[s]):
-        f.expected[i] = _slow_row(f, s, i, f.x)
-        f.eps[f.fasts + i] = _slow_row(f, s, i, f.e)  # C G e
+        f.expected[i] = _measured(f, s, i, f.x)
+        f.eps[f.fasts + i] = _measured(f, s, i, f.e)  # C G e
 
 
 @jit
-def correct_between(f: Any, gains: Any, s: int) -> None:
+def correct_between(f: Memory, gains: Gains, s: int) -> None:
     """Correct x and e, both predicted, by the fast residuals in f.eps and the pseudo-residuals.
 
     gains: in the present table, rows of K^T and then of the inverse's transpose stand behind those
     of the steps and frames.
     """
     x, e, N, m = f.x, f.e, f.total, f.fasts
-    first = _constant_row(f, s)
+    first = frame_row(f, s, f.pattern)
     for i in range(m):
-        ahead = 0.0
-        for k in range(f.n):
-            ahead += f.y_row[i, k] * e[k]
-        f.residual[i] = ahead
+        f.e_seen[i] = dot(f.C_fast[i], e, f.n)
     for i in range(m):
         K = gains[f.cell, first + i]
         for j in range(N):
             x[j] += K[j] * f.eps[i]
-            e[j] -= K[j] * f.residual[i]  # (21): (I - K C) G e
+            e[j] -= K[j] * f.e_seen[i]  # (21): (I - K C) G e
     for i in range(m, m + f.rows[s]):
         K = gains[f.cell, first + i]
         for j in range(N):
@@ -72,16 +58,10 @@ def correct_between(f: Any, gains: Any, s: int) -> None:
 
 
 @jit
-def _constant_row(f: Any, s: int) -> Any:
-    """The row of the table at which K^T, or the shares of an innovation, start."""
-    return 1 + f.cycle * maximum(f.fasts, 1) + f.rows[s] * f.pattern
-
-
-@jit
-def correct_sample(f: Any, gains: Any, s: int) -> None:
+def correct_sample(f: Memory, gains: Gains, s: int) -> None:
     """A sample has come in this tick: its residuals replace the pseudo ones, and e starts anew."""
     m, N, rows = f.fasts, f.total, f.rows[s]
-    first = _constant_row(f, s)
+    first = frame_row(f, s, f.pattern)
     for i in range(rows):
         K, real = gains[f.cell, first + m + i], f.residual[i]  # tie-vision (19)
         for j in range(N):
@@ -96,18 +76,16 @@ def correct_sample(f: Any, gains: Any, s: int) -> None:
 
 
 @jit
-def share_fast(f: Any, i: int, residual: Any) -> None:
-    """A fast row's gain was used on x: the same for e."""
-    ahead = 0.0
-    for k in range(f.n):
-        ahead += f.y_row[i, k] * f.e[k]
+def share_fast(f: Memory, i: int, residual: float) -> None:
+    """A fast row's gain f.share[i] was used on x: the same for e."""
+    ahead = dot(f.C_fast[i], f.e, f.n)
     f.eps[i] = residual
     for j in range(f.total):
         f.e[j] -= f.share[i, j] * ahead
 
 
 @jit
-def share_between(f: Any, s: int) -> None:
+def share_between(f: Memory, s: int) -> None:
     """Correct x and e by the pseudo-residuals with the share of the last sample's gain."""
     for i in range(f.fasts, f.fasts + f.rows[s]):
         for j in range(f.total):
@@ -116,8 +94,9 @@ def share_between(f: Any, s: int) -> None:
 
 
 @jit
-def share_sample(f: Any, s: int, first: int, packet: Any) -> None:
-    """`correct_sample` with the covariance's gain of this very sample, spread over a period."""
+def share_sample(f: Memory, s: int, first: int, packet: Row) -> None:
+    """`correct_sample` with the covariance's gain of this packet (PACKET_WIDTH,), in even shares
+    over a period."""
     m, N, rows = f.fasts, f.total, f.rows[s]
     steps = f.period[s] // f.stride
     for i in range(rows):
@@ -128,9 +107,9 @@ def share_sample(f: Any, s: int, first: int, packet: Any) -> None:
         if first >= 0:
             measure_clone(f, first + i, r, 0.0)
         else:
-            measure_state(f, f.row[s, i], r, 0.0)
+            measure_state(f, f.C[s, i], r, 0.0)
         for k in range(i):  # the rows before it correct what it measures
-            moved = _slow_row(f, s, i, f.share[m + k])
+            moved = _measured(f, s, i, f.share[m + k])
             for j in range(N):
                 f.share[m + k, j] -= f.gain[j] * moved
         for j in range(N):
@@ -145,28 +124,28 @@ def share_sample(f: Any, s: int, first: int, packet: Any) -> None:
 
 
 @jit
-def _spread(f: Any, gains: Any, s: int) -> None:
+def _use_share(f: Memory, gains: Gains, s: int) -> None:
     """x += the share of the last innovation that is due now."""
-    first = _constant_row(f, s) + f.since * f.rows[s]
+    first = frame_row(f, s, f.pattern) + f.since * f.rows[s]
     for i in range(f.rows[s]):
         K = gains[f.cell, first + i]
         for j in range(f.total):
-            f.x[j] += K[j] * f.eps[f.fasts + i]
+            f.x[j] += K[j] * f.innovation[i]
 
 
 @jit
-def spread_sample(f: Any, gains: Any, s: int) -> None:
-    """A sample has come: keep its innovation and use its first share."""
+def begin_shares(f: Memory, gains: Gains, s: int) -> None:
+    """A sample has come: store its innovation and use its first share."""
     for i in range(f.rows[s]):
-        f.eps[f.fasts + i] = f.residual[i]
+        f.innovation[i] = f.residual[i]
     f.since = 0
-    _spread(f, gains, s)
+    _use_share(f, gains, s)
 
 
 @jit
-def spread_between(f: Any, gains: Any, s: int) -> None:
+def next_share(f: Memory, gains: Gains, s: int) -> None:
     """The next share, as long as there is one."""
     if f.since >= 0:
         f.since += 1
         if f.since < f.cycle:
-            _spread(f, gains, s)
+            _use_share(f, gains, s)

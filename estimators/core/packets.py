@@ -1,23 +1,24 @@
-"""A packet that is here: sound or not, for now or for the next step."""
+"""A packet that is here: sound or not, for now or for the next step.
+
+A packet is a row (PACKET_WIDTH,), columns as in `envs.record.Packet`.
+"""
 
 from typing import Any
 
 import numpy as np
 
-from ...envs.backend.decorators import apart, jit
+from ...envs.backend.decorators import apart, copied, jit
 from ...envs.backend.primitives import floor
-from ...envs.record import PACKET, PACKET_WIDTH
-from ...envs.sensors.slow import GPS
+from ...envs.record import PACKET
 from .delay import BUFFER, DROPPED, find, known
-from .innovation import SATELLITES
-from .memory import COUNTERS, SLOW, WAITING
+from .memory import COUNTERS, SLOW, WAITING, Gains, Memory, Row
 from .rewind import take_late
 from .speed import finite
 from .update import measure
 
 
 @jit
-def use(f: Any, gains: Any, s: int, packet: Any) -> bool:
+def use(f: Memory, gains: Gains, s: int, packet: Row) -> bool:
     """Use a sound packet of sensor s according to its age; whether it was used."""
     if f.late == BUFFER:
         return take_late(f, gains, s, packet)
@@ -32,8 +33,8 @@ def _whole(value: Any) -> Any:
 
 
 @jit
-def _timely(f: Any, captured: Any, arrived: Any) -> bool:
-    """Whether stamps are ticks from the first row to now, in their order; else it is counted."""
+def _timely(f: Memory, captured: Any, arrived: Any) -> bool:
+    """Whether stamps are ticks from the first row to now, in their order; else counted."""
     if not (_whole(captured) and _whole(arrived)) or arrived < captured:
         f.counts[COUNTERS.unknown] += 1
     elif arrived > f.tick:
@@ -46,7 +47,7 @@ def _timely(f: Any, captured: Any, arrived: Any) -> bool:
 
 
 @jit
-def sound(f: Any, packet: Any) -> bool:
+def sound(f: Memory, packet: Row) -> bool:
     """Whether a packet is one for this filter and fit for use; what is not is counted.
 
     Numbers are judged as floats, before any becomes an int.
@@ -66,8 +67,9 @@ def sound(f: Any, packet: Any) -> bool:
         if not finite(packet[PACKET.value + i]):
             f.counts[COUNTERS.invalid] += 1
             return False
-    satellites = packet[PACKET.value + SATELLITES]  # 0 or NaN: not told
-    few = s == GPS and satellites > 0.0 and satellites < f.satellites
+    few, column = False, f.satellites_column[s]
+    if column > 0:
+        few = packet[column] > 0.0 and packet[column] < f.least_satellites  # 0 or NaN: unknown
     if packet[PACKET.quality] <= 0.0 or few:
         f.counts[COUNTERS.poor] += 1
         return False
@@ -75,8 +77,8 @@ def sound(f: Any, packet: Any) -> bool:
 
 
 @jit
-def _wait(f: Any, s: int, packet: Any) -> bool:
-    """Keep a packet for the next step that listens; whether it is kept."""
+def _wait(f: Memory, s: int, packet: Row) -> bool:
+    """Queue a packet for the next step that listens; False if it is refused, and counted."""
     if known(f, s, int(packet[PACKET.captured])):
         return False
     for i in range(f.waits):
@@ -87,14 +89,13 @@ def _wait(f: Any, s: int, packet: Any) -> bool:
     if f.waits == WAITING:
         f.counts[COUNTERS.refused] += 1
         return False
-    for i in range(PACKET_WIDTH):
-        f.waiting[f.waits, i] = packet[i]
+    copied(packet, f.waiting[f.waits])
     f.waits += 1
     return True
 
 
 @jit
-def receive_sample(f: Any, gains: Any) -> bool:
+def receive_sample(f: Memory, gains: Gains) -> bool:
     """`receive` the packet that lies in f.sample."""
     f.nis = np.nan
     if not sound(f, f.sample):
@@ -106,19 +107,17 @@ def receive_sample(f: Any, gains: Any) -> bool:
 
 
 @apart
-def receive(f: Any, gains: Any, packet: Any) -> bool:
-    """Use a packet that is here now, keep it for the next step, or drop and count it; whether it
-    was used or kept."""
-    for i in range(PACKET_WIDTH):
-        f.sample[i] = packet[i]
+def receive(f: Memory, gains: Gains, packet: Row) -> bool:
+    """Use a packet that is here now, queue it for the next step, or drop and count it; False if it
+    was dropped."""
+    copied(packet, f.sample)
     return receive_sample(f, gains)
 
 
 @jit
-def use_waiting(f: Any, gains: Any) -> None:
+def use_waiting(f: Memory, gains: Gains) -> None:
     """Use the packets that came since the last step that listened."""
     for i in range(f.waits):
-        for j in range(PACKET_WIDTH):
-            f.sample[j] = f.waiting[i, j]
+        copied(f.waiting[i], f.sample)
         use(f, gains, int(f.sample[PACKET.sensor]), f.sample)
     f.waits = 0

@@ -1,81 +1,75 @@
-"""The rule "buffer": what happened in the window is told again when a late sample comes.
+"""The rule "buffer": the window is filtered anew when a late sample comes.
 
-Every tick's inputs, fast measurements and speed are kept, and every few ticks the states and their
-covariance. A sample captured at c is put in its place: the newest snapshot not after c is taken
-back, and the ticks up to now are filtered anew with all samples that are known by now. Exact for
-any delay, order and clock; a sample older than the window, or than a sample that is no longer kept,
-is refused and counted. The gate judges a sample once, by what was known of the time before it; one
+Every tick's inputs, fast measurements and speed are stored, and every few ticks the states and
+their covariance. A sample captured at c is put in its place: the newest snapshot not after c is
+restored, and the ticks up to now are filtered anew with all samples that are known by now. Exact
+for any delay, order and clock; a sample older than the window, or than a sample that had to go, is
+refused and counted. The gate judges a sample once, by what was known of the time before it; one
 that it refuses leaves everything as it was.
 """
 
-from typing import Any
-
-from ...envs.backend.decorators import apart, jit
+from ...envs.backend.decorators import apart, copied, jit
 from ...envs.backend.primitives import maximum
-from ...envs.record import PACKET, PACKET_WIDTH
+from ...envs.record import PACKET
 from .delay import direct
 from .fast import advance_state, correct_fast
-from .memory import COUNTERS, EVERY, FASTS, INPUTS, RECENT, ROWS, SLOW, SNAPSHOTS, WINDOW
+from .memory import COUNTERS, EVERY, RECENT, SLOW, SNAPSHOTS, WINDOW, Gains, Memory, Row
 from .transition import VELOCITY_ROLL, build
 from .update import measure
 
 _GONE = -1  # the captured tick of a place that is empty
-_NOW = SNAPSHOTS  # the snapshot of now, while the past is told
+_NOW = SNAPSHOTS  # the snapshot of now, while the past is filtered anew
 
 
 @jit
-def _slot(f: Any, tick: int) -> int:
+def _slot(f: Memory, tick: int) -> int:
     """The snapshot after the fast row of a tick, before its samples."""
     return int((tick - f.start) // EVERY % SNAPSHOTS)
 
 
 @jit
-def _shoot(f: Any, slot: int) -> None:
-    """Keep the states in a snapshot."""
+def _shoot(f: Memory, slot: int) -> None:
+    """Store states and covariance in a snapshot."""
     for i in range(f.n):
-        f.shot_x[slot, i] = f.x[i]
+        f.snapshot_x[slot, i] = f.x[i]
         for j in range(f.n):
-            f.shot_P[slot, i, j] = f.P[i, j]
+            f.snapshot_P[slot, i, j] = f.P[i, j]
 
 
 @jit
-def _take_back(f: Any, slot: int) -> None:
-    """The states of a snapshot."""
+def _restore(f: Memory, slot: int) -> None:
+    """The states and covariance of a snapshot."""
     for i in range(f.n):
-        f.x[i] = f.shot_x[slot, i]
+        f.x[i] = f.snapshot_x[slot, i]
         for j in range(f.n):
-            f.P[i, j] = f.shot_P[slot, i, j]
+            f.P[i, j] = f.snapshot_P[slot, i, j]
 
 
 @jit
-def remember(f: Any) -> None:
-    """Keep what the present tick told."""
+def remember(f: Memory) -> None:
+    """Store the inputs, fast measurements and model of the present tick."""
     slot = f.tick % WINDOW
-    for i in range(INPUTS):
-        f.told_u[slot, i] = f.u[i]
-    for i in range(FASTS):
-        f.told_y[slot, i] = f.y[i]
-    f.told_speed[slot, 0], f.told_speed[slot, 1] = f.model_speed, f.turning
+    copied(f.u, f.past_u[slot])
+    copied(f.y, f.past_y[slot])
+    f.past_speed[slot], f.past_turning[slot] = f.model_speed, f.turning
     if (f.tick - f.start) % EVERY == 0:
         _shoot(f, _slot(f, f.tick))
 
 
 @jit
-def _recall(f: Any, tick: int) -> None:
+def _recall(f: Memory, tick: int) -> None:
     """Inputs, fast measurements and model of a tick."""
     slot = tick % WINDOW
-    for i in range(INPUTS):
-        f.u[i] = f.told_u[slot, i]
-    for i in range(FASTS):
-        f.y[i] = f.told_y[slot, i]
-    speed, turning = f.told_speed[slot, 0], f.told_speed[slot, 1]
+    copied(f.past_u[slot], f.u)
+    copied(f.past_y[slot], f.y)
+    speed, turning = f.past_speed[slot], f.past_turning[slot]
     if speed != f.model_speed or turning != f.turning:
         build(f, speed, turning)
 
 
 @jit
-def _oldest(f: Any) -> int:
-    """The place to keep a packet in: an empty one, or that of the earliest captured."""
+def _oldest(f: Memory) -> int:
+    """The place to store a packet in: an empty one, or that of the earliest captured."""
     place = 0
     for i in range(RECENT):
         if f.recent[i, PACKET.captured] < f.recent[place, PACKET.captured]:
@@ -84,17 +78,16 @@ def _oldest(f: Any) -> int:
 
 
 @jit
-def _keep(f: Any, s: int, packet: Any, place: int) -> None:
-    """Keep a packet and its noise; what stood in its place is lost."""
+def _store(f: Memory, s: int, packet: Row, place: int) -> None:
+    """Store a packet and its noise; what stood in its place is lost."""
     f.lost = maximum(f.lost, int(f.recent[place, PACKET.captured]))
-    for i in range(PACKET_WIDTH):
-        f.recent[place, i] = packet[i]
-    for i in range(ROWS):
-        f.recent_r[place, i] = f.r[s, i]
+    copied(packet, f.recent[place])
+    copied(f.r[s], f.recent_r[place])
 
 
 @jit
-def _twice(f: Any, s: int, captured: int) -> bool:
+def _twice(f: Memory, s: int, captured: int) -> bool:
+    """Whether a sample is a duplicate of a stored one."""
     for i in range(RECENT):
         if f.recent[i, PACKET.captured] == captured and f.recent[i, PACKET.sensor] == s:
             return True
@@ -102,7 +95,7 @@ def _twice(f: Any, s: int, captured: int) -> bool:
 
 
 @jit
-def _since(f: Any, first: int) -> int:
+def _since(f: Memory, first: int) -> int:
     """Collect in f.replay the good samples captured at `first` or later; returns how many."""
     count = 0
     for i in range(RECENT):
@@ -113,13 +106,11 @@ def _since(f: Any, first: int) -> int:
 
 
 @jit
-def _measure(f: Any, gains: Any, s: int, place: int, new: bool) -> bool:
-    """Use a kept sample; False if it is new and the gate refuses it, now and for ever."""
-    if f.kind == VELOCITY_ROLL:  # told its noise with each packet
-        for i in range(ROWS):
-            f.r[s, i] = f.recent_r[place, i]
-    for i in range(PACKET_WIDTH):
-        f.sample[i] = f.recent[place, i]
+def _measure(f: Memory, gains: Gains, s: int, place: int, new: bool) -> bool:
+    """Use a stored sample; False if it is new and the gate refuses it, now and for ever."""
+    if f.kind == VELOCITY_ROLL:  # its noise comes with each packet
+        copied(f.recent_r[place], f.r[s])
+    copied(f.recent[place], f.sample)
     passed = measure(f, gains, s, direct(), f.sample, new)
     if not passed:
         f.recent[place, PACKET.quality] = 0.0
@@ -127,7 +118,7 @@ def _measure(f: Any, gains: Any, s: int, place: int, new: bool) -> bool:
 
 
 @jit
-def _measure_again(f: Any, gains: Any, tick: int, count: int, new: int) -> bool:
+def _measure_again(f: Memory, gains: Gains, tick: int, count: int, new: int) -> bool:
     """Use the samples captured at a tick, one sensor after the other; False as `_measure`."""
     for s in range(SLOW):
         for i in range(count):
@@ -139,12 +130,12 @@ def _measure_again(f: Any, gains: Any, tick: int, count: int, new: int) -> bool:
 
 
 @jit
-def _tell_again(f: Any, gains: Any, first: int, new: int) -> bool:
+def _filter_anew(f: Memory, gains: Gains, first: int, new: int) -> bool:
     """Filter anew from the snapshot at `first` to now; False, and back to now, if the gate refuses
     the sample at the place `new`."""
     now, invalid, count = f.tick, f.counts[COUNTERS.invalid], _since(f, first)
     _shoot(f, _NOW)
-    _take_back(f, _slot(f, first))
+    _restore(f, _slot(f, first))
     passed = True
     for tick in range(first, now + 1):
         _recall(f, tick)
@@ -159,13 +150,13 @@ def _tell_again(f: Any, gains: Any, first: int, new: int) -> bool:
     f.counts[COUNTERS.invalid] = invalid  # each row was counted when it came
     if not passed:
         _recall(f, now)
-        _take_back(f, _NOW)
+        _restore(f, _NOW)
     return passed
 
 
 @apart
-def take_late(f: Any, gains: Any, s: int, packet: Any) -> bool:
-    """Use a sample of any age within the window; whether it was used."""
+def take_late(f: Memory, gains: Gains, s: int, packet: Row) -> bool:
+    """Use a packet (PACKET_WIDTH,) of any age within the window; whether it was used."""
     captured = int(packet[PACKET.captured])
     first = f.start + (captured - f.start) // EVERY * EVERY
     if _twice(f, s, captured):
@@ -175,14 +166,14 @@ def take_late(f: Any, gains: Any, s: int, packet: Any) -> bool:
     if f.tick - first >= WINDOW or first <= maximum(f.lost, int(f.recent[place, PACKET.captured])):
         f.counts[COUNTERS.refused] += 1
         return False
-    _keep(f, s, packet, place)
+    _store(f, s, packet, place)
     if captured == f.tick:
         return _measure(f, gains, s, place, captured == f.tick)
-    return _tell_again(f, gains, first, place)
+    return _filter_anew(f, gains, first, place)
 
 
 @jit
-def forget(f: Any) -> None:
+def forget(f: Memory) -> None:
     """Empty the window."""
     f.lost = _GONE
     for i in range(RECENT):

@@ -10,41 +10,58 @@ from typing import Any
 
 import numpy as np
 
-from ...envs.backend.decorators import apart, counted, jit
+from ...envs.backend.decorators import apart, copied, counted, jit
 from ...envs.backend.primitives import maximum, sqrt
 from ...envs.record import FAST, PACKET
 from .delay import BUFFER, latch_due
 from .fast import advance_state, correct_fast, read
-from .memory import COUNTERS, FRAMES, INPUTS, ROWS, SEEN, SLOW, WIDTH, WINDOW
+from .memory import (
+    CORE,
+    COUNTERS,
+    FRAMES,
+    SEEN,
+    SLOW,
+    WIDTH,
+    WINDOW,
+    Filters,
+    Gains,
+    Memory,
+    Row,
+)
 from .packets import receive, use_waiting
 from .rewind import forget, remember
 from .second_layer import pass_on
-from .speed import next_cell
+from .speed import next_cell, step_row
 from .transition import build
 
 
+@jit
+def _fill(vector: Row, value: float) -> None:
+    for i in range(len(vector)):
+        vector[i] = value
+
+
 @apart
-def begin(f: Any, first: int) -> None:
+def begin(f: Memory, first: int) -> None:
     """A fresh filter whose first row is the tick `first`."""
     f.start, f.tick, f.begun, f.at = first, first - 1, 0, 0
     f.cell, f.wanted, f.cursor, f.waits, f.u_count = 0, -1, 0, 0, 0
     f.first_fix, f.since, f.nis, f.turning = -1, -1, np.nan, 0.0
+    _fill(f.x, 0.0)
+    _fill(f.e, 0.0)
+    _fill(f.gain, 0.0)
+    _fill(f.eps, 0.0)
+    _fill(f.innovation, 0.0)
+    _fill(f.u, 0.0)
+    _fill(f.u_sum, 0.0)
+    for i in range(len(f.share)):
+        _fill(f.share[i], 0.0)
     for i in range(WIDTH):
-        f.x[i], f.e[i], f.gain[i] = 0.0, 0.0, 0.0
-        for j in range(WIDTH):
-            f.P[i, j] = 0.0
-        for j in range(len(f.share)):
-            f.share[j, i] = 0.0
-    for i in range(len(f.eps)):
-        f.eps[i] = 0.0
-    for i in range(f.n):
-        for j in range(f.n):
-            f.P[i, j] = f.prior[i, j]
-    for i in range(INPUTS):
-        f.u[i], f.u_sum[i] = 0.0, 0.0
+        _fill(f.P[i], 0.0)
+    for i in range(CORE):
+        copied(f.prior[i], f.P[i])
     for s in range(SLOW):
-        for i in range(ROWS):
-            f.scale[s, i] = 1.0
+        _fill(f.scale[s], 1.0)
         for i in range(FRAMES):
             f.stamp[s, i] = -1
         for i in range(SEEN):
@@ -62,7 +79,7 @@ def begin(f: Any, first: int) -> None:
 
 
 @jit
-def _start(f: Any) -> None:
+def _start(f: Memory) -> None:
     """The first step: nothing to predict from."""
     f.begun = 1
     f.at = ((f.tick - f.origin) // f.stride) % f.cycle
@@ -71,7 +88,7 @@ def _start(f: Any) -> None:
 
 
 @jit
-def tick(f: Any, gains: Any) -> None:
+def tick(f: Memory, gains: Gains) -> None:
     """From the last tick to this one, whose fast row was read."""
     f.tick += 1
     if f.stride > 1:
@@ -92,9 +109,9 @@ def tick(f: Any, gains: Any) -> None:
         f.at = f.at + 1 if f.at + 1 < f.cycle else 0
     else:
         _start(f)
-    if f.trailing == 1:
+    if f.store_predictions == 1:
         for i in range(f.n):
-            f.trail[f.tick % WINDOW, i] = f.x[i]
+            f.predicted[f.tick % WINDOW, i] = f.x[i]
     if listens:
         correct_fast(f, gains)
     if f.late == BUFFER:
@@ -107,23 +124,22 @@ def tick(f: Any, gains: Any) -> None:
 
 
 @jit
-def covariance_of(f: Any, gains: Any, i: int, j: int) -> Any:
+def covariance_of(f: Memory, gains: Gains, i: int, j: int) -> Any:
     """P[i, j] of two states, i <= j, now; with periodic gains that of the settled cycle."""
     if f.periodic == 1:
-        at = 1 + f.at * maximum(f.fasts, 1)
-        return gains[f.cell, at, f.total + i * f.n - i * (i - 1) // 2 + j - i]
+        return gains[f.cell, step_row(f), f.total + i * f.n - i * (i - 1) // 2 + j - i]
     return f.P[i, j]
 
 
 @jit
-def deviation(f: Any, gains: Any, i: int) -> Any:
+def deviation(f: Memory, gains: Gains, i: int) -> Any:
     """The standard deviation of a state now."""
     return sqrt(maximum(covariance_of(f, gains, i, i), 0.0))
 
 
 @jit
-def _write(layers: Any, gains: Any, j: int, X: Any, S: Any) -> None:
-    """Row j of the states and standard deviations of all layers."""
+def _write(layers: Filters, gains: Gains, j: int, X: Any, S: Any) -> None:
+    """The states and standard deviations of all layers into row j of X and S (rows, n)."""
     column = 0
     for layer in range(len(layers)):
         f = layers[layer]
@@ -135,8 +151,8 @@ def _write(layers: Any, gains: Any, j: int, X: Any, S: Any) -> None:
 
 @apart
 def advance(
-    layers: Any,
-    gains: Any,
+    layers: Filters,
+    gains: Gains,
     fast: Any,
     rows: int,
     packets: Any,
@@ -144,14 +160,15 @@ def advance(
     start: int,
     X: Any,
     S: Any,
-    nis: Any,
+    nis: Row,
 ) -> int:
     """Take the fast rows from `start` to `rows` and the first `count` packets.
 
-    layers: the filters of one estimator, each told what the one before it says. gains: (cells,
-    ..., ...). X, S: (rows, n) to be filled, or empty. nis: (count,) to be filled with each packet's
-    normalised innovation squared, or empty. Returns the rows done: fewer than `rows` where gains
-    are missing, `wanted` of the first layer says which; call again from there.
+    layers: (1,) or (2,), the second measures what the first estimates. gains: of the first layer.
+    fast: (rows or more, FAST_WIDTH). packets: (count or more, PACKET_WIDTH). X, S: (rows, n) to be
+    filled with states and standard deviations, or empty. nis: (count,) to be filled with each
+    packet's normalised innovation squared, or empty. Returns the rows done: fewer than `rows` where
+    gains are missing, those of the cell `wanted` of the first layer; call again from there.
     """
     f = layers[0]
     at, last = 0 if start == 0 else f.cursor, f.tick + rows - start
@@ -179,7 +196,7 @@ def advance(
 
 
 @counted
-def step_all(layers: Any, gains: Any, fast: Any, packets: Any, count: int) -> int:
+def step_all(layers: Filters, gains: Gains, fast: Any, packets: Any, count: int) -> int:
     """`advance` over all rows with nothing to be filled: fewer arguments to hand over."""
     nothing = fast[:0]
     return advance(
@@ -197,14 +214,14 @@ def step_all(layers: Any, gains: Any, fast: Any, packets: Any, count: int) -> in
 
 
 @jit
-def begin_all(layers: Any, first: int) -> None:
+def begin_all(layers: Filters, first: int) -> None:
     """`begin` for all layers of an estimator."""
     for i in range(len(layers)):
         begin(layers[i], first)
 
 
 @jit
-def receive_all(layers: Any, gains: Any, packet: Any) -> None:
-    """`receive` for all layers of an estimator."""
+def receive_all(layers: Filters, gains: Gains, packet: Row) -> None:
+    """`receive` a packet (PACKET_WIDTH,) by all layers of an estimator."""
     if receive(layers[0], gains, packet) and len(layers) > 1:
         pass_on(layers[0], layers[1], gains, packet)

@@ -1,9 +1,15 @@
-"""The measured speed: when the model is built anew, and which table of gains belongs to it."""
+"""The measured speed: when the model is built anew, and where its gains stand.
+
+There is a table of gains for each cell of speed. Its rows: a head, then, for each step of the
+cycle, one for every fast measurement (one where there is none), then, for each frame of the
+pattern, one for every row of the slow sensor, then those of the rule between samples.
+"""
 
 from typing import Any
 
 from ...envs.backend.decorators import jit
 from ...envs.backend.primitives import absolute, maximum, minimum
+from .memory import Memory
 from .transition import SLOWEST
 
 LARGEST = 1e15  # of a number that a filter takes: below it, whole floats are exact as int
@@ -11,14 +17,14 @@ MOVED = 0.005  # the model is built anew where the speed moved by this share
 
 
 @jit
-def finite(value: Any) -> Any:
+def finite(value: float) -> Any:
     """Whether a number is one to calculate with: not NaN, infinite or beyond all measure."""
     return absolute(value) < LARGEST
 
 
 @jit
-def measured_speed(f: Any, now: Any) -> Any:
-    """The low-passed mean of the front wheels' speeds, with this sample of it."""
+def measured_speed(f: Memory, now: float) -> Any:
+    """The low-passed mean of the front wheels' speeds in m/s, with this sample of it."""
     if not finite(now):
         return f.speed
     if f.model_speed == 0.0:
@@ -27,14 +33,14 @@ def measured_speed(f: Any, now: Any) -> Any:
 
 
 @jit
-def moved(f: Any, speed: Any) -> Any:
-    """Whether the model has to be built anew for this speed."""
+def moved(f: Memory, speed: float) -> Any:
+    """Whether the model has to be built anew for this speed in m/s."""
     return absolute(maximum(speed, SLOWEST) - f.model_speed) > MOVED * f.model_speed
 
 
 @jit
-def cell_of(f: Any, speed: Any) -> int:
-    """The table of gains nearest to a speed."""
+def cell_of(f: Memory, speed: float) -> Any:
+    """The table of gains nearest to a speed in m/s."""
     if f.spacing == 0.0:
         return 0
     V = minimum(maximum(speed, f.low), f.high)
@@ -42,10 +48,25 @@ def cell_of(f: Any, speed: Any) -> int:
 
 
 @jit
-def next_cell(f: Any, now: Any) -> Any:
-    """The table of gains that a row with this sample of the speed will ask for."""
+def next_cell(f: Memory, now: float) -> Any:
+    """The table of gains that a row with this sample of the speed, m/s, will ask for."""
     if f.measured == 1:
         speed = measured_speed(f, now)
         if moved(f, speed):
             return cell_of(f, speed)
     return f.cell
+
+
+@jit
+def step_row(f: Memory) -> Any:
+    """The table's row with the gain of the first fast measurement in this step."""
+    return 1 + f.at * maximum(f.fasts, 1)
+
+
+@jit
+def frame_row(f: Memory, s: int, frame: int) -> Any:
+    """The row with the gain of sensor s's first row for a frame of the pattern.
+
+    frame = pattern: the first row of the rule between samples.
+    """
+    return 1 + f.cycle * maximum(f.fasts, 1) + frame * f.rows[s]

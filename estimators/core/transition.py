@@ -4,32 +4,32 @@ from typing import Any
 
 from ...envs.backend.decorators import apart, jit
 from ...envs.backend.primitives import absolute, maximum
-from ...envs.sensors.slow import GPS
 from ...envs.vehicle.linear import write_kinematic, write_lateral, write_roll
 from ...envs.vehicle.vehicle import GRAVITY
-from .memory import CORE, INPUTS
+from .memory import CAR, CORE, INPUTS, SLOW, Memory
 
-LATERAL, ROLL, KINEMATIC, VELOCITY_ROLL, YAW, FORCES, GIVEN = range(7)
-"""Kinds of models; GIVEN has its matrices from the user."""
+LATERAL, ROLL, KINEMATIC, VELOCITY_ROLL, YAW, FORCES, LINEAR = range(7)
+"""Kinds of models; LINEAR is any linear system, whose matrices are arguments."""
+PSI = 2  # the place of the heading in a bicycle's states
 
 SLOWEST = 1.5  # m/s: below it the model stays that of this speed
 
 
 @jit
-def _lateral(f: Any, V: Any) -> None:
+def _lateral(f: Memory, V: Any) -> None:
     """tie-vision (8), dakf-stability (5)-(11); a_y = V (beta' + gamma) is an output."""
     A, B = f.A, f.B
     write_lateral(A, B, f.car, V, f.dense - f.delayed, f.preview)
     if f.forces == 1:
-        B[0, INPUTS], B[1, INPUTS + 1] = 1.0 / (f.car[0] * V), B[1, 1]
+        B[0, INPUTS], B[1, INPUTS + 1] = 1.0 / (f.car[CAR.mass] * V), B[1, 1]
     if f.fasts > 1:
-        f.y_row[1, 0], f.y_row[1, 1] = V * A[0, 0], V * (A[0, 1] + 1.0)
-        f.y_feed[1, 0] = V * B[0, 0]
+        f.C_fast[1, 0], f.C_fast[1, 1] = V * A[0, 0], V * (A[0, 1] + 1.0)
+        f.D_fast[1, 0] = V * B[0, 0]
 
 
 @jit
-def continuous(f: Any, V: Any, turning: Any) -> None:
-    """A and B = [inputs, disturbances] at the speed V and the yaw rate `turning`."""
+def continuous(f: Memory, V: Any, turning: Any) -> None:
+    """f.A and f.B = [inputs, disturbances] at a speed V in m/s and a yaw rate in rad/s."""
     A, B = f.A, f.B
     for i in range(CORE):
         for j in range(CORE):
@@ -43,21 +43,22 @@ def continuous(f: Any, V: Any, turning: Any) -> None:
         _lateral(f, V)
     elif f.kind == ROLL or f.kind == VELOCITY_ROLL:
         i = 0 if f.kind == ROLL else 2
-        write_roll(A, B, i, f.inputs - 1, f.roll[0], f.roll[1], f.roll[2])
+        write_roll(A, B, i, f.inputs - 1, f.roll_stiffness, f.roll_damping, f.roll_arm)
     if f.kind == KINEMATIC or f.kind == VELOCITY_ROLL:
         write_kinematic(A, B, turning)
         if f.kind == VELOCITY_ROLL:
             A[1, 2] = -GRAVITY  # double-layer-gps (5)
     if f.kind == YAW or f.kind == FORCES:
-        B[0, 0] = 1.0 / f.car[1]
-        B[0, INPUTS] = 1.0 / f.car[1]
+        I = f.car[CAR.yaw_inertia]  # noqa: E741  the papers' letter
+        B[0, 0] = 1.0 / I
+        B[0, INPUTS] = 1.0 / I
         if f.kind == FORCES:
-            B[0, INPUTS], B[0, INPUTS + 1] = f.car[2] / f.car[1], -f.car[3] / f.car[1]
+            B[0, INPUTS], B[0, INPUTS + 1] = f.car[CAR.front_arm] / I, -f.car[CAR.rear_arm] / I
 
 
 @jit
 def _product(a: Any, b: Any, c: Any, n: int, m: int) -> None:
-    """c = a b for a (n, n) and b (n, m)."""
+    """c = a b for a (n, n) and b (n, m), in the corners of larger arrays."""
     for i in range(n):
         for j in range(m):
             c[i, j] = 0.0
@@ -67,8 +68,8 @@ def _product(a: Any, b: Any, c: Any, n: int, m: int) -> None:
 
 
 @jit
-def discretise(f: Any) -> None:
-    """G and H of tie-vision (9): exact for inputs and disturbances held over the step.
+def discretise(f: Memory) -> None:
+    """f.G and f.H of tie-vision (9): exact for inputs and disturbances held over the step.
 
     Phi = integral of e^(A t) over the step by its Taylor series, after halving the step until
     ||A h|| <= 1/2 and doubling back; G = I + A Phi. Accurate to rounding (relative 1e-14).
@@ -117,24 +118,32 @@ def discretise(f: Any) -> None:
 
 
 @jit
-def _lagging(f: Any) -> None:
+def _lagging(f: Memory) -> None:
     """The delayed states follow what the camera sees: tie-vision (12), at every step."""
     first = f.dense - f.delayed
     for i in range(f.delayed):
         for j in range(f.n):
             f.G[first + i, j] = 0.0
-        f.G[first + i, 2 + i] = f.relax
+        f.G[first + i, PSI + i] = f.relax
         f.G[first + i, first + i] = 1.0 - f.relax
 
 
+@jit
+def variance(f: Memory, s: int, i: int, V: Any) -> Any:
+    """The variance of row i of sensor s at a speed of the model in m/s."""
+    over = f.noise_over_speed[s, i]
+    return over / (V * V) if over > 0.0 else f.r[s, i]
+
+
 @apart
-def build(f: Any, speed: Any, turning: Any) -> None:
-    """The model at a speed in m/s and a yaw rate in rad/s, and the course's variance there."""
+def build(f: Memory, speed: Any, turning: Any) -> None:
+    """The model at a speed in m/s and a yaw rate in rad/s, and the noise that goes with 1/V."""
     V = maximum(speed, SLOWEST)
     f.model_speed, f.turning = V, turning
-    if f.kind != GIVEN:
+    if f.kind != LINEAR:
         continuous(f, V, turning)
         discretise(f)
         _lagging(f)
-    if f.r_course > 0.0:
-        f.r[GPS, 0] = f.r_course / (V * V)
+    for s in range(SLOW):
+        for i in range(f.rows[s]):
+            f.r[s, i] = variance(f, s, i, V)

@@ -7,13 +7,11 @@ i = 0 .. r-1: B_i = L G_i with the gain L and the matrix G_i of the pseudo measu
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from . import kalman
-from .pole_placement import observer_gain, whole
+from .kalman import Array
+from .pole_placement import observer_gain
 from .pseudo_gains import inverse
-
-Array = npt.NDArray[np.float64]
 
 RULES = ("predict", "hold", "oh", "pseudo")
 GAINS = ("constant", "from-29", "placed")
@@ -127,18 +125,6 @@ def frame_map(F: Array, C: Array, shares: Array) -> Array:
     for B in shares:
         M = F @ (M - B @ eps)
     return M
-
-
-def shares(f: Any, G: Array, schedule: Any, wish: Any, table: Array) -> None:
-    """Write the shares and the error's covariance after each step into a table of gains."""
-    n, q = int(f.n), int(f.rows.max())
-    s = int(np.argmax(f.period > 0))
-    F, C, Q = whole(f, G), f.row[s, :q, :n], f.Q[:n, :n]
-    R = np.diag(f.r[s, :q])
-    poles = np.exp(np.array(wish.poles) * float(f.step)) if wish.poles else None
-    B = shares_of(wish.rule, wish.gains, poles, F, Q, C, R, int(schedule.period))
-    first = 1 + schedule.cycle + q * len(schedule.lags)
-    write_shares(F, Q, C, R, B, table, first, int(f.total))
 
 
 def write_shares(

@@ -1,22 +1,19 @@
-"""The error map of a filter over one cycle of its schedule, and what it says.
+"""The error map of a filter over one cycle of its schedule, and its eigenvalues.
 
 Without noise the estimation error after a cycle is a matrix times the error before it. Its
 spectral radius decides: above one the filter diverges; at one it has an unobservable direction.
 """
 
-from typing import Any
-
 import numpy as np
-import numpy.typing as npt
 
 from ..core.delay import CLONE, CONSTANT, STORED
-from ..core.intersample import PSEUDO, SPREAD
+from ..core.intersample import DUAL_RATE, PSEUDO
+from ..core.memory import Memory
 from .dual_rate import frame_map
-from .periodic import measured_rows, slow_index
-from .pole_placement import whole
+from .kalman import Array
+from .periodic import measured_rows
+from .pole_placement import transition_matrix
 from .schedule import Schedule
-
-Array = npt.NDArray[np.float64]
 
 MARGINAL = 1e-9
 
@@ -39,17 +36,17 @@ def unobservable(M: Array, names: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(found)
 
 
-def error_map(f: Any, table: Array, G: Array, schedule: Schedule) -> Array:
+def error_map(f: Memory, table: Array, G: Array, schedule: Schedule) -> Array:
     """The error after one cycle over that before it, (size, size); what else a rule carries on
     (the estimated error e, the last innovation, stored predictions) stands behind it.
 
-    f: the filter's record. table, G: from `periodic.design`.
+    table (rows, columns), G (dense, n): from `periodic.design`.
     """
-    size, s = int(f.total), slow_index(f)
+    size, s = int(f.total), int(f.first_slow)
     F = np.eye(size)
-    F[: f.n, : f.n] = whole(f, G)
-    if f.between == SPREAD:
-        return _spread_map(f, table, F, s, schedule)
+    F[: f.n, : f.n] = transition_matrix(f, G)
+    if f.between == DUAL_RATE:
+        return _dual_rate_map(f, table, F, schedule)
     late = f.late in (STORED, CONSTANT) and s >= 0
     stored = max(schedule.lags) // schedule.period + 1 if late else 0  # the newest first
     rows = int(f.rows[s]) if s >= 0 else 0
@@ -58,7 +55,7 @@ def error_map(f: Any, table: Array, G: Array, schedule: Schedule) -> Array:
     total: Array = np.eye(width)
     for step in range(schedule.cycle):
         move = np.eye(width)
-        one = F @ _latched(f, s, schedule, step)
+        one = F @ _latched(f, schedule, step)
         for k in range(twice):
             move[k * size : (k + 1) * size, k * size : (k + 1) * size] = one
         if stored and step % schedule.period == 0:  # the prediction of what is captured now
@@ -66,48 +63,51 @@ def error_map(f: Any, table: Array, G: Array, schedule: Schedule) -> Array:
             store = np.eye(width)
             store[at:] = 0.0
             store[at + rows :, at:end] = np.eye(end - at)
-            store[at : at + rows, : f.n] = f.row[s, :rows, : f.n]
+            store[at : at + rows, : f.n] = f.C[s, :rows, : f.n]
             move = store @ move
         correct = _pseudo_correction if f.between == PSEUDO else _correction
-        held = twice * size if stored else -1
-        total = np.asarray(correct(f, s, table, schedule, step, width, held) @ move @ total)
+        stored_at = twice * size if stored else -1
+        total = np.asarray(correct(f, table, schedule, step, width, stored_at) @ move @ total)
     return total
 
 
-def _latched(f: Any, s: int, schedule: Schedule, step: int) -> Array:
+def _latched(f: Memory, schedule: Schedule, step: int) -> Array:
     """Clones of what was captured in the step before."""
-    L = np.eye(int(f.total))
+    L, s = np.eye(int(f.total)), int(f.first_slow)
     frame, rest = divmod((step - 1) % schedule.cycle, schedule.period)
     if s >= 0 and f.late == CLONE and f.frames[s] > 0 and rest == 0:
         rows = int(f.rows[s])
-        first = int(f.home[s]) + frame % int(f.frames[s]) * rows
+        first = int(f.first_clone[s]) + frame % int(f.frames[s]) * rows
         L[first : first + rows] = 0.0
-        L[first : first + rows, : f.n] = f.row[s, :rows, : f.n]
+        L[first : first + rows, : f.n] = f.C[s, :rows, : f.n]
     return L
 
 
-def _seen(f: Any, s: int, schedule: Schedule, frame: int, width: int, held: int) -> Array:
-    """What the residuals of a step see of the whole error, (m + p, width)."""
-    C = np.zeros((int(f.fasts) + (int(f.rows[s]) if s >= 0 else 0), width))
+def _seen(f: Memory, schedule: Schedule, frame: int, width: int, stored_at: int) -> Array:
+    """What the residuals of a step see of the whole error, (m + p, width).
+
+    stored_at: where stored predictions start in the error; -1: there are none.
+    """
     lag = schedule.lags[frame] if schedule.lags else 0
-    own = measured_rows(f, s, frame, lag)
+    own = measured_rows(f, frame, lag)
+    C = np.zeros((len(own), width))
     C[:, : own.shape[1]] = own
-    if held >= 0:
-        m, p = int(f.fasts), int(f.rows[s])
+    if stored_at >= 0:
+        m, p = int(f.fasts), len(own) - int(f.fasts)
         C[m:] = 0.0
-        at = held + lag // schedule.period * p
+        at = stored_at + lag // schedule.period * p
         C[m:, at : at + p] = np.eye(p)
     return C
 
 
 def _correction(
-    f: Any, s: int, table: Array, schedule: Schedule, step: int, width: int, held: int
+    f: Memory, table: Array, schedule: Schedule, step: int, width: int, stored_at: int
 ) -> Array:
     """(I - K C) of the fast rows and of the frames that arrive in a step."""
     size, m = int(f.total), int(f.fasts)
     I = np.eye(width)  # noqa: E741
     M = I.copy()
-    fast = _seen(f, s, schedule, 0, width, held)[:m]
+    fast = _seen(f, schedule, 0, width, stored_at)[:m]
     joint = np.zeros((width, width))
     for i in range(m):
         K = np.zeros(width)
@@ -118,8 +118,8 @@ def _correction(
             M = (I - np.outer(K, fast[i])) @ M
     M = (I - joint) @ M
     for frame in schedule.arriving(step):
-        C = _seen(f, s, schedule, frame, width, held)[m:]
-        own = measured_rows(f, s, frame, 0 if held >= 0 else schedule.lags[frame])[m:]
+        C = _seen(f, schedule, frame, width, stored_at)[m:]
+        own = measured_rows(f, frame, 0 if stored_at >= 0 else schedule.lags[frame])[m:]
         first = 1 + schedule.cycle * max(m, 1) + frame * len(C)
         total, passed = np.zeros((width, len(C))), np.eye(len(C))
         for i in range(len(C)):  # row i's correction changes the residuals of those behind it
@@ -132,11 +132,11 @@ def _correction(
 
 
 def _pseudo_correction(
-    f: Any, s: int, table: Array, schedule: Schedule, step: int, width: int, held: int
+    f: Memory, table: Array, schedule: Schedule, step: int, width: int, stored_at: int
 ) -> Array:
     """(error, e, ...) -> (error, e, ...): tie-vision (19)-(22)."""
     size, m = int(f.total), int(f.fasts)
-    C = measured_rows(f, s, 0)
+    C = measured_rows(f, 0)
     first = 1 + schedule.cycle * max(m, 1) + (len(C) - m) * len(schedule.lags)
     K = table[first : first + len(C), :size].T
     inverse = table[first + len(C) : first + 2 * len(C), :size].T
@@ -145,8 +145,8 @@ def _pseudo_correction(
     if arriving:
         see = np.zeros((len(C), width))
         see[:, :size] = C
-        if held >= 0:
-            see = _seen(f, s, schedule, arriving[-1], width, held)
+        if stored_at >= 0:
+            see = _seen(f, schedule, arriving[-1], width, stored_at)
         M[error] -= K @ see  # (19)
         M[e] = (inverse - K) @ see  # (20)
         return M
@@ -156,9 +156,10 @@ def _pseudo_correction(
     return M
 
 
-def _spread_map(f: Any, table: Array, F: Array, s: int, schedule: Schedule) -> Array:
+def _dual_rate_map(f: Memory, table: Array, F: Array, schedule: Schedule) -> Array:
     """From sample to sample, with the shares in the table."""
-    n, q, r = int(f.n), int(f.rows[s]), schedule.period
+    n, s, r = int(f.n), int(f.first_slow), schedule.period
+    q = int(f.rows[s])
     first = 1 + schedule.cycle + q * len(schedule.lags)
     B = table[first : first + r * q, :n].reshape(r, q, n).transpose(0, 2, 1)
-    return frame_map(F[:n, :n], f.row[s, :q, :n], B)
+    return frame_map(F[:n, :n], f.C[s, :q, :n], B)

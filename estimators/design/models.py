@@ -7,42 +7,51 @@ physical model ("dense"), the disturbances behind them decay by themselves.
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from ...envs.record import FAST
-from ...envs.sensors.slow import CAMERA, GPS, SLOW_NAMES
+from ...envs.sensors.slow import SLOW_NAMES
 from ...envs.vehicle.linear import roll
 from ...envs.vehicle.vehicle import Vehicle
+from ..core.memory import Car, Memory
 from ..core.transition import FORCES, KINEMATIC, LATERAL, ROLL, VELOCITY_ROLL, YAW
+from .measurements import MEASUREMENTS, packet_column
 
 Array = npt.NDArray[np.float64]
 
-SMOOTHING_TIME = 0.2  # s, of the measured speed
-COURSE_SPEED = 60.0 / 3.6  # m/s at which the receivers' course noise is quoted
 
-UNITS = {
-    "beta": "rad",
-    "gamma": "rad/s",
-    "psi": "rad",
-    "y_l": "m",
-    "psi_late": "rad",
-    "y_l_late": "m",
-    "v_x": "m/s",
-    "v_y": "m/s",
-    "phi": "rad",
-    "phi_rate": "rad/s",
-    "F_yf": "N",
-    "F_yr": "N",
-    "d1": "rad/s",
-    "d2": "rad/s2",
-    "d3": "rad/s",
-    "d": "rad/s2",
-    "F_d": "N",
-    "N_d": "N m",
+class State(NamedTuple):
+    """A state: its unit, and the usual standard deviation at the start."""
+
+    unit: str
+    prior: float
+
+
+STATES = {
+    "beta": State("rad", 0.02),
+    "gamma": State("rad/s", 0.05),
+    "psi": State("rad", 0.05),
+    "y_l": State("m", 0.3),
+    "psi_late": State("rad", 0.05),
+    "y_l_late": State("m", 0.3),
+    "v_x": State("m/s", 0.1),
+    "v_y": State("m/s", 0.1),
+    "phi": State("rad", 0.02),
+    "phi_rate": State("rad/s", 0.05),
+    "F_yf": State("N", 500.0),
+    "F_yr": State("N", 500.0),
+    "d1": State("rad/s", 0.1),
+    "d2": State("rad/s2", 1.0),
+    "d3": State("rad/s", 0.1),
+    "d": State("rad/s2", 1.0),
+    "F_d": State("N", 0.0),
+    "N_d": State("N m", 100.0),
 }
+"""All states of all models, by name."""
+UNITS = {name: state.unit for name, state in STATES.items()}
 
 
 @dataclass(frozen=True)
@@ -52,7 +61,7 @@ class Model:
     kind: of `transition`. states: those that follow the model. disturbances: name of each state
     behind them and the state that it pushes, or, for "forces", an Ornstein-Uhlenbeck force and
     moment. late: the states that lag behind the camera's (tie-vision (12)). inputs, fast: names of
-    `SIGNALS`.
+    `signals`.
     """
 
     kind: int
@@ -73,6 +82,7 @@ class Model:
 ORDER = ("beta", "gamma", "psi", "y_l")
 WALK = (("d1", "beta"), ("d2", "gamma"))  # dakf-stability (8)-(9), (14)
 WALK_ALL = (*WALK, ("d3", "psi"))  # dual-rate (4): one for every state of (37)
+DISTURBANCES = ("none", "walk", "walk-all", "forces")
 
 MODELS: dict[str, Model] = {
     "roll": Model(ROLL, ("phi", "phi_rate"), ("accel_y",), ("roll_rate",)),
@@ -91,15 +101,6 @@ MODELS: dict[str, Model] = {
 }
 """Models other than the bicycle's, by name."""
 
-ROWS: dict[str, tuple[tuple[str, ...], ...]] = {
-    "camera": (("psi",), ("y_l",)),
-    "gps": (("beta", "psi"),),
-}
-"""What each slow sensor measures of a bicycle: sums of states, one a row."""
-
-VELOCITY_ROWS = (("v_x",), ("v_y",))  # double-layer-gps (41)
-_ANGLES = {"camera": (1, 0, 0, 0), "gps": (1, 0, 0, 0)}
-_NEEDS = {"camera": ("psi", "y_l"), "gps": ("psi",)}
 _LATE = {"psi": "psi_late", "y_l": "y_l_late"}
 
 Signal = tuple[tuple[int, float], tuple[int, float]]
@@ -118,18 +119,18 @@ def signals(vehicle: Vehicle) -> dict[str, Signal]:
 
 
 def states_for(sensors: tuple[str, ...]) -> tuple[str, ...]:
-    """The smallest set of a bicycle's states that the given slow sensors measure."""
-    needed = {state for sensor in sensors for state in _NEEDS[sensor]}
-    return ORDER[:2] + tuple(state for state in ORDER[2:] if state in needed)
+    """The fewest of a bicycle's states that these slow sensors measure: the first of `ORDER`."""
+    rows = [row for sensor in sensors for row in MEASUREMENTS[sensor].rows]
+    return ORDER[: max([2, *(1 + ORDER.index(state) for row in rows for state in row.states)])]
 
 
 def bicycle_model(
     sensors: tuple[str, ...], fast: tuple[str, ...], disturbances: str, late: bool
 ) -> Model:
-    """The bicycle with what the given slow sensors need.
+    """The bicycle with what these slow sensors need.
 
-    disturbances: "none", "walk" (d_1, d_2), "walk-all" (every state's) or "forces".
-    late: the camera measures states that lag (tie-vision (12)-(13)).
+    disturbances: of `DISTURBANCES`; "walk" has d_1 and d_2, "walk-all" every state's. late: the
+    camera measures states that lag (tie-vision (12)-(13)).
     """
     walks = {"walk": WALK, "walk-all": WALK_ALL}.get(disturbances, ())
     states = states_for(sensors)
@@ -139,13 +140,18 @@ def bicycle_model(
 
 
 def write_model(
-    f: Any, model: Model, vehicle: Vehicle, step: float, noise: Mapping[str, float], Q: Array
+    f: Memory,
+    model: Model,
+    vehicle: Vehicle,
+    step: float,
+    noise: Mapping[str, float],
+    noise_over_speed: Mapping[str, float],
+    Q: Array,
 ) -> None:
-    """Write everything about the model and its rows into a filter's record.
+    """Write everything about the model and its measurements into a filter's memory.
 
-    step: s. noise: standard deviations "gyro", "accel_y", "roll_rate", "wheel", "psi", "y_l",
-    "course" (at 60 km/h, growing as 1/V) or "course_fixed" (at any speed), and of disturbances
-    "force", "moment", "time". Q: (n, n), process noise per second on top of them.
+    step: s. noise, noise_over_speed: of a `FilterConfig`. Q: (n, n), process noise per second on
+    top of the forces'.
     """
     names, dense = model.names, len(model.states) + len(model.late)
     n = len(names)
@@ -153,16 +159,9 @@ def write_model(
     f.forces = int(model.forces)
     for j, (_, pushed) in enumerate(model.disturbances):
         f.pushed[j] = names.index(pushed)
-    f.car[:] = [
-        vehicle.mass,
-        vehicle.yaw_inertia,
-        vehicle.front_arm,
-        vehicle.rear_arm,
-        vehicle.front_stiffness,
-        vehicle.rear_stiffness,
-    ]
+    f.car[:] = [getattr(vehicle, name) for name in Car._fields]
     body = roll(vehicle)
-    f.roll[:] = [-body.A[1, 0], -body.A[1, 1], body.B[1, 0]]
+    f.roll_stiffness, f.roll_damping, f.roll_arm = -body.A[1, 0], -body.A[1, 1], body.B[1, 0]
     f.preview = vehicle.preview
     f.step = step
     f.Q[:n, :n] = Q * step
@@ -174,10 +173,10 @@ def write_model(
         f.Q[dense + 1, dense + 1] += (1.0 - keep * keep) * noise["moment"] ** 2
     f.speed_state = names.index("v_x") if "v_x" in names else -1
     _write_signals(f, model, vehicle, noise)
-    _write_rows(f, model, noise)
+    _write_rows(f, model, noise, noise_over_speed)
 
 
-def _write_signals(f: Any, model: Model, vehicle: Vehicle, noise: Mapping[str, float]) -> None:
+def _write_signals(f: Memory, model: Model, vehicle: Vehicle, noise: Mapping[str, float]) -> None:
     """Inputs and fast measurements; rows that depend on the speed are `transition.build`'s."""
     table, names = signals(vehicle), model.names
     f.inputs, f.fasts = len(model.inputs), len(model.fast)
@@ -188,28 +187,31 @@ def _write_signals(f: Any, model: Model, vehicle: Vehicle, noise: Mapping[str, f
         f.y_column[i], f.y_factor[i] = zip(*table[name], strict=True)
         f.r_fast[i] = noise[name] ** 2
         if name in state_of:
-            f.y_row[i, names.index(state_of[name])] = 1.0
+            f.C_fast[i, names.index(state_of[name])] = 1.0
     if model.kind == FORCES:  # m a_y = F_yf + F_yr
-        f.y_row[1, 1] = f.y_row[1, 2] = 1.0 / vehicle.mass
+        f.C_fast[1, 1] = f.C_fast[1, 2] = 1.0 / vehicle.mass
 
 
-def _write_rows(f: Any, model: Model, noise: Mapping[str, float]) -> None:
-    names = model.names
-    for s, sensor in enumerate(SLOW_NAMES):
-        if f.period[s] == 0:
-            continue
-        velocity = model.kind == VELOCITY_ROLL
-        rows = VELOCITY_ROWS if velocity else ROWS[sensor]
-        f.rows[s] = len(rows)
-        f.angle[s] = 0 if velocity else _ANGLES[sensor]
-        for i, summed in enumerate(rows):
-            for state in summed:
+def _write_rows(
+    f: Memory, model: Model, noise: Mapping[str, float], noise_over_speed: Mapping[str, float]
+) -> None:
+    """What the slow sensors that are used measure."""
+    used = [s for s in range(len(SLOW_NAMES)) if f.period[s] > 0]
+    f.first_slow = used[0] if used else -1
+    for s in used:
+        sensor = MEASUREMENTS[SLOW_NAMES[s]]
+        second = model.kind == VELOCITY_ROLL
+        rows = sensor.velocities if second else sensor.rows
+        f.rows[s], f.heading_fix[s] = len(rows), sensor.heading_fix and not second
+        f.hdop_column[s] = packet_column(SLOW_NAMES[s], "hdop")
+        f.satellites_column[s] = packet_column(SLOW_NAMES[s], "satellites")
+        f.speed_column[s] = packet_column(SLOW_NAMES[s], "speed")
+        for i, row in enumerate(rows):
+            f.angle[s, i] = row.angle
+            f.r[s, i] = noise[row.noise] ** 2
+            f.noise_over_speed[s, i] = noise_over_speed.get(row.noise, 0.0) ** 2
+            for state in row.states:
                 late = _LATE.get(state)
-                f.row[s, i, names.index(late if late in model.late else state)] = 1.0
-    f.r[CAMERA, :2] = noise["psi"] ** 2, noise["y_l"] ** 2
-    fixed = noise.get("course_fixed")
-    f.r[GPS, 0] = 0.0 if fixed is None else fixed**2
-    f.r_course = 0.0 if fixed is not None else (noise["course"] * COURSE_SPEED) ** 2
-    if model.kind == VELOCITY_ROLL:  # layer 2 is told its noise with each packet
-        f.r_course = 0.0
-        f.r[GPS, :2] = noise["gps_speed"] ** 2
+                f.C[s, i, model.names.index(late if late in model.late else state)] = 1.0
+        if second:
+            f.r_speed = f.r[s, 0]

@@ -1,17 +1,15 @@
 """Gains by pole placement: the observers that the papers compare with."""
 
-from typing import Any
-
 import numpy as np
-import numpy.typing as npt
 from scipy.linalg import solve_discrete_lyapunov
 from scipy.signal import place_poles
 
-Array = npt.NDArray[np.float64]
+from ..core.memory import Memory
+from .kalman import Array
 
 
-def whole(f: Any, G: Array) -> Array:
-    """F (n, n): G on the dense states, the others decay."""
+def transition_matrix(f: Memory, G: Array) -> Array:
+    """F (n, n) of a step: G (dense, n) on the dense states, the others decay."""
     n, dense = int(f.n), len(G)
     F = np.zeros((n, n))
     F[:dense] = G
@@ -34,15 +32,14 @@ def observer_gain(F: Array, C: Array, poles: Array) -> Array:
     return K
 
 
-def place(f: Any, G: Array, poles: tuple[float, ...], table: Array) -> None:
+def place(f: Memory, G: Array, poles: tuple[float, ...], table: Array) -> None:
     """Write the gains of the fast rows and the error's covariance into a table of gains.
 
-    poles: (n,) in rad/s, negative real. Raises ValueError as `observer_gain`.
+    G: (dense, n). poles: (n,) in rad/s, negative real. table: (rows, columns), as in `periodic`.
+    Raises ValueError as `observer_gain`.
     """
     n, m = int(f.n), int(f.fasts)
-    if len(poles) != n:
-        raise ValueError(f"{n} states need {n} poles, got {len(poles)}")
-    F, C = whole(f, G), f.y_row[:m, :n]
+    F, C = transition_matrix(f, G), f.C_fast[:m, :n]
     K = observer_gain(F, C, np.exp(np.array(poles) * float(f.step)))
     rest = np.eye(n) - K @ C
     noise = rest @ f.Q[:n, :n] @ rest.T + K @ np.diag(f.r_fast[:m]) @ K.T

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from ..core.intersample import RIDGE, Array
-from .kalman import gain
+from .kalman import Array, gain
 
+RIDGE = 1e-3  # lambda of Tikhonov's inverse, in SI units squared
 INVERSES = ("moore-penrose", "p-weighted", "tikhonov", "bayes")
 
 

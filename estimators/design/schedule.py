@@ -39,17 +39,17 @@ NO_SENSOR = Schedule(1, ())
 
 
 def schedules(
-    name: str, sensor: SlowSensor, dt: float, stride: int, pace: int, frames: int
+    who: str, sensor: SlowSensor, dt: float, stride: int, pace: int, frames: int
 ) -> tuple[Schedule, ...]:
     """What the sensor's schedule can be: one where it repeats, else its two extremes.
 
-    stride: ticks of a filter's step. pace: ticks between steps that listen; a sample is used in the
-    first of them at or after its arrival. frames: held clones, whose slots take turns; 0 for a
-    filter that does not look at the lag.
+    who: the sensor, in errors. stride: ticks of a filter's step. pace: ticks between steps that
+    listen; a sample is used in the first of them at or after its arrival. frames: stored captures,
+    whose slots take turns; 0 for a filter that does not look at the lag.
     """
-    period = whole_ticks(sensor.period, dt, f"the {name}'s period") // stride
-    late = [whole_ticks(delay, dt, f"a delay of the {name}") for delay in sensor.delays]
-    jitter = whole_ticks(sensor.jitter, dt, f"the {name}'s jitter")
+    period = whole_ticks(sensor.period, dt, f"{who}'s period") // stride
+    late = [whole_ticks(delay, dt, f"a delay: {who}'s") for delay in sensor.delays]
+    jitter = whole_ticks(sensor.jitter, dt, f"{who}'s jitter")
 
     def lagging(extra: int) -> Schedule:
         lags = [math.ceil((lag + extra) / pace) * pace // stride for lag in late]

@@ -112,7 +112,7 @@ def test_logs_that_cannot_be_filtered(log: Any) -> None:
         filter_.run(Record(record.fast[:0], record.packets))
     with pytest.raises(ValueError, match=r"ticks of 0.001 s, the record has 0.01 s"):
         filter_.run(Record(record.fast, record.packets, dt=0.01))
-    with pytest.raises(ValueError, match=r"built for the camera .* the reset tells"):
+    with pytest.raises(ValueError, match=r"built for the camera .* the reset has"):
         filter_.run(Log(record, {"camera": SlowSensor(0.05)}))
     with pytest.raises(ValueError, match=r"fast rows have shape \(k, 11\), got \(1, 3\)"):
         filter_.predict(np.zeros(3))
@@ -218,5 +218,5 @@ def test_the_first_course_far_off_sets_the_heading() -> None:
 def test_a_count_beyond_the_packets_is_refused(count: int) -> None:
     """Memory behind the array would be read as packets."""
     filter_ = make_estimator("multirate-kf", sensors={"camera": CAMERA})
-    with pytest.raises(ValueError, match=f"count is 0 to 0, the packets given, got {count}"):
+    with pytest.raises(ValueError, match=f"count is 0 to 0, as many as packets, got {count}"):
         filter_.step(np.zeros((10, FAST_WIDTH)), np.zeros((0, PACKET_WIDTH)), count)

@@ -18,7 +18,7 @@ from sideslip.agents import Lqr, make_agent
 from sideslip.envs.ticks import TICK
 from sideslip.envs.vehicle.linear import LinearModel, bicycle
 from sideslip.estimators import EstimateObservation
-from sideslip.estimators.analysis.bound import riccati_covariances
+from sideslip.estimators.analysis.bound import riccati
 
 V, STEPS, PERIOD = 7.0, 200, 10
 LEVELS = {"force_sd": 15.0, "moment_sd": 6.0, "disturbance_time": 0.3, "gyro_noise": 0.002}
@@ -72,7 +72,7 @@ def mean_cost(env: Any, K: np.ndarray, first: int = 0) -> float:
     stationary = np.diag([0.0, 0.0, LEVELS["force_sd"] ** 2, LEVELS["moment_sd"] ** 2])
     W = (1.0 - keep**2) * stationary
     weights = np.diag([0.02**-2, 0.1**-2, 0.0, 0.0])
-    P, names = riccati_covariances(
+    P, names = riccati(
         vehicle, sensors=sensors, speed=V, seconds=STEPS * PERIOD * TICK + TICK, **LEVELS
     )
     rows = [names.index(name) for name in ("beta", "gamma", "F_d", "N_d")]

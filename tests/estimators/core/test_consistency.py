@@ -16,9 +16,10 @@ from sideslip.envs import Log
 from sideslip.envs.record import PACKET
 from sideslip.envs.scenarios.manoeuvres import scenario_from
 from sideslip.estimators import Estimator, make_estimator
-from sideslip.estimators.analysis.bound import riccati_variances
-from sideslip.estimators.design.models import ROWS, states_for
-from sideslip.estimators.design.options import DISTURBANCE, NOISE
+from sideslip.estimators.analysis.bound import riccati
+from sideslip.estimators.design.config import DISTURBANCE, NOISE
+from sideslip.estimators.design.measurements import MEASUREMENTS
+from sideslip.estimators.design.models import states_for
 from tests.estimators.drives import Drives, told
 
 RUNS = 128
@@ -44,6 +45,12 @@ def exact(drives: Drives, log: Log, sensors: tuple[str, ...], **options: Any) ->
     )
 
 
+def variances(vehicle: Any, **options: Any) -> dict[str, np.ndarray]:
+    """By state, (ticks,) each, of the optimal estimates."""
+    P, names = riccati(vehicle, **options)
+    return {name: P[:, i, i] for i, name in enumerate(names)}
+
+
 def errors(filter_: Estimator, x: np.ndarray, log: Log) -> np.ndarray:
     """Estimate minus truth, (K, n)."""
     return x - np.column_stack([log.truth[state] for state in filter_.names])
@@ -67,7 +74,7 @@ class Verdict(NamedTuple):
 
 def judge(filter_: Estimator, logs: list[Log]) -> Verdict:
     """NEES of all states at the last tick of every run; NIS of every packet used."""
-    rows = np.array([len(ROWS[sensor]) for sensor in ("camera", "gps")])
+    rows = np.array([len(MEASUREMENTS[sensor].rows) for sensor in ("camera", "gps")])
     nees, nis, dof = 0.0, [], []
     for log in logs:
         estimates = filter_.run(log)
@@ -134,9 +141,7 @@ def test_what_it_says_of_every_state_is_the_recursion_in_textbook_letters(
 ) -> None:
     drives, log = prompt.drives, prompt.logs[0]
     filter_ = exact(drives, log, sensors)
-    best = riccati_variances(
-        drives.vehicle, sensors=told(log, *sensors), speed=drives.speed, seconds=1.0
-    )
+    best = variances(drives.vehicle, sensors=told(log, *sensors), speed=drives.speed, seconds=1.0)
     std = filter_.run(log).std[: len(best["beta"])]
     for state, found in zip(filter_.names, std.T, strict=True):
         np.testing.assert_allclose(found**2, best[state], rtol=1e-8, atol=1e-18, err_msg=state)
@@ -168,12 +173,12 @@ def test_monte_carlo_variances_are_riccatis() -> None:
     for sensors, filter_ in filters.items():
         common: Any = {"sensors": told(log, *sensors), "speed": drives.speed}
         seconds = len(log.record.fast) * log.record.dt
-        best = riccati_variances(drives.vehicle, seconds=seconds, **common)
+        best = variances(drives.vehicle, seconds=seconds, **common)
         for i, state in enumerate(filter_.names):
             each = np.array(squares[sensors])[:, i]
             mean, wanted = each.mean(), best[state][start:].mean()
             error = each.std(ddof=1) / np.sqrt(runs)
             assert abs(mean - wanted) < 4.0 * error, (sensors, state, mean / wanted)
             assert state != "beta" or abs(mean / wanted - 1.0) < 0.03, (sensors, mean / wanted)
-        louder = riccati_variances(drives.vehicle, seconds=seconds, force_sd=52.0, **common)
+        louder = variances(drives.vehicle, seconds=seconds, force_sd=52.0, **common)
         assert louder["beta"][start:].mean() > 1.06 * best["beta"][start:].mean()  # it would show

@@ -111,7 +111,7 @@ def test_a_sample_that_nothing_is_held_of_changes_nothing(rule: Any) -> None:
             "exact-kf",
             {"gps": SlowSensor(0.005, (0.4,))},
             {"delay": "buffer"},
-            "86 samples of gps can come within the longest delay; delay='buffer' keeps 64",
+            "86 samples of gps can come within the longest delay; delay='buffer' stores 64",
         ),
         (
             "exact-kf",

@@ -62,7 +62,7 @@ def test_the_error_map_is_what_the_compiled_filter_does() -> None:
         filter_ = make_estimator(name, vehicle=COMS, sensors=sensors, speed=7.0)
         filter_.P  # noqa: B018  designs the table
         f, schedule = filter_.filters[0], filter_._schedules[0]
-        table, G = design(f, schedule, 7.0, filter_._wish)
+        table, G = design(f, schedule, 7.0, filter_.config)
         M = error_map(f, table, G, schedule)
         N, n = int(f.total), int(f.n)
         cycle = schedule.cycle

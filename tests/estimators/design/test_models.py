@@ -64,8 +64,8 @@ def test_dakf_is_the_papers_discrete_model() -> None:
     np.testing.assert_allclose(f.G[:3, :5], np.hstack([A_nd, D_nd]), atol=1e-9)
     np.testing.assert_allclose(f.H[:3, :2], B_nd, atol=1e-9)
     np.testing.assert_array_equal(f.decay[3:5], [1.0, 1.0])  # (14): a random walk
-    np.testing.assert_array_equal(f.y_row[0, :5], [0, 1, 0, 0, 0])  # (19)
-    np.testing.assert_array_equal(f.row[1, 0, :5], [1, 0, 1, 0, 0])
+    np.testing.assert_array_equal(f.C_fast[0, :5], [0, 1, 0, 0, 0])  # (19)
+    np.testing.assert_array_equal(f.C[1, 0, :5], [1, 0, 1, 0, 0])
     assert filter_.names == ("beta", "gamma", "psi", "d1", "d2")
 
 

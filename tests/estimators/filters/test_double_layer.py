@@ -266,7 +266,7 @@ def test_the_two_state_observer() -> None:
     reached = np.linalg.eigvals((np.eye(2) - K @ C) @ G)
     np.testing.assert_allclose(np.sort(reached), np.sort(poles), rtol=1e-9)
     filter_ = make_estimator("lob-2", speed=V)
-    table, _ = design(filter_.filters[0], NO_SENSOR, V, filter_._wish)
+    table, _ = design(filter_.filters[0], NO_SENSOR, V, filter_.config)
     np.testing.assert_allclose(table[1, :2], K[:, 0], rtol=1e-9)
     x: Any = np.zeros(2)
     wanted: Any = []

@@ -1,0 +1,164 @@
+"""From a filter's config to its compiled memory: one record a layer, and its schedules."""
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from scipy.stats import chi2
+
+from ...envs.sensors.link import SlowSensor
+from ...envs.sensors.slow import SLOW_NAMES
+from ...envs.vehicle.vehicle import Vehicle
+from ..core.delay import CONSTANT, STORED
+from ..core.intersample import DUAL_RATE, NONE, PSEUDO
+from ..core.memory import FILTER, ROWS, Memory
+from ..core.transition import KINEMATIC, SLOWEST, VELOCITY_ROLL
+from .config import FilterConfig
+from .kalman import gain
+from .late_samples import check_window, place_clones
+from .models import write_model
+from .periodic import measured_rows
+from .schedule import NO_SENSOR, Schedule, schedules, whole_ticks
+
+SMOOTHING_TIME = 0.2  # s, of the measured speed
+FASTEST = 80.0  # m/s, of the tables of gains
+SPACING = 0.5  # m/s between them
+
+
+def assemble(
+    config: FilterConfig, vehicle: Vehicle, dt: float, speed: float | None
+) -> tuple[Any, tuple[Schedule, ...]]:
+    """The memory (layers,) of a filter and the schedules of its first slow sensor.
+
+    vehicle: the filter's. dt: s of a tick. speed: m/s if it is held, None where it is measured.
+    Raises ValueError for a schedule that does not fit ticks, a sensor that can be later than the
+    filter's window, and for options that do not go together.
+    """
+    layers, first = np.zeros(len(config.models), FILTER).view(np.recarray), 0
+    for f, model in zip(layers, config.models, strict=True):
+        _write_clocks(f, config, dt)
+        n, step = len(model.names), f.stride * dt
+        own = slice(first, first + n)
+        noise = config.noise, config.noise_over_speed
+        write_model(f, model, vehicle, step, *noise, config.Q[own, own])
+        f.decay[f.dense : n] *= math.exp(-config.leak * f.stride * dt)
+        f.prior[:n, :n] = np.diag([config.prior[state] ** 2 for state in model.names])
+        place_clones(f, config)
+        f.measured, f.speed = int(speed is None), speed or 0.0
+        f.smoothing = 1.0 - math.exp(-dt / SMOOTHING_TIME)
+        _write_trust(f, config)
+        first += n
+    planned = _schedules(layers[0], config, dt)
+    for f in layers:
+        f.assumed = layers[0].assumed
+        _write_rules(f, config, planned)
+        check_window(f, config)
+    layers[0].store_predictions |= len(layers) > 1
+    return layers, planned
+
+
+def alone(config: FilterConfig) -> FilterConfig:
+    """The same filter with its first slow sensor alone."""
+    return replace(config, sensors=dict(list(config.sensors.items())[:1]))
+
+
+def _write_clocks(f: Memory, config: FilterConfig, dt: float) -> None:
+    """Periods, the filter's own step, and by how much late states follow in it."""
+    for name, sensor in config.sensors.items():
+        what = f"{config.name}: the {name}'s period"
+        f.period[SLOW_NAMES.index(name)] = whole_ticks(sensor.period, dt, what)
+    f.pace = int(f.period.max()) if config.intersample == "single-rate" else 1
+    f.stride = f.pace if config.between == "hold" else 1
+    f.relax = 1.0
+    if config.delay == "lag":  # a first-order lag of the mean delay
+        camera = config.sensors["camera"]
+        delay = float(np.mean(camera.delays)) + 0.5 * camera.jitter
+        f.relax = 1.0 - math.exp(-dt / max(delay, dt))
+
+
+def _write_trust(f: Memory, config: FilterConfig) -> None:
+    """What is known of a sample's noise, and which ones are skipped."""
+    f.least_satellites, f.adapt = config.satellites, config.adapt
+    if config.gate is not None:
+        f.gate[1:] = chi2.ppf(config.gate, np.arange(1, ROWS + 1))
+    knots = config.hdop_table if f.kind != VELOCITY_ROLL else ()  # applied by the first layer
+    f.knots = len(knots)
+    for i, (hdop, factor) in enumerate(knots):
+        f.hdop[i], f.hdop_factor[i] = hdop, factor
+
+
+def _schedules(f: Memory, config: FilterConfig, dt: float) -> tuple[Schedule, ...]:
+    """Of the first slow sensor: one, or two extremes where delays are random."""
+    if not config.sensors:
+        return (NO_SENSOR,)
+    name, sensor = next(iter(config.sensors.items()))
+    if config.delay == "constant":
+        f.assumed = whole_ticks(config.assumed_delay, dt, f"{config.name}: assumed_delay")
+        sensor = SlowSensor(sensor.period, (config.assumed_delay,), sensor.phase)
+    if config.row.intersample == "dual-rate":  # knows of no delay
+        sensor = SlowSensor(sensor.period, (0.0,), sensor.phase)
+    who = f"{config.name}: the {name}"
+    return schedules(who, sensor, dt, int(f.stride), int(f.pace), int(f.frames[f.first_slow]))
+
+
+def _write_rules(f: Memory, config: FilterConfig, planned: tuple[Schedule, ...]) -> None:
+    """The codes that choose what compiled code does; ValueError for what does not go together."""
+    f.cycle, f.pattern = planned[-1].cycle, max(1, len(planned[-1].lags))
+    pseudo = config.intersample == "pseudo-residual"
+    shared = config.row.intersample == "dual-rate"
+    f.between = PSEUDO if pseudo else DUAL_RATE if shared else NONE
+    f.periodic = _periodic(f, config, len(planned) > 1)
+    f.joint = config.row.gains == "placed" or (pseudo and f.periodic)
+    f.store_predictions = f.late in (STORED, CONSTANT)
+    if f.measured and f.periodic:
+        f.low, f.high, f.spacing = SLOWEST, FASTEST, SPACING
+    if pseudo:
+        C = measured_rows(f, 0)
+        f.inverse[: len(C), : f.total] = gain(np.eye(f.total), C, np.zeros((len(C), len(C)))).T
+    if _needs_covariance(config) and (f.periodic or f.between != NONE):
+        raise ValueError(
+            f"{config.name}: gate, adapt, delay='larsen' and delay='buffer' need "
+            f"gains='covariance' and no correction between samples; got gate={config.gate}, "
+            f"adapt={config.adapt}, delay={config.delay!r}"
+        )
+    if config.adapt > 0.0 and config.delay in ("larsen", "buffer"):
+        raise ValueError(f"{config.name}: adapt needs delay='clone', got delay={config.delay!r}")
+
+
+def _needs_covariance(config: FilterConfig) -> bool:
+    return config.gate is not None or config.adapt > 0.0 or config.delay in ("larsen", "buffer")
+
+
+def _periodic(f: Memory, config: FilterConfig, random: bool) -> bool:
+    """Whether the gains are precomputed; ValueError where that was asked for and cannot be.
+
+    random: the first slow sensor's delay is.
+    """
+
+    def refused(why: str) -> ValueError:
+        return ValueError(f"{config.name}: no gains={config.gains!r}: {why}")
+
+    if f.between == DUAL_RATE or config.row.gains == "placed":
+        return True
+    several, blind = len(config.sensors) > 1, f.frames.max() == 0  # blind: to the lag
+    impossible = ""
+    if f.kind in (KINEMATIC, VELOCITY_ROLL) or config.row.second:
+        impossible = "its model changes with the yaw rate"
+    elif f.between == PSEUDO:
+        if config.gains == "covariance":
+            raise refused("it has one constant gain")
+        if f.frames.max() > 1:
+            raise ValueError(
+                f"{config.name}: a sample must arrive before the next one is captured, got "
+                f"{config.sensors}"
+            )
+        return True
+    elif several or (random and not blind):
+        impossible = "two slow sensors" if several else "random delay"
+    if impossible:
+        if config.gains == "periodic":
+            raise refused(f"{impossible}; use gains='covariance'")
+        return False
+    usual = "covariance" if _needs_covariance(config) else config.row.gains
+    return (config.gains or usual) == "periodic"

@@ -1,0 +1,272 @@
+"""The options of a filter: `FilterConfig` has them complete, `configure` parses and checks them."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ...envs.sensors.link import SlowSensor
+from ...envs.sensors.slow import SLOW_NAMES
+from ..core.delay import RULES
+from ..core.memory import KNOTS
+from ..filters import Filter
+from . import dual_rate
+from .checks import check_covariance
+from .measurements import COURSE_SPEED, MEASUREMENTS
+from .models import DISTURBANCES, MODELS, STATES, Model, bicycle_model
+from .options import Options
+from .pseudo_gains import INVERSES
+from .tunings import TUNINGS
+
+Array = npt.NDArray[np.float64]
+
+_ROWS = [row for sensor in MEASUREMENTS.values() for row in sensor.rows]
+_VELOCITIES = [row for sensor in MEASUREMENTS.values() for row in sensor.velocities]
+NOISE = {"gyro_noise": 0.005} | {f"{row.noise}_noise": row.sd for row in _ROWS}  # gyro: rad/s
+MORE_NOISE = {
+    "accel_y_noise": 0.1,  # m/s2
+    "roll_rate_noise": 0.005,  # rad/s
+    "wheel_noise": 0.015,  # m/s, of the mean of both front wheels
+} | {f"{row.noise}_noise": row.sd for row in _VELOCITIES}
+DISTURBANCE = {"force_sd": 50.0, "moment_sd": 20.0, "disturbance_time": 0.3}  # N, N m, s
+SATELLITES = 4.0  # double-layer-gps 4.3
+ASSUMED_DELAY = 0.033  # s
+
+
+@dataclass(frozen=True, kw_only=True)
+class FilterConfig:
+    """What is decided about a filter before it is designed: its row in `FILTERS` and its options.
+
+    Options, as `make_estimator` takes them
+    ---------------------------------------
+    slow: the slow sensor to use (default: the first of the row's that is there). A filter with
+        gains "covariance" also takes several.
+    gains: "periodic" (precomputed for a schedule that repeats) or "covariance"; of dual-rate
+        "constant", "from-29" or "placed" (with poles).
+    delay: "clone" or "buffer" (late samples used exactly), "larsen", "stored", "constant" (with
+        assumed_delay in s), "literal", "lag" or "ignore": `sideslip.estimators.core.delay` says
+        what they are.
+    between: of single-rate-kf, "hold" (default) or "predict" between its steps.
+    intersample: of double-layer "pseudo-residual" (default) or "predict"; of dual-rate "pseudo"
+        (default), "predict", "hold" or "oh".
+    inverse: the generalised inverse of the pseudo-residual rule, "moore-penrose", "p-weighted",
+        "tikhonov" or "bayes".
+    poles: negative numbers in rad/s, one for each state, where gains are placed: of the filter's
+        error, of dual-rate as `sideslip.estimators.DualRate` says.
+    disturbances: of a bicycle, "none", "walk" (d1 and d2 push beta and gamma), "walk-all" (d3
+        pushes psi) or "forces" (an Ornstein-Uhlenbeck force and moment).
+    leak: 1/s, by which disturbances decay on top of that.
+    q_beta, q_gamma, ...: process noise of a state per second, (unit)^2/s; or Q, (n, n) or (n,)
+        (default: of `tunings.toml`).
+    gyro_noise (rad/s), psi_noise (rad), y_l_noise (m), course_noise (rad at every speed; default
+        0.14 deg at 60 km/h growing as 1/V), accel_y_noise (m/s2), roll_rate_noise (rad/s),
+        wheel_noise, gps_speed_noise (m/s): standard deviations.
+    hdop_table: pairs (HDOP, factor on the GPS's noise), linear in between; None for one noise at
+        every HDOP (default: the factor is the HDOP for double-layer, None for the others).
+    satellites: the least that a GPS fix needs (default 4).
+    gate: a probability; a sample whose innovation is less likely than 1 - gate is skipped.
+    adapt: share of a new innovation in an R that follows them (0: R as configured).
+    force_sd (N), moment_sd (N m), disturbance_time (s): of disturbances that are forces.
+    prior: standard deviations of states at the start, by state.
+    allow_unstable: build a filter whose error grows.
+    """
+
+    name: str
+    row: Filter
+    sensors: Mapping[str, SlowSensor]  # `slow`, in the order of SLOW_NAMES
+    models: tuple[Model, ...]  # of each layer
+    gains: str  # "": the row's, where that can be
+    delay: str
+    assumed_delay: float
+    between: str
+    intersample: str
+    inverse: str
+    poles: tuple[float, ...]
+    leak: float
+    Q: Array  # (n, n) per second, of the states of all layers
+    noise: Mapping[str, float]  # standard deviations, names without "_noise"; force, moment, time
+    noise_over_speed: Mapping[str, float]  # of those that grow as 1/V, times V in m/s
+    hdop_table: tuple[tuple[float, float], ...]
+    satellites: float
+    gate: float | None
+    adapt: float
+    prior: Mapping[str, float]  # of all states
+    allow_unstable: bool
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """Names of the states of all layers."""
+        return tuple(self.prior)
+
+
+def configure(
+    name: str, row: Filter, sensors: Mapping[str, SlowSensor], options: Mapping[str, Any]
+) -> FilterConfig:
+    """The config of a filter from its row, the slow sensors that are there, and options.
+
+    Raises TypeError for an unknown option or a value of the wrong type, ValueError for a sensor
+    that is absent, a value out of range and options that exclude each other; each names filter,
+    option and value.
+    """
+    read = Options(name, options)
+    used = _slow_sensors(row, sensors, read)
+    rules = _rules(row, used, read)
+    models = _models(row, used, rules["delay"], read)
+    states = [state for model in models for state in model.names]
+    if rules["poles"] and len(rules["poles"]) != len(states):
+        raise read.wrong("poles", f"are one for each of {', '.join(states)}", rules["poles"])
+    noise, noise_over_speed = _noise(models[0].forces, read)
+    config = FilterConfig(
+        name=name,
+        row=row,
+        sensors={sensor: sensors[sensor] for sensor in used},
+        models=models,
+        **rules,
+        leak=read.number("leak", 0.0, "is in 1/s and not negative", lambda v: 0.0 <= v < math.inf),
+        Q=_process_noise(states, TUNINGS.get((name, ",".join(used)), {}), read),
+        noise=noise,
+        noise_over_speed=noise_over_speed,
+        hdop_table=_hdop_table(row, read),
+        satellites=read.number("satellites", SATELLITES),
+        gate=_gate(read),
+        adapt=read.number("adapt", 0.0, "is a share from 0 to 1", lambda v: 0.0 <= v < 1.0),
+        prior=_prior(states, noise, read),
+        allow_unstable=bool(read.value("allow_unstable", False)),
+    )
+    read.done()
+    return config
+
+
+def _slow_sensors(row: Filter, there: Mapping[str, SlowSensor], read: Options) -> tuple[str, ...]:
+    """The slow sensors to use, in the order of `SLOW_NAMES`."""
+    slow = read.value("slow", None)
+    if not row.slow:
+        if slow is not None:
+            raise ValueError(f"{read.name} uses no slow sensor, got slow={slow!r}")
+        return ()
+    if slow is None:
+        wanted = [sensor for sensor in row.slow if sensor in there][:1] or [" or ".join(row.slow)]
+    else:
+        wanted = list(slow) if isinstance(slow, list | tuple) else [slow]
+    for sensor in wanted:
+        if slow is not None and sensor not in row.slow:
+            raise ValueError(f"{read.name} can use {' or '.join(row.slow)}, got slow={slow!r}")
+        if sensor not in there:
+            present = ", ".join(there) or "none"
+            raise ValueError(f"{read.name} needs the slow sensor {sensor}; there is: {present}")
+    return tuple(sensor for sensor in SLOW_NAMES if sensor in wanted)
+
+
+def _rules(row: Filter, used: Sequence[str], read: Options) -> dict[str, Any]:
+    """How gains are found, and what happens to late samples and between samples."""
+    shared, placed = row.intersample == "dual-rate", row.gains == "placed"
+    intersample, between, assumed, poles = row.intersample, "hold", 0.0, row.poles
+    if shared:
+        intersample = read.one_of("intersample", "pseudo", dual_rate.RULES)
+    elif row.second:
+        intersample = read.one_of("intersample", intersample, (intersample, "predict"))
+    known = dual_rate.GAINS if shared else ("", "periodic", "covariance")
+    gains = row.gains if placed else read.one_of("gains", known[0], known)
+    if gains == "from-29" and intersample != "pseudo":
+        raise read.wrong("intersample", "is 'pseudo' for gains='from-29'", intersample)
+    if intersample == "single-rate":
+        between = read.one_of("between", between, ("hold", "predict"))
+        if between == "hold" and len(used) > 1:
+            raise read.wrong("slow", "is one sensor for between='hold'", used)
+    inverse = read.one_of("inverse", INVERSES[0], INVERSES)
+    delay = read.one_of("delay", row.delay, RULES)
+    if delay in ("literal", "lag") and "camera" not in used:
+        raise read.wrong("delay", "needs the camera for tie-vision's rules", delay)
+    if delay == "constant":
+        assumed = read.positive("assumed_delay", ASSUMED_DELAY)
+    if gains == "placed":
+        chosen = read.numbers("poles", read.value("poles", poles))
+        negative = (chosen < 0.0) & np.isfinite(chosen)
+        if chosen.ndim != 1 or not len(chosen) or not negative.all():
+            raise read.wrong("poles", "are negative numbers in rad/s", chosen.tolist())
+        poles = tuple(chosen.tolist())
+    return {
+        "gains": gains,
+        "delay": delay,
+        "assumed_delay": assumed,
+        "between": between,
+        "intersample": intersample,
+        "inverse": inverse,
+        "poles": poles,
+    }
+
+
+def _models(row: Filter, used: tuple[str, ...], delay: str, read: Options) -> tuple[Model, ...]:
+    """The model of each layer."""
+    if row.model != "bicycle":
+        return (MODELS[row.model],)
+    disturbances = read.one_of("disturbances", row.disturbances, DISTURBANCES)
+    first = bicycle_model(used, row.fast, disturbances, delay in ("literal", "lag"))
+    return (first, MODELS[row.second]) if row.second else (first,)
+
+
+def _process_noise(states: Sequence[str], tuning: Mapping[str, float], read: Options) -> Array:
+    """Q (n, n) per second: the tuning's, the option's, single states' on its diagonal."""
+    n, matrix = len(states), read.value("Q", None)
+    tuned = [tuning.get(state, 0.0) for state in states]
+    Q = read.numbers("Q", tuned if matrix is None else matrix)
+    if Q.shape not in ((n,), (n, n)):
+        raise ValueError(f"{read.name}: Q has shape ({n}, {n}) or ({n},), got {Q.shape}")
+    Q = np.diag(Q) if Q.ndim == 1 else Q
+    for i, state in enumerate(states):
+        Q[i, i] = read.number(f"q_{state}", float(Q[i, i]))
+    check_covariance(f"{read.name}: Q", Q)
+    return Q
+
+
+def _noise(forces: bool, read: Options) -> tuple[dict[str, float], dict[str, float]]:
+    """`FilterConfig.noise` and `noise_over_speed`."""
+    growing = [row.noise for row in _ROWS if row.over_speed and f"{row.noise}_noise" not in read]
+    levels = NOISE | MORE_NOISE
+    noise = {key.removesuffix("_noise"): read.positive(key, sd) for key, sd in levels.items()}
+    if forces:
+        keys = zip(("force", "moment", "time"), DISTURBANCE.items(), strict=True)
+        noise |= {short: read.positive(key, default) for short, (key, default) in keys}
+    return noise, {name: noise[name] * COURSE_SPEED for name in growing}
+
+
+def _prior(states: Sequence[str], noise: Mapping[str, float], read: Options) -> dict[str, float]:
+    """Standard deviations of all states at the start."""
+    found = {state: STATES[state].prior for state in states}
+    if "force" in noise:
+        found |= {"F_d": noise["force"], "N_d": noise["moment"]}
+    prior = read.value("prior", {})
+    if not isinstance(prior, Mapping):
+        raise TypeError(f"{read.name}: prior is standard deviations by state, got {prior!r}")
+    for state, value in prior.items():
+        if state not in states:
+            known = ", ".join(states)
+            raise ValueError(f"{read.name} has no state {state!r}; it has: {known}; prior={prior}")
+        sd = read.numbers(f"the prior of {state}", value)
+        if sd.ndim > 0 or not 0.0 <= sd < math.inf:
+            raise read.wrong(f"the prior of {state}", "is a standard deviation", value)
+        found[state] = float(sd)
+    return found
+
+
+def _gate(read: Options) -> float | None:
+    gate = read.value("gate", None)
+    if gate is None:
+        return None
+    return read.checked("gate", gate, "is a probability between 0 and 1", lambda v: 0.0 < v < 1.0)
+
+
+def _hdop_table(row: Filter, read: Options) -> tuple[tuple[float, float], ...]:
+    """Knots (HDOP, factor), or none."""
+    table = read.value("hdop_table", row.hdop)
+    if table is None or (isinstance(table, tuple) and not table):
+        return ()
+    knots = read.numbers("hdop_table", table)
+    pairs = knots.ndim == 2 and knots.shape[1] == 2 and 2 <= len(knots) <= KNOTS
+    if not (pairs and (np.diff(knots[:, 0]) > 0.0).all() and (knots[:, 1] > 0.0).all()):
+        expected = f"is 2 to {KNOTS} pairs (HDOP, factor) with rising HDOP and positive factors"
+        raise read.wrong("hdop_table", expected, table)
+    return tuple((float(hdop), float(factor)) for hdop, factor in knots)

@@ -1,0 +1,60 @@
+"""What each slow sensor measures: its rows of C and their noise.
+
+A new slow sensor is an entry of `MEASUREMENTS`: options, states and compiled code follow it.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from ...envs.record import PACKET
+from ...envs.sensors.slow import SLOW, SLOW_NAMES
+
+COURSE_SPEED = 60.0 / 3.6  # m/s at which the receivers' course noise is quoted
+
+
+class Row(NamedTuple):
+    """One value of a packet as a measurement: a sum of states.
+
+    noise: its standard deviation is the option `<noise>_noise`. sd: that option's default, in the
+    unit of the value. angle: the innovation is wrapped. over_speed: the default holds at
+    `COURSE_SPEED` and grows as 1/V; the option holds at every speed.
+    """
+
+    states: tuple[str, ...]
+    noise: str
+    sd: float
+    angle: bool = False
+    over_speed: bool = False
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """A slow sensor as a filter sees it.
+
+    rows: of a bicycle's states, for the packet's first values. velocities: in their place, of a
+    second layer. heading_fix: its first sample, where it is far off, sets psi.
+    """
+
+    rows: tuple[Row, ...]
+    velocities: tuple[Row, ...] = ()
+    heading_fix: bool = False
+
+
+MEASUREMENTS: dict[str, Measurement] = {
+    "camera": Measurement(
+        (Row(("psi",), "psi", 3.5e-3, angle=True), Row(("y_l",), "y_l", 0.02)),
+    ),
+    "gps": Measurement(
+        (Row(("beta", "psi"), "course", math.radians(0.14), angle=True, over_speed=True),),
+        (Row(("v_x",), "gps_speed", 0.05), Row(("v_y",), "gps_speed", 0.05)),  # (41)
+        heading_fix=True,
+    ),
+}
+"""By the sensor's name. (41): double-layer-gps."""
+
+
+def packet_column(sensor: str, value: str) -> int:
+    """The column of a sensor's packets that holds a value; 0 where it sends none of that name."""
+    names = [each.name for each in SLOW[SLOW_NAMES.index(sensor)].values]
+    return PACKET.value + names.index(value) if value in names else 0
