@@ -67,7 +67,7 @@ def estimate_options(cell: Cell) -> dict[str, Any]:
 
 def make_contest(cell: Cell, cars: int) -> tuple[VectorEnv[Any, Any, Any], Any]:
     """(vector env of `cars` rows with the cell's estimator, its agent)."""
-    options = {"scenario": cell.scenario, "on_bad_action": "fail"} | cell.options
+    options = cell.env_options
     if cell.controller == INFORMED:
         from ...agents.controllers.informed import make_informed
 

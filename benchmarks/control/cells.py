@@ -1,4 +1,4 @@
-"""Who meets whom: the manoeuvres, the estimators, the controllers, and the cells they make."""
+"""The matrix: manoeuvres, estimators, controllers, and the cells they make."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -52,8 +52,8 @@ class Cell:
     """One square of the matrix.
 
     estimator: a name of `make_estimator`, "truth", or "" where the controller reads none (or
-    brings its own). controller: what `make_agent` takes. options: of the env; cells are equal
-    whatever theirs are.
+    brings its own). controller: a name of `make_agent`. options: of the env, a scenario that has no
+    name among them; cells are equal whatever theirs are.
     """
 
     env_id: str
@@ -66,6 +66,11 @@ class Cell:
     def label(self) -> str:
         """Controller and estimator in words."""
         return f"{self.controller} on {self.estimator}" if self.estimator else self.controller
+
+    @property
+    def env_options(self) -> dict[str, Any]:
+        """Of the env: an action that is none ends the episode."""
+        return {"scenario": self.scenario, "on_bad_action": "fail"} | self.options
 
     @property
     def slow(self) -> bool:

@@ -35,7 +35,7 @@ def decision_time(cell: Cell) -> float:
     """
     contest: tuple[Any, Any] = make_contest(cell, 1)
     env, agent = contest
-    bare: Any = gym.make_vec(cell.env_id, num_envs=1, scenario=cell.scenario, **cell.options)
+    bare: Any = gym.make_vec(cell.env_id, num_envs=1, **cell.env_options)
     bare.reset(seed=0)
     agent.predict, env.step, without = _Timed(agent.predict), _Timed(env.step), _Timed(bare.step)
     for step in islice(steps_of(env, agent, 0), 1, STEPS + 1):

@@ -145,6 +145,5 @@ def over_time(
 def run_of(cell: Cell, seed: int) -> Rollout:
     """One episode of a contestant in a single env."""
     estimate = estimate_options(cell) if cell.estimator else None
-    options = {"scenario": cell.scenario} | cell.options
-    env = make_env(cell.env_id, cell.estimator, estimate, **options)
+    env = make_env(cell.env_id, cell.estimator, estimate, **cell.env_options)
     return rollout(env, make_agent(cell.controller, env), seed)

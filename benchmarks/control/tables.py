@@ -146,8 +146,7 @@ def rows_of(standing: Standing, salt: str) -> list[Row]:
 
 def spec_of(cell: Cell) -> str:
     """The env as JSON: what `gym.make` needs to build it again."""
-    options = {"scenario": cell.scenario, "on_bad_action": "fail"} | cell.options
-    env = gym.make(gym.spec(cell.env_id), **options)
+    env = gym.make(gym.spec(cell.env_id), **cell.env_options)
     return env.spec.to_json() if env.spec is not None else ""
 
 

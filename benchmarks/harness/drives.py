@@ -48,5 +48,5 @@ def make_env(
 
     estimate: options of `EstimateObservation`. options: of the env.
     """
-    env: gym.Env[Any, Any] = gym.make(env_id, on_bad_action="fail", **options)
+    env: gym.Env[Any, Any] = gym.make(env_id, **{"on_bad_action": "fail", **options})
     return quietly(EstimateObservation, env, estimator, **(estimate or {})) if estimator else env
