@@ -1,5 +1,5 @@
 """Question: what do steering and yaw moment do together? dakf-stability's bandwidth K, and lanes
-kept on curved roads from camera and gyro, the aim of uneven-delay."""
+held on curved roads from camera and gyro, the aim of uneven-delay."""
 
 from dataclasses import dataclass
 from itertools import islice
@@ -42,7 +42,7 @@ KEEPERS = (
     ("both", "exact-kf", True),
 )
 _TEXT = """\
-dakf-stability V.D says that the bandwidth K is limited by actuators and filter: its step by wire \
+dakf-stability V.D has the bandwidth K limited by actuators and filter: its step by wire \
 (Fig. 7) with dakf in the loop, from K = 1 to 100 rad/s. The radius is that of the sampled loop of \
 the true car with its lags, without the filter: beyond 1 it is unstable.
 

@@ -26,7 +26,7 @@ def design_pi(vehicle: Vehicle, speed: float, pole: float = POLE, placement: str
 
     With G = k / ((s + p_1)(s + p_2)), p_1 < p_2, and C = k_p (s + p_1) / s the closed loop is
     s^2 + p_2 s + k k_p. placement "radius": k k_p = pole^2 puts both poles on the circle of that
-    radius. They are kept at a damping of a half at least, which a slow plant reaches at a smaller
+    radius. They have a damping of a half at least, which a slow plant reaches at a smaller
     radius, and are real where p_2 > 2 pole. placement "real": k k_p = pole (p_2 - pole) puts one
     of two real poles there (both at p_2 / 2 where pole is beyond p_2). Gains are capped at the full
     yaw moment for 0.01 rad (near the speed where the yaw moment does not move beta, k is nearly

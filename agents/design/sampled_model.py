@@ -43,7 +43,7 @@ class Purpose:
     """What a design is for: everything but the car and its speed.
 
     period: ticks. full_scale: N m of the first input. steers: whether steering is the second.
-    kind: of `envs.reference.REFERENCES` by number. disturbances: of `DISTURBANCES`.
+    kind: of `REFERENCES` by number. disturbances: of `DISTURBANCES`.
     disturbance_time: s, in which forces decay. steer_weight: of added steering, times the cost's.
     """
 

@@ -26,7 +26,7 @@ def calibrate_command(
 ) -> None:
     """Find the cost of the clairvoyant, which a score of 1 stands for.
 
-    A stopped run goes on where it was when the same command is given again in the same folder.
+    A stopped run goes on where it was when the same command runs again in the same folder.
     """
     from ..control.calibration import FILE, calibrate, cases_of, forget, update
     from ..control.cells import MANOEUVRES

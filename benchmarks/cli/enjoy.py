@@ -50,18 +50,18 @@ def enjoy_command(
 
 
 def _show_card(console: Console, policy: "Policy") -> None:
-    """A line a field of the card, and what the file says of the network."""
+    """A line a field of the card, and the size of the network."""
     network = policy.network
     sizes = " x ".join(map(str, (network.inputs, *network.hidden, network.width)))
     unread = [name for (name, _), read in zip(policy.card.observation, policy.reads, strict=True)
               if not read]  # fmt: skip
-    told = asdict(policy.card) | {
+    fields = asdict(policy.card) | {
         "observation": ", ".join(f"{name} / {unit}" for name, unit in policy.card.observation),
         "not read": ", ".join(unread) or "none",
         "network": f"{sizes}, {network.activation}, {network.output} output",
         "observation clipped at": network.clip,
     }
     table = Table("field", "value", box=box.SIMPLE_HEAD, title=policy.name, title_justify="left")
-    for name, value in told.items():
+    for name, value in fields.items():
         table.add_row(name, escape(value if isinstance(value, str) else dumps(value)))
     console.print(table)

@@ -51,8 +51,8 @@ def main() -> None:
         sys.exit(2)
 
 
-def _say_version(wanted: bool) -> None:
-    if wanted:
+def _version(shown: bool) -> None:
+    if shown:
         console.print(f"sideslip {__version__}", highlight=False)
         raise typer.Exit
 
@@ -60,7 +60,7 @@ def _say_version(wanted: bool) -> None:
 @app.callback()
 def face(
     version: Annotated[
-        bool, typer.Option("--version", callback=_say_version, is_eager=True, help="Say it.")
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print it.")
     ] = False,
 ) -> None:
     """Lateral stability of electric vehicles: environments, estimators, controllers."""
@@ -136,7 +136,7 @@ def bench(
         Path | None, typer.Option(help="A folder for finished cases: a stopped run goes on.")
     ] = None,
 ) -> None:
-    """Compare estimators and controllers, and a recorded drive if one is given."""
+    """Compare estimators and controllers, and a recorded drive with --log."""
     names = suites or list(SUITES)
     unknown = [name for name in names if name not in SUITES]
     if unknown:

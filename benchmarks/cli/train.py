@@ -39,14 +39,14 @@ def train_command(
         bool, typer.Option("--resume", help="Go on with the training in the folder.")
     ] = False,
 ) -> None:
-    """Train a policy; the best one of the evaluations is kept, the last one can be gone on with.
+    """Train a policy; the best one of the evaluations is saved, the last one can be gone on with.
 
-    With --resume whatever is not given is that of the training in the folder.
+    With --resume the options left out are those of the training in the folder.
     """
     from ...agents.training.train import CURVE, POLICY, task_in, train, with_defaults
     from ..policies import evaluate, evaluation
 
-    wish: dict[str, Any] = {
+    options: dict[str, Any] = {
         "env_id": env,
         "algo": algo,
         "estimator": estimator,
@@ -54,24 +54,24 @@ def train_command(
         "seed": seed,
         "num_envs": num_envs,
     }
-    given = {name: value for name, value in wish.items() if value is not None}
-    task = with_defaults(**given)
+    options = {name: value for name, value in options.items() if value is not None}
+    task = with_defaults(**options)
     folder = out or Path(_name_of(task))
     if resume:
-        task = task_in(folder, **given)
+        task = task_in(folder, **options)
     console = Console()
     with _Bar(console, steps) as bar:
         trained = train(task, steps, folder, resume, bar.show, shlex.join(_words(task, steps)))
     console.print(_table(trained))
     costs = evaluation(evaluate(folder / POLICY, EPISODES))["cost"]
-    said = ", ".join(f"{name} {each['mean']:.4g}" for name, each in costs.items())
-    console.print(f"mean cost on test seeds: {said}", highlight=False, soft_wrap=True)
+    means = ", ".join(f"{name} {each['mean']:.4g}" for name, each in costs.items())
+    console.print(f"mean cost on test seeds: {means}", highlight=False, soft_wrap=True)
     console.print(f"policy: {folder / POLICY}", highlight=False, soft_wrap=True)
     console.print(f"curve: {folder / CURVE}", highlight=False, soft_wrap=True)
 
 
 def _name_of(task: "Task") -> str:
-    """Of the folder where none is given."""
+    """The folder of a task without --out."""
     options = [each if isinstance(each, str) else name for name, each in task.env_options.items()]
     words = [task.env_id.rpartition("/")[2], task.algo, task.estimator, *options]
     return "-".join(["train", *filter(None, words), str(task.seed)])
@@ -102,11 +102,11 @@ class _Bar(Progress):
         self._task = self.add_task("", total=steps)
 
     def show(self, now: "Now") -> None:
-        """Say where the training stands."""
-        said = "" if now.cost is None else f"cost {now.cost:.3g} exploring, "
+        """Show where the training stands."""
+        text = "" if now.cost is None else f"cost {now.cost:.3g} exploring, "
         last, best = now.evaluations[-1], min(now.evaluations, key=lambda each: each.cost)
-        said += f"of none's {last.of_none:.3f}, best {best.of_none:.3f}"
-        self.update(self._task, completed=now.steps, description=said)
+        text += f"of none's {last.of_none:.3f}, best {best.of_none:.3f}"
+        self.update(self._task, completed=now.steps, description=text)
 
 
 def _table(trained: "Trained") -> Table:

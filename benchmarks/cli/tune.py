@@ -75,7 +75,7 @@ def tune_estimator(
 ) -> None:
     """Find an estimator's Q, and R if asked to, on training seeds; report on test seeds.
 
-    A stopped search goes on where it was when the same command is given again.
+    A stopped search goes on where it was when the same command runs again.
     """
     from ...estimators.design import tunings
     from ..tuning.file import update
@@ -99,7 +99,7 @@ def tune_estimator(
     console = Console()
     suite, found = run(task, trials, test_seeds, storage or STORAGE, sampler, seed, jobs, console)
     print_suite(console, suite)
-    given: list[tuple[str, Sequence[Any]]] = [
+    flags: list[tuple[str, Sequence[Any]]] = [
         ("--env", [env] if env else []),
         ("--target", [target] if target != "beta" else []),
         ("--option", option or []),
@@ -110,7 +110,7 @@ def tune_estimator(
         ("--seeds", [seeds]),
         ("--seed", [seed] if seed else []),
     ]
-    words = [str(word) for flag, values in given for value in values for word in (flag, value)]
+    words = [str(word) for flag, values in flags for value in values for word in (flag, value)]
     command = shlex.join(["sideslip", "tune", "estimator", name, "--scenario", scenario, *words])
     made = entry(task, found, command, note)
     for path in files:

@@ -23,7 +23,7 @@ SIGNALS = ("beta", "gamma", "beta_ref", "gamma_ref", "yaw_moment", "steer")
 
 @dataclass(frozen=True)
 class Chunk:
-    """A case: some seeds of a cell. keep: whether the first seed's time series is wanted."""
+    """A case: some seeds of a cell. keep: whether it returns the first seed's time series."""
 
     cell: Cell
     seeds: tuple[int, ...]

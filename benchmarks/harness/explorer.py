@@ -77,5 +77,5 @@ class Explorer:
 
 def _thinned(values: Array) -> list[float | None]:
     """At most POINTS samples to a few digits; every signal at the same places."""
-    kept = np.unique(np.linspace(0, len(values) - 1, min(len(values), POINTS)).astype(int))
-    return [float(f"{v:.{_DIGITS}g}") if np.isfinite(v) else None for v in values[kept]]
+    shown = np.unique(np.linspace(0, len(values) - 1, min(len(values), POINTS)).astype(int))
+    return [float(f"{v:.{_DIGITS}g}") if np.isfinite(v) else None for v in values[shown]]

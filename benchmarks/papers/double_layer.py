@@ -18,7 +18,7 @@ DESIGNED = "kinematic-velocity-kf, Q of its sensors"
 FIXED = ", R of HDOP 1"
 _ENV = "sideslip/YawGps-v0"
 _HDOP = {"hdop_table": FILTERS["double-layer"].hdop}
-# a tuning of its own, found as estimators/tunings.py says on seeds 1000 to 1011 of FIG9
+# a tuning of its own, found as those of estimators/design/tunings.toml, seeds 1000 to 1011 of FIG9
 _PREDICTED = {
     "intersample": "predict",
     "q_beta": 1.1e-4,

@@ -18,9 +18,9 @@ NAME = "papers"
 
 _TEXT = (
     "The five papers' claims, each measured on the paper's own simulation or worked out exactly. "
-    "A part of a claim is one number a seed. `reproduced`: all parts are as the paper says, each "
+    "A part of a claim is one number a seed. `reproduced`: all parts are as the paper states, each "
     "in nine of ten seeds. `not reproduced`: no part is, even in the median over the seeds. "
-    "`partly`: anything between. `report only`: the paper says nothing that could be false. "
+    "`partly`: anything between. `report only`: the paper states nothing that could be false. "
     "Thresholds are what an honest implementation reaches (docs/PAPERS.md section 3); the median "
     "has to meet them. No paper prints its noise or its tuning: both are ours, and filters are "
     "tuned on other seeds than these. A twin is a road test's simulation with everything that the "
@@ -65,7 +65,7 @@ def simulate(seeds: int, jobs: int | None = None, console: Console | None = None
 
 def _verdicts(ledger: Ledger) -> Table:
     """One line a claim."""
-    cells = [[_where(claim), claim.text, verdict(found), _kept(found)] for claim, found in ledger]
+    cells = [[_where(claim), claim.text, verdict(found), _met(found)] for claim, found in ledger]
     return Table(
         "The claims and what became of them",
         ("paper", "claim", "verdict", "thresholds"),
@@ -77,16 +77,16 @@ def _verdicts(ledger: Ledger) -> Table:
 def _numbers(ledger: Ledger, paper: str) -> Table:
     """One line a part of a paper's claims."""
     cells = [
-        [f"{claim.source}: {each.part.label}", _spread(each), _said(each), _checked(each)]
+        [f"{claim.source}: {each.part.label}", _spread(each), _stated(each), _checked(each)]
         for claim, found in ledger
         for each in found
         if claim.paper == paper
     ]
     return Table(
         f"{paper}: what was measured",
-        ("number", "median [range]", "paper says", "threshold"),
+        ("number", "median [range]", "paper states", "threshold"),
         cells,
-        "The range is over seeds, tunings or speeds; behind what the paper says stands the share "
+        "The range is over seeds, tunings or speeds; behind what the paper states stands the share "
         "of them in which it is so.",
         keyed=False,
     )
@@ -109,13 +109,13 @@ def _spread(found: Found) -> str:
 
 
 def _text(value: float) -> str:
-    """Three digits; of rounding errors the order of magnitude says enough."""
+    """Three digits; of rounding errors the order of magnitude is enough."""
     return f"{value:.0e}" if 0.0 < abs(value) < 1e-6 else f"{value:.3g}"
 
 
-def _said(found: Found) -> str:
-    says = found.part.says
-    return "" if says is None else f"{says} ({100.0 * found.agreeing:.0f} %)"
+def _stated(found: Found) -> str:
+    stated = found.part.stated
+    return "" if stated is None else f"{stated} ({100.0 * found.agreeing:.0f} %)"
 
 
 def _checked(found: Found) -> str:
@@ -125,7 +125,7 @@ def _checked(found: Found) -> str:
     )
 
 
-def _kept(found: tuple[Found, ...]) -> str:
+def _met(found: tuple[Found, ...]) -> str:
     """How many of a claim's thresholds are met."""
     checked = [each.threshold_met for each in found if each.threshold_met is not None]
     if not checked:

@@ -17,7 +17,7 @@ ROLLBACK_17 = "multirate-kf, constant 17 ms"
 
 
 def _filters(**noise: float) -> tuple[Filter, ...]:
-    """The filters, told the camera's noise; the process noise is one for all of them."""
+    """The filters, with the camera's noise; the process noise is one for all of them."""
     return (
         Filter(PROPOSED, PROPOSED, noise),
         Filter(EXACT, EXACT, noise),
@@ -47,9 +47,9 @@ CLAIMS = (
         smaller("vision alone / the slip itself", FIG5, VISION, "truth")),
     claim("Fig. 5", "time stamps beat a constant delay, lateral offset",
         *(
-            smaller(f"proposed / constant {told}{text}", scenario, PROPOSED, rival, most, "y_l")
+            smaller(f"proposed / constant {delay}{text}", scenario, PROPOSED, rival, most, "y_l")
             for scenario, text in _NOISES
-            for told, rival, most in (("33 ms", FRAME, 0.80), ("17 ms, the true mean", MEAN, None))
+            for delay, rival, most in (("33 ms", FRAME, 0.80), ("17 ms, the true mean", MEAN, None))
         ),
         note="Against one frame the time stamps win; against the true mean delay there is no "
         "gain. One process noise for all; with one tuned to the offset for each of them the order "

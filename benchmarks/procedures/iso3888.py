@@ -1,9 +1,9 @@
 """ISO 3888: double lane change (part 1) and obstacle avoidance (part 2), with a check for cones.
 
-The lanes are `envs.tracks.sections`; a driver model steers. A car hits a cone where any part of
+The lanes are `tracks.sections`; a driver model steers. A car hits a cone where any part of
 its body, a rectangle, is outside a lane while within its length. Part 1 is driven at a held speed,
 part 2 coasting. A driver may try again: at every speed each driver of `TRIES` goes until one hits
-no cone. The result is the highest speed of a clean run, which tells the car and our drivers
+no cone. The result is the highest speed of a clean run, which is that of the car and our drivers
 together: they do not reach what test drivers do.
 
 A car built for lower speeds drives tracks shortened by a fixed share of their lengths: that of its

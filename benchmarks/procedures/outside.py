@@ -43,8 +43,8 @@ SCENARIO: dict[str, Any] = {
 def within_limit(motion: Motion, steer: float) -> float:
     """The check's yaw moment in N m."""
     most = 0.85 * GRAVITY * outside_vehicle().friction / motion.v_x
-    wanted = min(max(motion.v_x * steer / outside_vehicle().wheelbase, -most), most)
-    return float(min(max(GAIN * (wanted - motion.gamma), -LIMIT), LIMIT))
+    goal = min(max(motion.v_x * steer / outside_vehicle().wheelbase, -most), most)
+    return float(min(max(GAIN * (goal - motion.gamma), -LIMIT), LIMIT))
 
 
 @dataclass(frozen=True)

@@ -78,8 +78,8 @@ def time_series(
             raise ValueError(f"series {name!r} has shape {y.shape}, its time {t.shape}")
         there = ~np.isnan(y) if name in dots else np.ones(len(y), bool)
         x, y = t[there], y[there]
-        kept = peaks(y)
-        trace = _line(name, x[kept], y[kept], *colour_and_dash, name in dots)
+        shown = peaks(y)
+        trace = _line(name, x[shown], y[shown], *colour_and_dash, name in dots)
         if len(y) > 4 * POINTS and name not in (*dots, *FACTS):
             trace.line.width = 1.0  # a dense line is noisy: leave room to see the others
         figure.add_trace(trace)
@@ -104,11 +104,11 @@ def error_series(
     figure.add_hline(y=0.0, line={"color": GREY, "width": 1}, layer="below")
     if band is not None:
         name, half = band[0], np.asarray(band[1], float)
-        kept = peaks(half)
-        there = np.asarray(t, float)[kept]
+        shown = peaks(half)
+        there = np.asarray(t, float)[shown]
         area = go.Scatter(
             x=_single(np.concatenate([there, there[::-1]])),
-            y=_single(np.concatenate([half[kept], -half[kept][::-1]])),
+            y=_single(np.concatenate([half[shown], -half[shown][::-1]])),
             name=name,
             mode="lines",
             fill="toself",
@@ -159,8 +159,8 @@ def track(
         across, up = (np.asarray(values, float) for values in x[name])
         if across.shape != up.shape:
             raise ValueError(f"track {name!r}: x has shape {across.shape}, y {up.shape}")
-        kept = np.unique(np.linspace(0, len(up) - 1, min(len(up), POINTS)).round().astype(int))
-        figure.add_trace(_line(name, across[kept], up[kept], *colour_and_dash))
+        shown = np.unique(np.linspace(0, len(up) - 1, min(len(up), POINTS)).round().astype(int))
+        figure.add_trace(_line(name, across[shown], up[shown], *colour_and_dash))
     figure.update_yaxes(scaleanchor="x", scaleratio=1)
     height = int(np.clip(120 + 900 * _slimness(figure), 280, 640))
     return _finish(_facts_first(figure), title, x_label, y_label, height, hovermode="closest")

@@ -132,8 +132,8 @@ _BLANK = {"", "-", "\u2013", "\u2014", "nan", "n/a"}
 
 def numeric(cells: Iterable[str]) -> bool:
     """Whether a column is one of numbers: some, and nothing else but blanks."""
-    told = [cell for cell in cells if cell.strip().lower() not in _BLANK]
-    return bool(told) and all(number(cell) is not None for cell in told)
+    texts = [cell for cell in cells if cell.strip().lower() not in _BLANK]
+    return bool(texts) and all(number(cell) is not None for cell in texts)
 
 
 def _table(table: Table) -> str:

@@ -61,8 +61,8 @@ def track_kml(
     for name, (X, Y) in tracks.items():
         if X.shape != Y.shape or not (np.isfinite(X).all() and np.isfinite(Y).all()):
             raise ValueError(f"track {name!r}: X and Y must be finite and equally long")
-        kept = np.unique(np.linspace(0, len(X) - 1, min(len(X), _MOST)).round().astype(int))
-        latitude, longitude = degrees(X[kept], Y[kept], origin)
+        shown = np.unique(np.linspace(0, len(X) - 1, min(len(X), _MOST)).round().astype(int))
+        latitude, longitude = degrees(X[shown], Y[shown], origin)
         points = "\n".join(f"{e:.8f},{n:.8f}" for n, e in zip(latitude, longitude, strict=True))
         rgb = (colours or {}).get(name, "#0072B2").lstrip("#")
         bgr = "ff" + rgb[4:6] + rgb[2:4] + rgb[0:2]  # KML: alpha, blue, green, red

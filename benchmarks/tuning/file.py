@@ -18,14 +18,14 @@ def update(path: str | Path, entry: dict[str, Any]) -> None:
     """Replace or add an entry of a tunings file, which is made if it is not there.
 
     entry: estimator, sensors, q (by state), command, and noise (by option) and note where there is
-    something to say. The note of what a command found outlives the numbers unless a new one is
-    given; that of what was chosen by hand does not.
+    a reason for one. The note of what a command found outlives the numbers unless a new one comes
+    with them; that of what was chosen by hand does not.
     """
     target = Path(path)
     entries = {_key(old): old for old in read_tunings(target)} if target.exists() else {}
     old = entries.get(_key(entry), {})
-    kept = {"note": old["note"]} if {"note", "command"} <= old.keys() else {}
-    entries[_key(entry)] = kept | entry
+    note = {"note": old["note"]} if {"note", "command"} <= old.keys() else {}
+    entries[_key(entry)] = note | entry
     text = target.read_text(encoding="utf-8") if target.exists() else ""
     head = text.partition("[[tuning]]")[0] or _HEAD + "\n"
     write_text(target, head + "\n".join(map(_text, entries.values())))

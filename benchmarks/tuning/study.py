@@ -32,7 +32,7 @@ except ModuleNotFoundError as error:
         "tuning needs optuna: pip install 'sideslip[tune]'", name=error.name
     ) from error
 
-BATCH = 8  # trials asked for before any of them is told: the same search for every number of jobs
+BATCH = 8  # trials asked for before any result is in: the same search for every number of jobs
 DIGITS = 3  # of what is found
 
 

@@ -1,7 +1,7 @@
 """Question: which process and measurement noise makes an estimator most accurate?
 
-Searched on training seeds, judged on test seeds. `tune_task` says what is searched and what counts
-as error, `tune_study` searches, `tune_file` keeps what was found.
+Searched on training seeds, judged on test seeds. `task` has what is searched and what counts as
+error, `study` searches, `file` stores what was found.
 """
 
 import math
@@ -48,8 +48,8 @@ def run(
         "tune",
         f"Tuning {task.estimator} on {task.scenario}",
         f"RMSE of {task.target} from 2 s on in {task.unit}, with 95 % bootstrap intervals; "
-        f"{trials} trials. The default is what make_estimator does when it is told no more than "
-        "what is held.",
+        f"{trials} trials. The default is make_estimator with no more than what is held "
+        "fixed.",
         tables=[_comparison(task, training, test, found), _numbers(task, found)],
     )
     return suite, found

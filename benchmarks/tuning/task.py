@@ -97,14 +97,14 @@ def make_task(
             for state in states
             if f"q_{state}" not in held and _takes(estimator, f"q_{state}", held, facts)
         }
-    wished = {**search, **(noises or {})}
-    if not wished:
-        raise ValueError(f"{estimator} has no process noise to search; say which options to search")
-    for option in wished:
+    searched = {**search, **(noises or {})}
+    if not searched:
+        raise ValueError(f"{estimator} has no process noise to search; name the options to search")
+    for option in searched:
         if option in held:
             raise ValueError(f"the option {option} is both held and searched")
         if not _takes(estimator, option, held, facts):
-            build(estimator, facts, {**held, option: 1.0})  # says what it has
+            build(estimator, facts, {**held, option: 1.0})  # raises with what it has
     return Task(
         estimator,
         scenario,
@@ -113,7 +113,7 @@ def make_task(
         filter_.units[states.index(target)],
         ",".join(filter_.sensors),
         held,
-        {option: _range(option, limits) for option, limits in wished.items()},
+        {option: _range(option, limits) for option, limits in searched.items()},
         tuple(range(FIRST_SEED, FIRST_SEED + seeds)),
     )
 
@@ -149,7 +149,7 @@ def _takes(estimator: str, option: str, held: Mapping[str, Any], facts: Mapping[
 def _fitting(
     estimator: str, scenario: str, env_id: str | None, held: dict[str, Any]
 ) -> tuple[str, dict[str, Any], Estimator]:
-    """The environment to use, what it tells an estimator, and the estimator without tuning."""
+    """The environment to use, its facts, and the estimator without tuning."""
     first = [each.env_id for each in EXPERIMENTS if each.scenario == scenario]
     others = [name for name in gym.registry if name.startswith("sideslip/Yaw")]
     ids = list(dict.fromkeys([*first, *others])) if env_id is None else [env_id]
@@ -192,7 +192,7 @@ def squares(task: Task, drives: Sequence[Drive], found: Mapping[str, float]) -> 
     errors, filters = np.empty(len(drives)), dict[str, Estimator]()
     for i, (log, facts) in enumerate((drive.log, drive.facts) for drive in drives):
         clocks = [dataclasses.replace(sensor, phase=0.0) for sensor in facts["sensors"].values()]
-        key = repr(facts | {"sensors": clocks})  # a reset tells an estimator the clocks' phases
+        key = repr(facts | {"sensors": clocks})  # a reset sets the clocks' phases
         if key not in filters:
             filters[key] = build(task.estimator, facts, options)
         late = log.time >= SETTLED - 1e-9

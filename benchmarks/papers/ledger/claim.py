@@ -1,13 +1,13 @@
 """A claim of a paper, and the rule that turns what was measured into a verdict.
 
-A claim has one or more parts. A part is one number a seed, what the paper says about that number
-(`says`) and the threshold that an honest implementation meets (`threshold`, docs/PAPERS.md
+A claim has one or more parts. A part is one number a seed, what the paper states of that number
+(`stated`) and the threshold that an honest implementation meets (`threshold`, docs/PAPERS.md
 section 3); both are data. The rule:
 
-- a part *holds* where at least nine in ten seeds meet what the paper says, holds *in the median*
+- a part *holds* where at least nine in ten seeds meet what the paper states, holds *in the median*
   where at least the median over the seeds does, and *fails* otherwise;
 - a claim is `reproduced` if all its parts hold, `not reproduced` if all fail, `partly` otherwise;
-- a claim none of whose parts has a `says` (the paper gives no statement that could be false, or the
+- a claim none of whose parts has a `stated` (the paper has no statement that could be false, or the
   ledger only shows a number) is `report only`.
 
 A threshold is met if the median over the seeds meets it. It guards our implementation and has no
@@ -92,20 +92,20 @@ class Part:
     """One measured number of a claim.
 
     label: who against whom. of: from the results to one number a seed. scenario: the name of the
-    simulation or analysis it comes from. metric: of `rows.METRICS`.
+    simulation or analysis it comes from. metric: of `METRICS`.
     """
 
     label: str
     scenario: str
     of: Callable[[Results], Array]
-    says: Bound | None = None
+    stated: Bound | None = None
     threshold: Bound | None = None
     metric: str = "ratio"
 
 
 @dataclass(frozen=True)
 class Claim:
-    """paper: its short name. source: equation, figure or section. text: what it says, in a line.
+    """paper: its short name. source: equation, figure or section. text: it in a line.
 
     note: what was found out about it, for the report. Raises ValueError for a claim without parts.
     """
@@ -154,14 +154,14 @@ class Found:
 
     @property
     def agreeing(self) -> float:
-        """The share of seeds that meet what the paper says; NaN where it says nothing."""
-        says = self.part.says
-        return math.nan if says is None else float(np.mean(says.met(self.values)))
+        """The share of seeds that meet what the paper states; NaN where that is nothing."""
+        stated = self.part.stated
+        return math.nan if stated is None else float(np.mean(stated.met(self.values)))
 
     @property
     def in_the_median(self) -> bool:
-        """Whether the median meets what the paper says."""
-        return self.part.says is not None and bool(self.part.says.met(self.median))
+        """Whether the median meets what the paper states."""
+        return self.part.stated is not None and bool(self.part.stated.met(self.median))
 
     @property
     def threshold_met(self) -> bool | None:
@@ -183,7 +183,7 @@ def find(claim: Claim, results: Results) -> tuple[Found, ...]:
 
 def verdict(found: Sequence[Found]) -> str:
     """The verdict on a claim: the rule of this module."""
-    judged = [each for each in found if each.part.says is not None]
+    judged = [each for each in found if each.part.stated is not None]
     if not judged:
         return "report only"
     if all(each.agreeing >= MOST for each in judged):
@@ -203,12 +203,12 @@ def measured(
     scenario: str,
     who: str,
     what: str,
-    says: Bound | None = None,
+    stated: Bound | None = None,
     threshold: Bound | None = None,
     metric: str = "ratio",
 ) -> Part:
     """A measured number as a part of a claim."""
-    return Part(label, scenario, number(scenario, who, what), says, threshold, metric)
+    return Part(label, scenario, number(scenario, who, what), stated, threshold, metric)
 
 
 def ratio(scenario: str, one: str, other: str, metric: str = "beta") -> Callable[[Results], Array]:
@@ -247,6 +247,6 @@ def smaller(
     most: float | None = None,
     metric: str = "beta",
 ) -> Part:
-    """The paper says that one's number is smaller than the other's; most: the ratio's threshold."""
+    """The paper has one's number smaller than the other's; most: the ratio's threshold."""
     threshold = None if most is None else Bound("<=", most)
     return Part(label, scenario, ratio(scenario, one, other, metric), Bound("<", 1.0), threshold)

@@ -48,11 +48,11 @@ class Estimation:
     Numbers of each filter: the RMSE of every state whose truth is known, from `SETTLED` on;
     "outage", that of beta while the GPS is out; "jump", the RMS change of beta in the milliseconds
     in which a packet arrives; "last", the mean of beta's error over the last second, its size.
-    bound: whether "bound" is wanted, the RMS of the optimal standard deviation of beta. times: that
+    bound: whether to add "bound", the RMS of the optimal standard deviation of beta. times: that
     many times the seeds, where a ratio is close to its threshold. control_period: ticks between
     rows of the truth; in between it is interpolated.
 
-    Raises ValueError where the bound is wanted of a car whose tyres change on the way.
+    Raises ValueError for the bound of a car whose tyres change on the way.
     """
 
     name: str

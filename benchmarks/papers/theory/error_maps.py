@@ -40,7 +40,7 @@ def predicted(A: Array, C: Array, L: Array, r: int) -> list[Array]:
     return shared(A, C, np.concatenate([L[None], np.zeros((r - 1, *L.shape))]))
 
 
-def difference(ours: list[Array], wanted: list[Array]) -> float:
-    """The largest difference of two sequences of maps, over the largest of the wanted maps."""
-    size = max(float(np.linalg.norm(each)) for each in wanted)
-    return max(float(np.linalg.norm(a - b)) / size for a, b in zip(ours, wanted, strict=True))
+def difference(ours: list[Array], others: list[Array]) -> float:
+    """The largest difference of two sequences of maps, over the largest of the others."""
+    size = max(float(np.linalg.norm(each)) for each in others)
+    return max(float(np.linalg.norm(a - b)) / size for a, b in zip(ours, others, strict=True))

@@ -1,6 +1,6 @@
 """Does tie-vision's filter with pseudo-residuals converge, and with how many tunings?
 
-The paper does not say which gain its (16), (21) use between samples. Two are tried with the same
+The paper leaves open which gain its (16), (21) use between samples. Two are tried with the same
 random process noise: the Kalman gain of (13) at 1 ms, every row corrected at every step, as the
 four steps (19)-(22) read; and the shipped filter's, which spreads the multirate filter's gain over
 the frame.

@@ -1,4 +1,4 @@
-"""tie-vision: body slip angle from a camera and a gyro; `tie_vision_control` has its controller."""
+"""tie-vision: body slip angle from a camera and a gyro; `control` has its controller."""
 
 from functools import partial
 
@@ -16,7 +16,7 @@ NO_DELAY = "multirate-kf, delay ignored"
 RETUNED = "multirate-kf, delay ignored, tuned for it"
 
 _PAPERS_OWN = tuple(Filter(name, name) for name in (BICYCLE, SINGLE, MULTI, PROPOSED))
-# as estimators/tunings.py, but with psi and y_l's noise free too: seeds 1000 to 1011 of this drive
+# as tunings.toml, but with psi and y_l's noise free too: seeds 1000 to 1011 of this drive
 _FOR_NO_DELAY = {
     "q_beta": 8.8e-3,
     "q_gamma": 0.15,

@@ -125,8 +125,8 @@ def _opened(vehicle: Vehicle, design: LoopDesign, dt: float) -> tuple[Parts, Par
 def estimator_loop(vehicle: Vehicle, design: LoopDesign, dt: float) -> "StateSpace":
     """Plant, Kalman filter and PI, opened where the yaw moment enters the plant.
 
-    The filter is told the moment that the PI asks for: opened behind both, a filter with the right
-    model would not show in the loop at all. It has its steady gain and the PI reads the estimate
+    The filter's input is the moment that the PI asks for: opened behind both, a filter with the
+    right model would not show in the loop at all. It has its steady gain and the PI reads the estimate
     after the correction.
     """
     import control
