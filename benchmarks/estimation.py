@@ -208,12 +208,12 @@ def _draw(
             ("error of each estimator", bars, experiment.text),
             (
                 "the sideslip angle and its estimates (seed 0)",
-                time_series("", t, estimates, angle),
+                time_series(t, estimates, angle),
                 "The paper's figure, redrawn.",
             ),
             (
                 "errors (seed 0)",
-                time_series("", t, missed, f"error of the {angle}"),
+                time_series(t, missed, f"error of the {angle}"),
                 "Estimate minus truth.",
             ),
         )

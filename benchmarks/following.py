@@ -157,13 +157,13 @@ def _bandwidths(suite: Suite, found: Array) -> None:
     note = "Errors over those without control; shares of time and of runs."
     suite.tables.append(Table("The bandwidth K", header, cells, note, keyed=False))
     try:
-        from .report.heat_maps import curves
+        from .report.figures import curves
     except ModuleNotFoundError:
         return
     columns = np.array(numbers).transpose(1, 2, 0)  # (column, value low high, K)
     lines = {name: tuple(column) for name, column in zip(_COLUMNS, columns, strict=True)}
     lines["spectral radius of the loop"] = (radius, radius, radius)
-    figure = curves(np.array(BANDWIDTHS), lines, "K / (rad/s)", "ratio or share", log=True)
+    figure = curves(np.array(BANDWIDTHS), lines, "K / (rad/s)", "ratio or share", "x")
     caption = "Tracking, saturation and stability against the bandwidth; whiskers 95 % over seeds."
     suite.figures.append(("dakf-stability V.D: the bandwidth K", figure, caption))
 

@@ -22,20 +22,15 @@ def write_picture(path: str | Path, suites: Sequence[Suite]) -> None:
             "pictures need matplotlib: pip install 'sideslip[report]'"
         ) from None
     rows = [row for suite in suites for row in suite.rows]
+    error, score = "error of sideslip / mrad", "score (1: clairvoyant)"
     panels = [
-        (title, [r for r in rows if r.scenario == scenario and r.metric == metric], label)
-        for scenario, metric, title, label in (
-            (
-                "tie-vision-fig7",
-                "rmse",
-                "Estimating with a late camera",
-                "error of sideslip / mrad",
-            ),
-            ("dakf-fig6", "rmse", "Estimating with GPS, wind, outage", "error of sideslip / mrad"),
+        (title, [r for r in rows if (r.scenario, r.metric) == key and _shown(r)], label)
+        for title, key, label in (
+            ("Estimating with a late camera", ("tie-vision-fig7", "rmse"), error),
+            ("Estimating with GPS, wind, outage", ("dakf-fig6", "rmse"), error),
+            (f"Controlling, on {REFERENCE_FILTER}", ("all", "score"), score),
         )
     ]
-    scores = [r for r in rows if r.scenario == "all" and r.metric == "score" and _main(r)]
-    panels.append((f"Controlling, on {REFERENCE_FILTER}", scores, "score (1: clairvoyant)"))
     panels = [panel for panel in panels if panel[1]]
     if not panels:
         raise ValueError("nothing to draw: the picture needs the suites estimation or control")
@@ -43,21 +38,12 @@ def write_picture(path: str | Path, suites: Sequence[Suite]) -> None:
     axes = figure.subplots(1, len(panels), squeeze=False)[0]
     for axis, (title, mine, label) in zip(axes, panels, strict=True):
         _bars(axis, mine, title, label)
-        bounds = [
-            r for r in rows if r.metric == "rmse_over_bound" and r.scenario == mine[0].scenario
-        ]
-        if bounds:
-            value = next(r.value for r in mine if r.estimator == bounds[0].estimator)
-            axis.axvline(1e3 * value / bounds[0].value, color=INK, linewidth=1.5)
-            axis.text(
-                1e3 * value / bounds[0].value,
-                -0.4,
-                " the bound",
-                color=INK,
-                fontsize=8,
-                va="center",
-                bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 1.0},
-            )
+        over = {r.estimator: r.value for r in rows
+                if r.metric == "rmse_over_bound" and r.scenario == mine[0].scenario}  # fmt: skip
+        for row in mine:
+            if row.estimator in over:
+                _limit(axis, 1e3 * row.value / over[row.estimator])
+                break
     part = Path(path).with_name(f".{Path(path).name}.part.png")
     try:
         figure.savefig(part, dpi=110)
@@ -66,9 +52,16 @@ def write_picture(path: str | Path, suites: Sequence[Suite]) -> None:
         part.unlink(missing_ok=True)
 
 
-def _main(row: Row) -> bool:
-    """Whether a controller stands in the picture: with the best filter, yaw moment alone."""
-    return row.env_version.startswith(YAW) and row.estimator in ("", REFERENCE_FILTER)
+def _shown(row: Row) -> bool:
+    """Whether a row stands in the picture: of the scores those on the best filter, yaw moment."""
+    best = row.env_version.startswith(YAW) and row.estimator in ("", REFERENCE_FILTER)
+    return row.metric != "score" or best
+
+
+def _limit(axis: Any, value: float) -> None:
+    axis.axvline(value, color=INK, linewidth=1.5)
+    box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 1.0}
+    axis.text(value, -0.4, " the bound", color=INK, fontsize=8, va="center", bbox=box)
 
 
 def _bars(axis: Any, rows: Sequence[Row], title: str, label: str) -> None:

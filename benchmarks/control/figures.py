@@ -58,7 +58,7 @@ def illustrate(
         text = track_kml(manoeuvre, tracks, {name: colour(name) for name in tracks})
         suite.files.append((f"{manoeuvre}.kml", "application/vnd.google-earth.kml+xml", text))
     try:
-        from ..report.heat_maps import curves
+        from ..report.figures import curves
     except ModuleNotFoundError:
         return
     suite.explorers.append(_time_series(results))

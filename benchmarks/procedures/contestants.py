@@ -1,9 +1,8 @@
-"""Who is tested: cars with their controllers, as drives."""
+"""Cars and controllers under test, as drives."""
 
 from dataclasses import dataclass
 from typing import Any
 
-from ...agents import AGENTS
 from ...envs.outside.plants import outside_vehicle
 from ...envs.vehicle.vehicle import COMS, PASSENGER_CAR
 from .drive import Drive, TestCar, of_env
@@ -31,25 +30,16 @@ class Contestant:
     agent: str
     estimator: str = ""
 
-    @property
-    def label(self) -> str:
-        """Its name in tables."""
-        return self.agent
-
     def drive(self, car: str, seed: int = 0) -> Drive:
         """Drives of one of `CARS`; references stay within what friction can hold."""
         options: dict[str, Any] = {"vehicle": CARS[car].vehicle.to_dict(), "reference": "limited"}
         return of_env(ENV_ID, self.agent, self.estimator, seed, **options)
 
 
-CONTESTANTS: tuple[Contestant, ...] = tuple(
-    contestant
-    for contestant in (
-        Contestant("none"),
-        Contestant("feedforward"),
-        Contestant("two-dof", "exact-kf"),
-        Contestant("lqr", "exact-kf"),
-        Contestant("esc"),
-    )
-    if contestant.agent in AGENTS
+CONTESTANTS = (
+    Contestant("none"),
+    Contestant("feedforward"),
+    Contestant("two-dof", "exact-kf"),
+    Contestant("lqr", "exact-kf"),
+    Contestant("esc"),
 )

@@ -44,7 +44,7 @@ def yaw_rates(done: dict[Case, Sine]) -> Any:
     t = max((found.shown.t for found in done.values()), key=len)
     whole = {k: found for k, found in done.items() if found.shown.t[-1] >= fmvss126.COMPLETION}
     series = {_label(case): _shares(found, t) for case, found in whole.items()}
-    figure = time_series("", t, series, "yaw rate / its peak after the reversal")
+    figure = time_series(t, series, "yaw rate / its peak after the reversal")
     for time, most in fmvss126.RATIOS:
         at = fmvss126.COMPLETION + time
         for level in (most, -most):
@@ -119,4 +119,4 @@ def bode(found: Transient) -> Any:
 
 
 def _label(case: Case) -> str:
-    return CONTESTANTS[case.contestant].label
+    return CONTESTANTS[case.contestant].agent

@@ -7,7 +7,7 @@ import numpy as np
 from ... import __version__
 from ...envs.vehicle.vehicle import GRAVITY
 from ..harness.results import Row, Suite, Table
-from ..harness.stats import interval, mean
+from ..harness.stats import interval
 from . import fmvss126, iso3888, iso4138, iso7401, outside
 from .cases import NAME, Case, Done, Sine, Transient, of
 from .contestants import CONTESTANTS
@@ -40,7 +40,7 @@ def _row(case: Case, metric: str, value: float, of: str = "", **more: Any) -> Ro
 
 
 def _who(case: Case) -> list[str]:
-    return [CONTESTANTS[case.contestant].label, case.car]
+    return [CONTESTANTS[case.contestant].agent, case.car]
 
 
 def _sine(suite: Suite, done: dict[Case, Sine]) -> None:
@@ -52,14 +52,8 @@ def _sine(suite: Suite, done: dict[Case, Sine]) -> None:
         failed = [run for run in result.runs if not run.passed]
         last = max(run.multiple for run in result.runs)
         verdict = f"fails at {failed[0].multiple:.3g} A: {_why(failed[0])}" if failed else "passes"
-        cells.append(
-            [
-                *_who(case),
-                f"{np.degrees(result.A):.1f}",
-                f"{result.highest:.3g} of {last:.3g}",
-                verdict,
-            ]
-        )
+        amplitude, passed = f"{np.degrees(result.A):.1f}", f"{result.highest:.3g} of {last:.3g}"
+        cells.append([*_who(case), amplitude, passed, verdict])
     note = "Both sides; the last amplitude is the larger of 6.5 A and 270 deg, at most 300 deg."
     header = ("controller", "car", "A / deg", "passes up to / A", "result")
     suite.tables.append(Table("FMVSS 126, sine with dwell", header, cells, note))
@@ -111,30 +105,24 @@ def _step(suite: Suite, done: dict[Case, Transient]) -> None:
             suite.rows.append(_row(case, "overshoot", one.overshoot, name))
             pairs = [(a, vars(other)[key]) for key, a in vars(one).items()]
             cells.append([*_who(case), name, *(f"{a:.3g} ({b:.3g})" for a, b in pairs)])
-    header = (
-        "controller",
-        "car",
-        "output",
-        "gain / (1/rad)",
-        "90 % after / s",
-        "peak after / s",
-        "overshoot",
-    )
+    header = ("output", "gain / (1/rad)", "90 % after / s", "peak after / s", "overshoot")
     note = "In brackets the linear model's under the same steering. No control."
-    suite.tables.append(Table("ISO 7401, step response", header, cells, note))
+    suite.tables.append(
+        Table("ISO 7401, step response", ("controller", "car", *header), cells, note)
+    )
 
 
 def _episodes(suite: Suite, done: dict[Case, list[outside.Episode]]) -> None:
     """Outside plants: cost and spins of each contestant."""
     cells = []
     for case, found in done.items():
-        cost, low, high = interval(np.array([each.cost for each in found]), mean)
+        cost = interval(np.array([each.cost for each in found]))
         spins = float(np.mean([each.failed for each in found]))
         more: dict[str, Any] = {"n": len(found), "salt": "fixed"}
-        suite.rows.append(_row(case, "cost", cost, low=low, high=high, **more))
+        suite.rows.append(_row(case, "cost", cost.value, low=cost.low, high=cost.high, **more))
         suite.rows.append(_row(case, "share", spins, **more))
         peak = 1e3 * float(np.median([each.peak for each in found]))
-        text = f"{cost:.3g} [{low:.3g}, {high:.3g}]"
+        text = "{:.3g} [{:.3g}, {:.3g}]".format(*cost)
         cells.append([*_who(case), text, f"{100 * spins:.0f}", f"{peak:.0f}"])
     header = ("controller", "model", "cost", "failed / %", "median peak slip / mrad")
     note = "Lane changes at 60 to 90 km/h; speed, steering, tyres and friction are drawn by seed."
@@ -149,15 +137,10 @@ def _check(suite: Suite, found: outside.Check) -> None:
     cells = []
     for who, result in (("none", found.none), ("500 N m", found.law)):
         worst = max(result.runs, key=lambda run: run.ratio_1 if run.ratio_1 < np.inf else np.inf)
-        cells.append(
-            [
-                who,
-                f"{worst.multiple:.3g}",
-                *(f"{100 * ratio:.0f}" for ratio in (worst.ratio_1, worst.ratio_2)),
-                f"{min(run.sideways for run in result.runs):.2f}",
-                "passes" if result.passed else "fails",
-            ]
-        )
+        ratios = (f"{100 * ratio:.0f}" for ratio in (worst.ratio_1, worst.ratio_2))
+        sideways = f"{min(run.sideways for run in result.runs):.2f}"
+        outcome = "passes" if result.passed else "fails"
+        cells.append([who, f"{worst.multiple:.3g}", *ratios, sideways, outcome])
         more: dict[str, Any] = {"n": len(result.runs), "verdict": verdict, "paper": text}
         suite.rows.append(_row(case, "ratio", worst.ratio_1, controller=who, **more))
     header = ("control", "amplitude / A", "at 1.00 s / %", "at 1.75 s / %", "sideways / m", "")

@@ -210,12 +210,12 @@ def _figures(result: Result, log: Log) -> list[tuple[str, Any, str]]:
     shown = [
         (
             f"{log.name}: the sideslip angle and its estimates",
-            _few(time_series("", log.time, slips, label), result),
+            _few(time_series(log.time, slips, label), result),
             HIDDEN,
         ),
         (
             f"{log.name}: where the car slips most",
-            time_series("", log.time[near], close, label),
+            time_series(log.time[near], close, label),
             f"The {2 * WINDOW:g} s around the largest sideslip angle, all estimators.",
         ),
         (
@@ -228,7 +228,7 @@ def _figures(result: Result, log: Log) -> list[tuple[str, Any, str]]:
     if truth is None:
         return shown
     errors = {name: DEGREES * (beta - truth) for name, beta in result.traces.items()}
-    figure = error_series("", log.time, errors, f"error of the {label}")
+    figure = error_series(log.time, errors, f"error of the {label}")
     shown.insert(
         2, (f"{log.name}: errors", _few(figure, result), f"Estimate minus truth. {HIDDEN}")
     )

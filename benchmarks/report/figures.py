@@ -57,7 +57,6 @@ def peaks(y: Array, limit: int = POINTS) -> npt.NDArray[np.intp]:
 
 
 def time_series(
-    title: str,
     t: Array,
     series: Mapping[str, Array],
     unit_label: str,
@@ -84,86 +83,60 @@ def time_series(
             trace.line.width = 1.0  # a dense line is noisy: leave room to see the others
         figure.add_trace(trace)
     figure.update_xaxes(range=[float(t[0]), float(t[-1])] if len(t) > 1 else None)
-    return _finish(_facts_first(figure), title, x_label, unit_label, 380, hovermode="x unified")
+    return _finish(_facts_first(figure), x_label, unit_label, 380, hovermode="x unified")
 
 
-def error_series(
-    title: str,
-    t: Array,
-    errors: Mapping[str, Array],
-    unit_label: str,
-    x_label: str = "time / s",
-    band: tuple[str, Array] | None = None,
-) -> Any:
-    """Estimate minus truth over time, around a line at zero.
-
-    Arguments as of `time_series`. band: name and half-width (n,) of a grey band around zero,
-    such as twice the bound's standard deviation.
-    """
-    figure = time_series(title, t, errors, unit_label, x_label)
+def error_series(t: Array, errors: Mapping[str, Array], unit_label: str) -> Any:
+    """Estimate minus truth over time, around a line at zero; arguments as of `time_series`."""
+    figure = time_series(t, errors, unit_label)
     figure.add_hline(y=0.0, line={"color": GREY, "width": 1}, layer="below")
-    if band is not None:
-        name, half = band[0], np.asarray(band[1], float)
-        shown = peaks(half)
-        there = np.asarray(t, float)[shown]
-        area = go.Scatter(
-            x=_single(np.concatenate([there, there[::-1]])),
-            y=_single(np.concatenate([half[shown], -half[shown][::-1]])),
-            name=name,
-            mode="lines",
-            fill="toself",
-            fillcolor="rgba(127,127,127,0.25)",
-            line={"width": 0},
-            hoverinfo="skip",
-        )
-        figure.add_trace(area)
-        figure.data = (figure.data[-1], *figure.data[:-1])
-        figure.update_layout(showlegend=True)
     return figure
 
 
-def curves(title: str, x: Array, series: Mapping[str, Array], y_label: str, x_label: str) -> Any:
-    """Lines with dots over logarithmic axes, for costs that range over decades.
+def curves(
+    x: Array,
+    series: Mapping[str, Array | tuple[Array, Array, Array]],
+    x_label: str,
+    y_label: str,
+    log: str = "",
+) -> Any:
+    """Lines with dots; series: name to values (n,), or to (value, low, high) for whiskers.
 
-    x: (n,), positive. series: name to (n,), positive. Raises ValueError for a series that is not
-    as long as x.
+    log: which axes are logarithmic, of "x", "y" and "xy". Raises ValueError for a series that is
+    not as long as x.
     """
     figure = go.Figure()
     for name, pen in line_styles(series).items():
-        if len(series[name]) != len(x):
-            raise ValueError(f"series {name!r} has {len(series[name])} values, x {len(x)}")
-        trace = _line(name, np.asarray(x, float), np.asarray(series[name], float), *pen)
-        figure.add_trace(trace.update(mode="lines+markers"))
-    figure.update_xaxes(type="log", dtick=1)
-    figure.update_yaxes(type="log", dtick=1)
-    return _finish(figure, title, x_label, y_label, 380, hovermode="x unified")
+        found = series[name]
+        value, *bounds = found if isinstance(found, tuple) else (found,)
+        if len(value) != len(x):
+            raise ValueError(f"series {name!r} has {len(value)} values, x {len(x)}")
+        trace = _line(name, np.asarray(x, float), np.asarray(value, float), *pen)
+        trace.mode = "lines+markers"
+        if bounds:
+            ends = {"array": bounds[1] - value, "arrayminus": value - bounds[0], "symmetric": False}
+            trace.error_y = {"type": "data", "color": pen[0], "thickness": 1, "width": 3, **ends}
+        figure.add_trace(trace)
+    figure.update_xaxes(**{"type": "log", "dtick": 1} if "x" in log else {})
+    figure.update_yaxes(**{"type": "log", "dtick": 1} if "y" in log else {})
+    return _finish(figure, x_label, y_label, 400, hovermode="x unified")
 
 
-def track(
-    x: Array | Mapping[str, tuple[Array, Array]],
-    y: Array | None = None,
-    title: str = "",
-    x_label: str = "x / m",
-    y_label: str = "y / m",
-) -> Any:
+def track(paths: Mapping[str, tuple[Array, Array]]) -> Any:
     """Paths seen from above, a metre as long in x as in y.
 
-    x, y: (n,) each, or one mapping from name to (x, y). Raises ValueError for unequal lengths.
+    paths: name to (x, y), (n,) each. Raises ValueError for unequal lengths.
     """
-    if not isinstance(x, Mapping):
-        if y is None:
-            raise ValueError("a track needs y, or a mapping from name to (x, y)")
-        x = {"truth": (x, y)}
     figure = go.Figure()
-    for name, colour_and_dash in line_styles(x).items():
-        across, up = (np.asarray(values, float) for values in x[name])
+    for name, colour_and_dash in line_styles(paths).items():
+        across, up = (np.asarray(values, float) for values in paths[name])
         if across.shape != up.shape:
             raise ValueError(f"track {name!r}: x has shape {across.shape}, y {up.shape}")
         shown = np.unique(np.linspace(0, len(up) - 1, min(len(up), POINTS)).round().astype(int))
         figure.add_trace(_line(name, across[shown], up[shown], *colour_and_dash))
     figure.update_yaxes(scaleanchor="x", scaleratio=1)
     height = int(np.clip(120 + 900 * _slimness(figure), 280, 640))
-    return _finish(_facts_first(figure), title, x_label, y_label, height, hovermode="closest")
+    return _finish(_facts_first(figure), "x / m", "y / m", height, hovermode="closest")
 
 
 def bars_with_interval(
@@ -173,7 +146,6 @@ def bars_with_interval(
     highs: Sequence[float],
     unit: str,
     log: bool = False,
-    title: str = "",
 ) -> Any:
     """One bar a label, the first on top, with the interval [low, high] as whiskers.
 
@@ -214,7 +186,7 @@ def bars_with_interval(
     figure = go.Figure(trace)
     figure.update_xaxes(type="log" if log else "linear")
     figure.update_yaxes(type="category", autorange="reversed", ticks="", showgrid=log)
-    return _finish(figure, title, unit, "", 100 + 34 * len(labels), hovermode="closest")
+    return _finish(figure, unit, "", 100 + 34 * len(labels), hovermode="closest")
 
 
 def _line(name: str, x: Array, y: Array, colour: str, dash: str, dots: bool = False) -> Any:
@@ -249,11 +221,9 @@ def _facts_first(figure: Any) -> Any:
     return figure
 
 
-def _finish(figure: Any, title: str, x: str, y: str, height: int, **layout: Any) -> Any:
+def _finish(figure: Any, x: str, y: str, height: int, **layout: Any) -> Any:
     legend = {"orientation": "h", "x": 0, "xanchor": "left", "y": 1.02, "yanchor": "bottom"}
     figure.update_layout(height=height, legend=legend, showlegend=len(figure.data) > 1, **layout)
     figure.update_xaxes(title_text=x, hoverformat=".4~g", automargin=True)
     figure.update_yaxes(title_text=y, hoverformat=".4~g", automargin=True)
-    if title:
-        figure.update_layout(title_text=title)
     return figure

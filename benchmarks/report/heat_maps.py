@@ -1,4 +1,4 @@
-"""The matrix to look at: heat map, price of delay, cars in motion. Needs plotly."""
+"""The matrix as a heat map, and cars in motion. Needs plotly."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -54,38 +54,6 @@ def heat_map(
     figure.update_xaxes(side="top", tickangle=-35, showgrid=False, ticks="", automargin=True)
     figure.update_yaxes(autorange="reversed", showgrid=False, ticks="", automargin=True)
     figure.update_layout(height=170 + 22 * len(names), hovermode="closest", showlegend=False)
-    return figure
-
-
-def curves(
-    x: Array,
-    series: Mapping[str, tuple[Array, Array, Array]],
-    x_label: str,
-    y_label: str,
-    log: bool = False,
-) -> Any:
-    """Lines with dots and whiskers; series: name to (value, low, high), each as long as x.
-
-    log: x on a logarithmic axis.
-    """
-    figure = go.Figure()
-    for name, (shade, dash) in line_styles(series).items():
-        value, low, high = series[name]
-        bars = {"array": high - value, "arrayminus": value - low, "symmetric": False, "width": 3}
-        figure.add_trace(
-            go.Scatter(
-                x=x,
-                y=value,
-                name=name,
-                mode="lines+markers",
-                line={"color": shade, "dash": dash},
-                error_y={"type": "data", "color": shade, "thickness": 1} | bars,
-            )
-        )
-    legend = {"orientation": "h", "x": 0, "y": 1.02, "yanchor": "bottom"}
-    figure.update_layout(height=420, legend=legend, hovermode="x unified")
-    figure.update_xaxes(title_text=x_label, automargin=True, type="log" if log else "linear")
-    figure.update_yaxes(title_text=y_label, automargin=True)
     return figure
 
 

@@ -229,7 +229,6 @@ def _draw(suite: Suite, lines: dict[str, list[float]]) -> None:
     except ModuleNotFoundError:
         return
     figure = time_series(
-        "",
         np.array(FRAMES, float),
         {rule: np.array(line) for rule, line in lines.items()},
         "cost of a tick over that without delay",

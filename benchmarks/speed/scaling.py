@@ -125,6 +125,6 @@ def _draw(suite: Suite, x_label: str, x: Any, lines: Mapping[str, Any], text: st
         from ..report.figures import curves
     except ModuleNotFoundError:
         return
-    figure = curves("", x, lines, "CPU time of an env-step / us", x_label)
+    figure = curves(x, lines, x_label, "CPU time of an env-step / us", "xy")
     title = f"Cost of an env-step against {x_label.partition(' /')[0]}"
     suite.figures.append((title, figure, text))

@@ -1,13 +1,13 @@
 """Controllers over the same manoeuvre, and what they leave of the slip."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from ....agents import make_agent
-from ....agents.rollout import rollout
+from ....agents.rollout import Rollout, rollout
 from ...harness.parallel import chunked
 from . import lane_change, tracking
 from .claim import Array, Example, Measured
@@ -36,21 +36,9 @@ class Slip:
 
     def measure(self, seeds: tuple[int, ...]) -> Measured:
         """Drive every contestant on each seed."""
-        lines, example = [], None
-        for seed in seeds:
-            numbers: Numbers = {}
-            curves: dict[str, dict[str, Array]] = {}
-            time = np.zeros(0)
-            for label in self.contestants:
-                time, curves[label], limit = self._drive(label, seed)
-                numbers |= _effort(label, curves[label]["beta"], curves[label]["yaw_moment"], limit)
-            lines.append(numbers)
-            if seed == FIRST:
-                example = Example(time, curves)
-        return Measured(stacked(lines), example)
+        return _measured(seeds, self.contestants, self._drive)
 
-    def _drive(self, label: str, seed: int) -> tuple[Array, dict[str, Array], float]:
-        """Times, signals, and the yaw moment's limit in N m."""
+    def _drive(self, label: str, seed: int) -> tuple[Rollout, dict[str, float]]:
         known = {contestant.label: contestant for contestant in lane_change.CONTESTANTS}
         contestant = known[label.partition(",")[0]]
         env = lane_change.make_env(self.scenario, contestant)
@@ -59,18 +47,39 @@ class Slip:
             options["rate"] = contestant.rate
         drive = rollout(env, make_agent(contestant.agent, env, **options), seed)
         base: Any = env.unwrapped
-        return drive["t"], {name: drive[name] for name in SIGNALS}, base.vehicle.yaw_moment_limit
+        return drive, _effort(drive["beta"], drive["yaw_moment"], base.vehicle.yaw_moment_limit)
 
 
-def _effort(label: str, slip: Array, moment: Array, limit: float) -> Numbers:
+def _effort(slip: Array, moment: Array, limit: float) -> dict[str, float]:
     change = np.abs(np.diff(moment))
     return {
-        (label, "rms_slip"): rms(slip),
-        (label, "peak_slip"): float(np.max(np.abs(slip))),
-        (label, "largest_step"): float(np.max(change)),
-        (label, "total_variation"): float(np.sum(change)),
-        (label, "saturation"): float(np.mean(np.abs(moment) >= 0.999 * limit)),
+        "rms_slip": rms(slip),
+        "peak_slip": float(np.max(np.abs(slip))),
+        "largest_step": float(np.max(change)),
+        "total_variation": float(np.sum(change)),
+        "saturation": float(np.mean(np.abs(moment) >= 0.999 * limit)),
     }
+
+
+def _measured(
+    seeds: tuple[int, ...],
+    labels: Iterable[str],
+    drive: Callable[[str, int], tuple[Rollout, dict[str, float]]],
+) -> Measured:
+    """The numbers of every contestant on each seed, and the signals of the first seed."""
+    lines, example = [], None
+    for seed in seeds:
+        numbers: Numbers = {}
+        curves: dict[str, dict[str, Array]] = {}
+        for label in labels:
+            driven, found = drive(label, seed)
+            numbers |= {(label, name): value for name, value in found.items()}
+            curves[label] = {name: driven[name] for name in SIGNALS}
+        lines.append(numbers)
+        if seed == FIRST:
+            curves["reference"] = {name: driven[f"{name}_ref"] for name in ("beta", "gamma")}
+            example = Example(driven["t"], curves)
+    return Measured(stacked(lines), example)
 
 
 @dataclass(frozen=True)
@@ -92,19 +101,9 @@ class Following:
 
     def measure(self, seeds: tuple[int, ...]) -> Measured:
         """Drive every agent on each seed."""
-        lines, example = [], None
-        for seed in seeds:
-            numbers: Numbers = {}
-            curves: dict[str, dict[str, Array]] = {}
-            time = np.zeros(0)
-            for label, options in self.agents.items():
-                drive = tracking.drive(seed, self.scenario, **options)
-                found = tracking.tracking(drive)
-                numbers |= {(label, name): float(value) for name, value in vars(found).items()}
-                time = drive["t"]
-                curves[label] = {name: drive[name] for name in SIGNALS}
-                curves["reference"] = {name: drive[f"{name}_ref"] for name in ("beta", "gamma")}
-            lines.append(numbers)
-            if seed == FIRST:
-                example = Example(time, curves)
-        return Measured(stacked(lines), example)
+        return _measured(seeds, self.agents, self._drive)
+
+    def _drive(self, label: str, seed: int) -> tuple[Rollout, dict[str, float]]:
+        drive = tracking.drive(seed, self.scenario, **self.agents[label])
+        found = vars(tracking.tracking(drive))
+        return drive, {name: float(value) for name, value in found.items()}

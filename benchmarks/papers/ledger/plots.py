@@ -38,7 +38,7 @@ def curves(
         shown = [name for name in who or example.curves if signal in example.curves.get(name, {})]
         inside = _inside(example.time, window)
         series = {name: example.curves[name][signal][inside] for name in shown}
-        return time_series("", example.time[inside], series, y_label, x_label)
+        return time_series(example.time[inside], series, y_label, x_label)
 
     return draw
 
@@ -50,7 +50,7 @@ def loops(y_label: str) -> Draw:
         from ...report.figures import time_series
 
         series = {name: signals["magnitude"] for name, signals in example.curves.items()}
-        figure = time_series("", example.time, series, y_label, "frequency / Hz")
+        figure = time_series(example.time, series, y_label, "frequency / Hz")
         ends = np.log10(example.time[[0, -1]])
         figure.update_xaxes(type="log", range=[float(end) for end in ends])
         return figure
@@ -68,7 +68,7 @@ def course(y_label: str, who: Sequence[str], window: tuple[float, float] | None 
         series = {name: example.curves[name]["psi"] + example.curves[name]["beta"] for name in who}
         series["measured"] = samples(example, "gps", 0, "arrived")
         shown = {name: signal[inside] for name, signal in series.items()}
-        return time_series("", example.time[inside], shown, y_label, dots=("measured",))
+        return time_series(example.time[inside], shown, y_label, dots=("measured",))
 
     return draw
 
@@ -100,7 +100,7 @@ def measured_offset(y_label: str, who: Sequence[str], window: tuple[float, float
         inside = _inside(example.time, window)
         series = {name: example.curves[name]["y_l"][inside] for name in who}
         series["measured, held"] = held(samples(example, "camera", 1, "arrived"))[inside]
-        return time_series("", example.time[inside], series, y_label)
+        return time_series(example.time[inside], series, y_label)
 
     return draw
 
@@ -114,7 +114,7 @@ def delays(example: Example) -> Any:
     ticks = packets[:, PACKET.captured].astype(int)
     late[ticks] = packets[:, PACKET.arrived] - packets[:, PACKET.captured]
     inside = _inside(example.time, (0.0, 1.0))
-    return time_series("", example.time[inside], {"camera": held(late)[inside]}, "delay / ms")
+    return time_series(example.time[inside], {"camera": held(late)[inside]}, "delay / ms")
 
 
 def _inside(time: Array, window: tuple[float, float] | None) -> Any:

@@ -126,8 +126,8 @@ def estimator_loop(vehicle: Vehicle, design: LoopDesign, dt: float) -> "StateSpa
     """Plant, Kalman filter and PI, opened where the yaw moment enters the plant.
 
     The filter's input is the moment that the PI asks for: opened behind both, a filter with the
-    right model would not show in the loop at all. It has its steady gain and the PI reads the estimate
-    after the correction.
+    right model would not show in the loop at all. It has its steady gain and the PI reads the
+    estimate after the correction.
     """
     import control
 

@@ -78,13 +78,13 @@ def drawn() -> list[tuple[str, Any, str]]:
         ("The same on a log axis", figures.bars_with_interval(names, *bars, log=True), ""),
         (
             "The sideslip angle",
-            figures.time_series("", t, course, label, dots=["camera"]),
+            figures.time_series(t, course, label, dots=["camera"]),
             f"The paper's figure, redrawn: {HOSTILE}",
         ),
         (
             "Errors (seed 0)",
-            figures.error_series("", t, errors, f"error of the {label}", band=("bound", 2 + 0 * t)),
-            "Estimate minus truth; grey: twice the bound's standard deviation.",
+            figures.error_series(t, errors, f"error of the {label}"),
+            "Estimate minus truth.",
         ),
         ("The track", figures.track(paths), "Dead reckoning with each estimate."),
     ]
@@ -92,6 +92,7 @@ def drawn() -> list[tuple[str, Any, str]]:
 
 def matrix() -> Suite:
     """What only the matrix has: a heat map, a figure with menus, cars in motion, a file."""
+    figures = pytest.importorskip("sideslip.benchmarks.report.figures")
     pictures = pytest.importorskip("sideslip.benchmarks.report.heat_maps")
     t = np.linspace(0.0, 8.0, 801)
     cells = {
@@ -113,7 +114,7 @@ def matrix() -> Suite:
         "Made up.",
         figures=[
             ("Scores", pictures.heat_map(["none", "lqr"], ["gust", HOSTILE, "x"], values, "s"), ""),
-            ("Delay", pictures.curves(delays, {"lqr": line}, "delay / ms", "score"), ""),
+            ("Delay", figures.curves(delays, {"lqr": line}, "delay / ms", "score"), ""),
             ("In motion", cars, ""),
         ],
         explorers=[Explorer("Any cell", ("manoeuvre", "controller"), cells, panels, "One seed.")],
