@@ -26,10 +26,7 @@ from .estimates import Estimates, UnobservableWarning
 
 Array = npt.NDArray[np.float64]
 
-
 CHECKED_SPEEDS = (3.0, 7.0, 14.0)  # m/s, where a filter without a fixed speed is checked
-
-
 _EMPTY = np.zeros((0, 0))
 _NO_NIS = np.zeros(0)
 _NO_PACKETS = np.zeros((0, PACKET_WIDTH))

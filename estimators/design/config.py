@@ -15,10 +15,10 @@ from ..core.memory import KNOTS
 from ..filters import Filter
 from . import dual_rate
 from .checks import check_covariance
+from .kalman import INVERSES
 from .measurements import COURSE_SPEED, MEASUREMENTS
 from .models import DISTURBANCES, MODELS, STATES, Model, bicycle_model
 from .options import Options
-from .pseudo_gains import INVERSES
 from .tunings import TUNINGS
 
 Array = npt.NDArray[np.float64]

@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 
 from . import kalman
-from .kalman import Array
+from .kalman import Array, inverse
 from .pole_placement import observer_gain
-from .pseudo_gains import inverse
 
 RULES = ("predict", "hold", "oh", "pseudo")
 GAINS = ("constant", "from-29", "placed")

@@ -1,4 +1,4 @@
-"""The Kalman filter in textbook letters: what the designs, the Riccati limit and the tests use.
+"""The Kalman filter in textbook letters, and the generalised inverses that pseudo-residuals need.
 
 Shapes: x (n,), P (n, n), F (n, n), Q (n, n), C (p, n), R (p, p), y (p,).
 """
@@ -7,6 +7,9 @@ import numpy as np
 import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
+
+RIDGE = 1e-3  # lambda of Tikhonov's inverse, in SI units squared
+INVERSES = ("moore-penrose", "p-weighted", "tikhonov", "bayes")
 
 
 def predict(x: Array, P: Array, F: Array, Q: Array) -> tuple[Array, Array]:
@@ -39,3 +42,31 @@ def joseph(P: Array, K: Array, C: Array, R: Array) -> Array:
     rest = np.eye(len(P)) - K @ C
     after: Array = rest @ P @ rest.T + K @ R @ K.T
     return after
+
+
+def inverse(kind: str, C: Array, P: Array, R: Array) -> Array:
+    """The generalised inverse of C (p, n) that (20) needs; (n, p).
+
+    C has full row rank only, so C^T C of the printed (20) is singular; the Moore-Penrose inverse is
+    C^T (C C^T)^-1. "p-weighted" weighs by the covariance P (n, n), "tikhonov" is regularised,
+    "bayes" is the mean of the error given the residual, P C^T (C P C^T + R)^-1: for an optimal gain
+    it leaves nothing to correct between the samples.
+    """
+    I, zero = np.eye(C.shape[1]), np.zeros((len(C), len(C)))  # noqa: E741
+    if kind == "moore-penrose":
+        return gain(I, C, zero)
+    if kind == "p-weighted":
+        return gain(P, C, zero)
+    if kind == "bayes":
+        return gain(P, C, R)
+    return gain(I, C, RIDGE * np.eye(len(C)))
+
+
+def constant_gain(K_fast: Array, K_slow: Array, steps: int) -> Array:
+    """One gain for every tick from the multirate filter's gains over a period, (N, m + p).
+
+    K_fast: (steps, m, N) gains of the fast rows. K_slow: (p, N), the joint gain of the slow rows at
+    a sample. Every tick of the frame corrects by a pseudo-residual, so each takes its even share of
+    the gain that the multirate filter applies at once.
+    """
+    return np.column_stack([K_fast.mean(0).T, K_slow.T / steps])

@@ -19,9 +19,8 @@ from ..core.memory import Filters, Gains, Memory, Row
 from ..core.run import begin, begin_all, tick
 from .config import FilterConfig
 from .dual_rate import shares_of, write_shares
-from .kalman import Array
+from .kalman import Array, constant_gain, inverse
 from .pole_placement import place, transition_matrix
-from .pseudo_gains import constant_gain, inverse
 from .schedule import Schedule
 
 SETTLED = 1e-12
