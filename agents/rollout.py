@@ -71,24 +71,15 @@ def costs_of(
     return costs
 
 
-INFO_UNITS = {
-    "t": "s",
-    "beta": "rad",
-    "gamma": "rad/s",
-    "psi": "rad",
-    "beta_ref": "rad",
-    "gamma_ref": "rad/s",
-    "steer": "rad",
-    "yaw_moment": "N m",
-    "cost": "-",
-    "failure": "-",
-    "v_x": "m/s",
-    "v_y": "m/s",
-    "phi": "rad",
-    "y_l": "m",
-    "X": "m",
-    "Y": "m",
+_UNITS = {
+    "s": "t",
+    "rad": "beta psi beta_ref steer phi",
+    "rad/s": "gamma gamma_ref",
+    "N m": "yaw_moment",
+    "m/s": "v_x v_y",
+    "m": "y_l X Y",
 }
+INFO_UNITS = {name: unit for unit, names in _UNITS.items() for name in names.split()}
 TRUTH = ("beta", "gamma", "psi", "v_x", "v_y", "phi", "y_l")
 """The true states in a log, named as estimators name them."""
 

@@ -2,6 +2,7 @@
 held on curved roads from camera and gyro, the aim of uneven-delay."""
 
 from dataclasses import dataclass
+from functools import partial
 from itertools import islice
 from typing import Any
 
@@ -123,13 +124,10 @@ def run(
     cases = [Case(K, seed) for K in (0.0, *BANDWIDTHS) for seed in range(seeds)]
     found = np.array(run_cases(follow, cases, "bandwidth", jobs, console))
     _bandwidths(suite, found.reshape(len(BANDWIDTHS) + 1, seeds, -1))
-    lanes = run_cases(_keeper, [(k, cars) for k in range(len(KEEPERS))], "lanes", jobs, console)
+    keep = partial(keep_lane, cars=cars)
+    lanes = run_cases(keep, range(len(KEEPERS)), "lanes", jobs, console)
     _lanes(suite, lanes)
     return suite
-
-
-def _keeper(case: tuple[int, int]) -> Array:
-    return keep_lane(*case)
 
 
 _COLUMNS = {  # what `follow` gives, and what the figure calls it

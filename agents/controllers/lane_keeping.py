@@ -153,11 +153,7 @@ class LaneKeeping(Controller):
     memory = len(Memory._fields)
 
     def __init__(
-        self,
-        env: AnyEnv,
-        moment: bool = True,
-        curvature_time: float = 0.3,
-        haste: float = HASTE,
+        self, env: AnyEnv, moment: bool = True, curvature_time: float = 0.3, haste: float = HASTE
     ) -> None:
         super().__init__(env)
         if self.width != 2:

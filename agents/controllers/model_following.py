@@ -120,10 +120,7 @@ class ModelFollowing(Controller):
     memory = len(Memory._fields)
 
     def __init__(
-        self,
-        env: AnyEnv,
-        bandwidth: Sequence[float] = BANDWIDTH,
-        rejection: bool = True,
+        self, env: AnyEnv, bandwidth: Sequence[float] = BANDWIDTH, rejection: bool = True
     ) -> None:
         instead = {} if "gamma_hat" in entries_of(env) else {"gamma_hat": "gyro"}
         if not rejection:  # whatever stands there is multiplied by zero

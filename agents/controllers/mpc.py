@@ -59,11 +59,7 @@ class Mpc(Lqr):
     """
 
     def __init__(
-        self,
-        env: AnyEnv,
-        horizon: int = 30,
-        iterations: int = 20000,
-        disturbance_time: float = 0.3,
+        self, env: AnyEnv, horizon: int = 30, iterations: int = 20000, disturbance_time: float = 0.3
     ) -> None:
         try:
             import osqp

@@ -59,9 +59,7 @@ def gain_table(
     shape = len(speeds), max(len(fronts), 1), max(len(rears), 1)
     gains = []
     for speed, front, rear in itertools.product(
-        speeds,
-        fronts or (vehicle.front_stiffness,),
-        rears or (vehicle.rear_stiffness,),
+        speeds, fronts or (vehicle.front_stiffness,), rears or (vehicle.rear_stiffness,)
     ):
         car = vehicle.replace(front_stiffness=front, rear_stiffness=rear)
         gains.append(np.hstack(regulator(design_model(car, speed, purpose))))

@@ -65,11 +65,7 @@ def _capped(vehicle: Vehicle, k_p: float) -> float:
 
 
 def sample_pi(
-    vehicle: Vehicle,
-    speed: float,
-    period: float,
-    pole: float = POLE,
-    placement: str = "radius",
+    vehicle: Vehicle, speed: float, period: float, pole: float = POLE, placement: str = "radius"
 ) -> PI:
     """`design_pi` for a loop sampled every `period` seconds, with the moment held between.
 

@@ -18,11 +18,7 @@ from .output import give, show_episode
 from .train import train_command
 from .tune import tune_app
 
-app = typer.Typer(
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-)
+app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 app.add_typer(tune_app, name="tune")
 app.command("calibrate")(calibrate_command)
 app.command("enjoy")(enjoy_command)

@@ -13,23 +13,12 @@ MANOEUVRES = tuple(name for name, scenario in SCENARIOS.items() if scenario.scor
 
 TRUTH, REFERENCE_FILTER, REFERENCE_CONTROLLER = "truth", "exact-kf", "two-dof"
 ESTIMATORS = (
-    "bicycle-kf",
-    "single-rate-kf",
-    "multirate-residual-kf",
-    "uneven-delay-kf",
-    "dakf",
-    REFERENCE_FILTER,
-    TRUTH,
+    *("bicycle-kf", "single-rate-kf", "multirate-residual-kf", "uneven-delay-kf", "dakf"),
+    *(REFERENCE_FILTER, TRUTH),
 )
 OTHER_ESTIMATORS = (
-    "multirate-kf",
-    "constant-delay-kf",
-    "vision-only-kf",
-    "course-kf",
-    "double-layer",
-    "dual-rate",
-    "lob",
-    "lob-2",
+    *("multirate-kf", "constant-delay-kf", "vision-only-kf", "course-kf", "double-layer"),
+    *("dual-rate", "lob", "lob-2"),
 )
 BLIND = ("none", "feedforward")
 """Controllers that ignore the estimate: one cell a manoeuvre."""

@@ -19,13 +19,8 @@ DELAYS = (0.0, 0.03, 0.06, 0.1, 0.15, 0.2, 0.25, 0.3)  # s, of camera and GPS al
 FRAME = 0.05  # s: so slow that a camera's frames 0.3 s late find room under way
 SCENARIO = "random-steering"
 CONTESTANTS = (
-    ("none", ""),
-    (INFORMED, ""),
-    ("two-dof", "multirate-kf"),
-    ("two-dof", "exact-kf"),
-    ("lqr", "single-rate-kf"),
-    ("lqr", "dakf"),
-    ("lqr", "exact-kf"),
+    *(("none", ""), (INFORMED, ""), ("two-dof", "multirate-kf"), ("two-dof", "exact-kf")),
+    *(("lqr", "single-rate-kf"), ("lqr", "dakf"), ("lqr", "exact-kf")),
 )
 
 

@@ -19,14 +19,8 @@ FIXED = ", R of HDOP 1"
 _ENV = "sideslip/YawGps-v0"
 _HDOP = {"hdop_table": FILTERS["double-layer"].hdop}
 # a tuning of its own, found as those of estimators/design/tunings.toml, seeds 1000 to 1011 of FIG9
-_PREDICTED = {
-    "intersample": "predict",
-    "q_beta": 1.1e-4,
-    "q_gamma": 2.4e-6,
-    "q_psi": 2.3e-5,
-    "q_d1": 0.089,
-    "q_d2": 0.46,
-}
+_Q = {"q_beta": 1.1e-4, "q_gamma": 2.4e-6, "q_psi": 2.3e-5, "q_d1": 0.089, "q_d2": 0.46}
+_PREDICTED = {"intersample": "predict", **_Q}
 _FILTERS = (
     Filter(PROPOSED, PROPOSED, _HDOP),
     Filter(WALKS, PROPOSED, {**_PREDICTED, **_HDOP}),

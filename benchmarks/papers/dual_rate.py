@@ -15,31 +15,13 @@ _ENV = "sideslip/YawGps-v0"
 # every rule has a tuning of its own, found by Nelder-Mead on the logarithms on seeds 1000 to 1011
 # of FIG4; they hold there, at other speeds and rates of the GPS they may diverge
 _TUNED = {
-    PSEUDO: {
-        "q_beta": 1.9e-5,
-        "q_gamma": 1.5e-7,
-        "q_psi": 5.5e-4,
-        "q_d1": 1.1e-7,
-        "q_d2": 35.0,
-        "q_d3": 6e-2,
-    },
-    CONVENTIONAL: {
-        "q_beta": 1.1e-7,
-        "q_gamma": 1.4e-2,
-        "q_psi": 5.4e-8,
-        "q_d1": 3.7e-8,
-        "q_d2": 3.4,
-        "q_d3": 9.8e-3,
-    },
-    HOLDING: {
-        "q_beta": 9.6e-6,
-        "q_gamma": 1.2e-2,
-        "q_psi": 2.7e-8,
-        "q_d1": 2e-8,
-        "q_d2": 7.6,
-        "q_d3": 2e-2,
-    },
-    PLAIN: {"q_beta": 2.2e-4, "q_gamma": 1e-8, "q_psi": 1e-8},
+    rule: dict(zip(("q_beta", "q_gamma", "q_psi", "q_d1", "q_d2", "q_d3"), q, strict=False))
+    for rule, q in (
+        (PSEUDO, (1.9e-5, 1.5e-7, 5.5e-4, 1.1e-7, 35.0, 6e-2)),
+        (CONVENTIONAL, (1.1e-7, 1.4e-2, 5.4e-8, 3.7e-8, 3.4, 9.8e-3)),
+        (HOLDING, (9.6e-6, 1.2e-2, 2.7e-8, 2e-8, 7.6, 2e-2)),
+        (PLAIN, (2.2e-4, 1e-8, 1e-8)),
+    )
 }
 _FILTERS = (
     Filter(CONVENTIONAL, "dual-rate", {"intersample": "predict", **_TUNED[CONVENTIONAL]}),
@@ -48,10 +30,7 @@ _FILTERS = (
     Filter(PLAIN, "dual-rate", {"intersample": "predict", "disturbances": "none", **_TUNED[PLAIN]}),
 )
 
-SIMULATIONS = (
-    Estimation(FIG4, _ENV, FIG4, _FILTERS),
-    Estimation(FIG5, _ENV, FIG5, _FILTERS),
-)
+SIMULATIONS = (Estimation(FIG4, _ENV, FIG4, _FILTERS), Estimation(FIG5, _ENV, FIG5, _FILTERS))
 
 
 def _order(scenario: str, most: float | None) -> tuple[Part, ...]:

@@ -8,6 +8,7 @@ from rich.console import Console
 from ... import __version__
 from ..harness.parallel import run_cases
 from ..harness.results import VERDICTS, Row, Suite, Table
+from ..harness.stats import Estimate
 from .claims import CLAIMS, FIGURES, SIMULATIONS
 from .ledger.claim import Claim, Found, Measured, Results, find, verdict
 from .ledger.simulations import joined
@@ -135,20 +136,11 @@ def _met(found: tuple[Found, ...]) -> str:
 
 def _row(claim: Claim, found: Found, judged: str) -> Row:
     """low and high are the range over the seeds."""
-    return Row(
-        NAME,
-        found.part.scenario,
-        found.part.metric,
-        found.median,
-        estimator=found.part.label,
-        low=found.low,
-        high=found.high,
-        n=len(found.values),
-        salt="fixed",
-        env_version=__version__,
-        verdict=judged,
-        paper=f"{_where(claim)}: {claim.text}",
-    )
+    number = Estimate(found.median, found.low, found.high)
+    where = {"suite": NAME, "scenario": found.part.scenario, "estimator": found.part.label}
+    paper = f"{_where(claim)}: {claim.text}"
+    common = {"salt": "fixed", "env_version": __version__, "verdict": judged, "paper": paper}
+    return Row.of(found.part.metric, number, n=len(found.values), **where, **common)
 
 
 def _draw(suite: Suite, results: Results) -> None:

@@ -9,42 +9,17 @@ INK = "#000000"
 GREY = "#7F7F7F"
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 
-COLOURS = {
-    "truth": INK,
-    "true": INK,
-    "reference": INK,
-    "bound": INK,
-    "none": GREY,
-    "measured": GREY,
-    "bicycle-kf": GREY,
-    "gyro-only": GREY,
-    "single-rate": "#D55E00",
-    "single-rate-kf": "#D55E00",
-    "multirate": "#0072B2",
-    "multirate-kf": "#0072B2",
-    "multirate-residual": "#009E73",
-    "multirate-residual-kf": "#009E73",
-    "course-kf": "#CC79A7",
-    "dakf": "#E69F00",
-    "exact-kf": "#56B4E9",
-    "uneven-delay-kf": "#009E73",
-    "constant-delay-kf": "#D55E00",
-    "vision-only-kf": "#56B4E9",
-    "double-layer": "#0072B2",
-    "lob": "#D55E00",
-    "lob-2": "#D55E00",
-    "roll-kf": "#CC79A7",
-    "kinematic-velocity-kf": "#E69F00",
-    "conventional": "#E69F00",
-    "innovation holding": "#CC79A7",
-    "pseudo measurement": "#0072B2",
-    "pseudo-residuals": "#009E73",
-    "without control": GREY,
-    "with control": "#0072B2",
-    "ideal": INK,
-    "feedforward": "#E69F00",
-    "two-dof": "#CC79A7",
+_NAMES = {
+    INK: "truth, true, reference, bound, ideal",
+    GREY: "none, measured, bicycle-kf, gyro-only, without control",
+    "#D55E00": "single-rate, single-rate-kf, constant-delay-kf, lob, lob-2",
+    "#0072B2": "multirate, multirate-kf, double-layer, pseudo measurement, with control",
+    "#009E73": "multirate-residual, multirate-residual-kf, uneven-delay-kf, pseudo-residuals",
+    "#CC79A7": "course-kf, roll-kf, innovation holding, two-dof",
+    "#E69F00": "dakf, kinematic-velocity-kf, conventional, feedforward",
+    "#56B4E9": "exact-kf, vision-only-kf",
 }
+COLOURS = {name: shade for shade, names in _NAMES.items() for name in names.split(", ")}
 """Estimators, controllers and facts by name."""
 
 FACTS = ("truth", "true")

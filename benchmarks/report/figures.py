@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from .colours import COLOURS, FACTS, GREY, INK, colour, line_styles
+from .colours import FACTS, GREY, INK, colour, line_styles
 
 try:
     from plotly import graph_objects as go
@@ -19,16 +19,6 @@ except ModuleNotFoundError as error:
     raise ModuleNotFoundError(
         "figures need plotly: pip install 'sideslip[report]'", name=error.name
     ) from error
-
-__all__ = [
-    "COLOURS",
-    "bars_with_interval",
-    "colour",
-    "curves",
-    "error_series",
-    "time_series",
-    "track",
-]
 
 Array = npt.NDArray[np.floating[Any]]
 

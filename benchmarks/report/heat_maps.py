@@ -113,10 +113,7 @@ def _view(paths: Mapping[str, tuple[Array, Array, Array]], k: int) -> dict[str, 
     x, y = max(ends)
     low, high = float(x) - 0.7 * _WINDOW[0], float(x) + 0.3 * _WINDOW[0]
     half = 0.5 * _WINDOW[1]
-    return {
-        "xaxis": {"range": [low, high]},
-        "yaxis": {"range": [float(y) - half, float(y) + half]},
-    }
+    return {"xaxis": {"range": [low, high]}, "yaxis": {"range": [float(y) - half, float(y) + half]}}
 
 
 def _cars(

@@ -1,7 +1,7 @@
 """The report: what the suites found as one HTML file that needs nothing from the network.
 
-The page's looks are in `report.css`, what it does in `report.js` and `explorer.js`, all beside this
-module and copied into the page. The page's own policy forbids it to load anything.
+The page is `page.html`, its looks `report.css`, what it does `report.js` and `explorer.js`, all
+beside this module and put together into one file. The page's own policy forbids it to load more.
 """
 
 import base64
@@ -19,53 +19,6 @@ from typing import Any
 from ..harness.results import Suite, Table, write_text
 from .colours import INK, base, colour
 
-_PAGE = Template("""\
-<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta http-equiv="Content-Security-Policy" content="default-src 'none'; \
-script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data: blob:; \
-form-action 'none'; base-uri 'none'">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<meta name="color-scheme" content="light dark">
-<link rel="icon" href="data:,">
-<title>sideslip: $suites</title>
-<style>
-$css
-</style>
-</head>
-<body>
-<header>
-<h1>sideslip</h1>
-<p class="lead">sideslip compares estimators and controllers for the lateral stability of electric
-vehicles with in-wheel motors, in simulation and on recorded drives. It asks which of them, with
-the sensors a real car has (a fast gyro, a slow late camera, a slower GPS), keeps the car closest
-to where it should be, and how far that is from the best possible.</p>
-<pre class="command"><code>$command</code></pre>
-<p class="made">$made</p>
-</header>
-<nav aria-label="Contents"><ol>
-$contents
-</ol></nav>
-<main>
-<noscript><p class="note">Without JavaScript the tables are complete, but cannot be sorted, and
-the figures are missing.</p></noscript>
-<section id="summary">
-<h2>What wins</h2>
-$summary
-</section>
-$sections
-</main>
-<footer>A click on a column's header sorts by it: up, down, as written. A click on a figure's
-legend hides a line, a double click shows it alone.</footer>
-$plotly<script>
-$js
-</script>
-</body>
-</html>
-""")
-
 
 def write_report(
     path: str | Path, suites: list[Suite], command: str, environment: Mapping[str, str]
@@ -81,7 +34,7 @@ def write_report(
         raise ValueError("a report needs at least one suite")
     made = {"made": datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z"), **environment}
     drawn = any(suite.figures or suite.explorers for suite in suites)
-    page = _PAGE.substitute(
+    page = Template(_beside("page.html") + "\n").substitute(
         suites=", ".join(escape(suite.name) for suite in suites),
         css=_beside("report.css"),
         js=_beside("report.js") + "\n\n" + _beside("explorer.js"),

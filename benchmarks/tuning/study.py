@@ -93,10 +93,7 @@ def search(
         done = _finished(study, task)
         path = str(Path(folder) / "drives")
         joblib.dump(list(drives), path)
-        with (
-            progress(console) as bar,
-            joblib.Parallel(n_jobs=min(jobs or cores(), BATCH)) as pool,
-        ):
+        with progress(console) as bar, joblib.Parallel(n_jobs=min(jobs or cores(), BATCH)) as pool:
             shown = bar.add_task(_best_text(study), total=trials, completed=len(done))
             while len(done) < trials:
                 batch = [study.ask(space) for _ in range(min(BATCH, trials - len(done)))]

@@ -213,20 +213,11 @@ def measured(
 
 def ratio(scenario: str, one: str, other: str, metric: str = "beta") -> Callable[[Results], Array]:
     """One's number over the other's, seed by seed."""
-
-    def of(results: Results) -> Array:
-        numbers = results[scenario].numbers
-        return np.asarray(numbers[one, metric] / numbers[other, metric])
-
-    return of
+    return over_others(scenario, one, (other,), np.min, metric)
 
 
 def over_others(
-    scenario: str,
-    one: str,
-    others: Sequence[str],
-    pick: Callable[..., Array],
-    metric: str = "beta",
+    scenario: str, one: str, others: Sequence[str], pick: Callable[..., Array], metric: str = "beta"
 ) -> Callable[[Results], Array]:
     """One's number over the best (pick: np.min) or the poorest (np.max) of the others'."""
 
@@ -240,12 +231,7 @@ def over_others(
 
 
 def smaller(
-    label: str,
-    scenario: str,
-    one: str,
-    other: str,
-    most: float | None = None,
-    metric: str = "beta",
+    label: str, scenario: str, one: str, other: str, most: float | None = None, metric: str = "beta"
 ) -> Part:
     """The paper has one's number smaller than the other's; most: the ratio's threshold."""
     threshold = None if most is None else Bound("<=", most)

@@ -1,6 +1,6 @@
 """The papers' figures from an example's signals: axes and curves as the papers have them."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,6 +23,22 @@ class PaperFigure:
     caption: str
 
 
+def _lines(
+    example: Example,
+    series: Mapping[str, Array],
+    y_label: str,
+    window: tuple[float, float] | None = None,
+    **more: Any,
+) -> Any:
+    """Lines over time, in a window (s) of it; more: of `time_series`."""
+    from ...report.figures import time_series
+
+    t = example.time
+    inside = (t >= window[0]) & (t <= window[1]) if window else np.ones(len(t), bool)
+    shown = {name: signal[inside] for name, signal in series.items()}
+    return time_series(t[inside], shown, y_label, **more)
+
+
 def curves(
     signal: str,
     y_label: str,
@@ -33,12 +49,9 @@ def curves(
     """A signal of everybody (or of those named) over time. window: s, of the time axis."""
 
     def draw(example: Example) -> Any:
-        from ...report.figures import time_series
-
-        shown = [name for name in who or example.curves if signal in example.curves.get(name, {})]
-        inside = _inside(example.time, window)
-        series = {name: example.curves[name][signal][inside] for name in shown}
-        return time_series(example.time[inside], series, y_label, x_label)
+        signals = {name: example.curves.get(name, {}) for name in who or example.curves}
+        series = {name: each[signal] for name, each in signals.items() if signal in each}
+        return _lines(example, series, y_label, window, x_label=x_label)
 
     return draw
 
@@ -47,10 +60,8 @@ def loops(y_label: str) -> Draw:
     """Open loops over frequency in Hz, on a logarithmic axis."""
 
     def draw(example: Example) -> Any:
-        from ...report.figures import time_series
-
         series = {name: signals["magnitude"] for name, signals in example.curves.items()}
-        figure = time_series(example.time, series, y_label, "frequency / Hz")
+        figure = _lines(example, series, y_label, x_label="frequency / Hz")
         ends = np.log10(example.time[[0, -1]])
         figure.update_xaxes(type="log", range=[float(end) for end in ends])
         return figure
@@ -58,17 +69,13 @@ def loops(y_label: str) -> Draw:
     return draw
 
 
-def course(y_label: str, who: Sequence[str], window: tuple[float, float] | None = None) -> Draw:
+def course(y_label: str, who: Sequence[str]) -> Draw:
     """The course psi + beta: the truth, the receiver's samples and each filter's."""
 
     def draw(example: Example) -> Any:
-        from ...report.figures import time_series
-
-        inside = _inside(example.time, window)
         series = {name: example.curves[name]["psi"] + example.curves[name]["beta"] for name in who}
         series["measured"] = samples(example, "gps", 0, "arrived")
-        shown = {name: signal[inside] for name, signal in series.items()}
-        return time_series(example.time[inside], shown, y_label, dots=("measured",))
+        return _lines(example, series, y_label, dots=("measured",))
 
     return draw
 
@@ -95,29 +102,17 @@ def measured_offset(y_label: str, who: Sequence[str], window: tuple[float, float
     """The lateral offset: truth, the camera's held late samples, and each filter's."""
 
     def draw(example: Example) -> Any:
-        from ...report.figures import time_series
-
-        inside = _inside(example.time, window)
-        series = {name: example.curves[name]["y_l"][inside] for name in who}
-        series["measured, held"] = held(samples(example, "camera", 1, "arrived"))[inside]
-        return time_series(example.time[inside], series, y_label)
+        series = {name: example.curves[name]["y_l"] for name in who}
+        series["measured, held"] = held(samples(example, "camera", 1, "arrived"))
+        return _lines(example, series, y_label, window)
 
     return draw
 
 
 def delays(example: Example) -> Any:
     """The delay of the newest frame over the time of its capture, for the first second."""
-    from ...report.figures import time_series
-
     packets = example.packets["camera"]
     late = np.full(len(example.time), np.nan)
     ticks = packets[:, PACKET.captured].astype(int)
     late[ticks] = packets[:, PACKET.arrived] - packets[:, PACKET.captured]
-    inside = _inside(example.time, (0.0, 1.0))
-    return time_series(example.time[inside], {"camera": held(late)[inside]}, "delay / ms")
-
-
-def _inside(time: Array, window: tuple[float, float] | None) -> Any:
-    if window is None:
-        return slice(None)
-    return (time >= window[0]) & (time <= window[1])
+    return _lines(example, {"camera": held(late)}, "delay / ms", (0.0, 1.0))

@@ -17,14 +17,8 @@ RETUNED = "multirate-kf, delay ignored, tuned for it"
 
 _PAPERS_OWN = tuple(Filter(name, name) for name in (BICYCLE, SINGLE, MULTI, PROPOSED))
 # as tunings.toml, but with psi and y_l's noise free too: seeds 1000 to 1011 of this drive
-_FOR_NO_DELAY = {
-    "q_beta": 8.8e-3,
-    "q_gamma": 0.15,
-    "q_psi": 2.9e-8,
-    "q_y_l": 1.3e-7,
-    "psi_noise": 1.5e-3,
-    "y_l_noise": 2.2,
-}
+_Q = {"q_beta": 8.8e-3, "q_gamma": 0.15, "q_psi": 2.9e-8, "q_y_l": 1.3e-7}
+_FOR_NO_DELAY = {**_Q, "psi_noise": 1.5e-3, "y_l_noise": 2.2}
 
 # fmt: off
 SIMULATIONS = (
