@@ -1,5 +1,6 @@
 """What a scenario's fields may be; a value out of place is refused by its field's name."""
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -34,7 +35,6 @@ _NUMBERS = (
     "wind_height",
     "bank",
     "grade",
-    "half_width",
     "hdop",
     "hdop_spread",
     "hdop_time",
@@ -126,6 +126,9 @@ def _check_numbers(fields: Fields) -> None:
         _check_number(name, fields[name])
     for name in _NUMBERS_OR_NONE:
         _check_number(name, 0.0 if fields[name] is None else fields[name])
+    width = fields["half_width"]  # only compared with: it may be as wide as a float can be
+    if not (is_finite(width) or (isinstance(width, float) and math.isfinite(width))):
+        raise ValueError(f"half_width {brief(width)} is not finite")
     for name in _POSITIVE:
         if not fields[name] > 0.0:
             raise ValueError(f"{name} must be positive, got {fields[name]!r}")
