@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.vector import VectorEnv
 
+from ..envs.backend.files import whole
 from ..envs.record import Log, Record, concatenate
 
 if TYPE_CHECKING:
@@ -126,9 +127,8 @@ class Rollout:
             for name in self.columns
         ]
         table = pa.table(list(self.columns.values()), schema=pa.schema(fields))
-        part = Path(f"{path}.part")
-        pq.write_table(table, part)
-        part.replace(path)
+        with whole(path) as file:
+            pq.write_table(table, file)
 
     def plot(self) -> "Figure":
         """Sideslip angle, yaw rate, yaw moment and steering over time (needs `report`)."""

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from ..envs.backend.files import whole
 from .control.cells import REFERENCE_FILTER, YAW
 from .harness.metrics import METRICS
 from .harness.results import Row, Suite
@@ -44,12 +45,8 @@ def write_picture(path: str | Path, suites: Sequence[Suite]) -> None:
             if row.estimator in over:
                 _limit(axis, 1e3 * row.value / over[row.estimator])
                 break
-    part = Path(path).with_name(f".{Path(path).name}.part.png")
-    try:
-        figure.savefig(part, dpi=110)
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
+    with whole(path) as file:
+        figure.savefig(file, format="png", dpi=110)
 
 
 def _shown(row: Row) -> bool:

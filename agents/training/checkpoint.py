@@ -14,10 +14,13 @@ from safetensors.torch import save
 from ...envs.backend.files import write_whole
 
 FORMAT = 1
+STATE = {"groups", "sideslip", "task", "steps", "none", "scaling", "evaluations"}
+"""What a training goes on from, besides the tensors."""
 
 
-def save_checkpoint(path: Path, model: Any, told: dict[str, Any]) -> None:
-    """A stable-baselines3 model's parameters and optimisers, and what is told; JSON types."""
+def save_checkpoint(path: Path, model: Any, rest: dict[str, Any]) -> None:
+    """A stable-baselines3 model's parameters and optimisers, and the rest of the training's state,
+    in JSON types."""
     tensors: dict[str, torch.Tensor] = {}
     groups: dict[str, Any] = {}
     for part, state in model.get_parameters().items():
@@ -28,29 +31,35 @@ def save_checkpoint(path: Path, model: Any, told: dict[str, Any]) -> None:
         else:
             tensors |= {f"{part}/{name}": value for name, value in state.items()}
     plain = {name: value.detach().cpu().clone() for name, value in tensors.items()}
-    content = json.dumps({"format": FORMAT, "groups": groups, **told}, allow_nan=False)
+    content = json.dumps({"format": FORMAT, "groups": groups, **rest}, allow_nan=False)
     write_whole(path, save(plain, {"checkpoint": content}))
 
 
-def read_told(path: Path) -> dict[str, Any]:
-    """What was told when it was saved; ValueError for a file that is no checkpoint of ours."""
+def read_state(path: Path) -> dict[str, Any]:
+    """The training's state without the tensors; ValueError for a file that is no checkpoint."""
     try:
         with safe_open(path, "pt") as file:
             text = (file.metadata() or {}).get("checkpoint")
     except SafetensorError as error:
         raise ValueError(f"{path} is no checkpoint, or is cut short: {error}") from None
-    told: dict[str, Any] = {} if text is None else json.loads(text)
-    if told.get("format") != FORMAT:
+    try:
+        state: Any = {} if text is None else json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path} is no checkpoint: its state is no JSON ({error})") from None
+    if not isinstance(state, dict) or state.get("format") != FORMAT:
         raise ValueError(f"{path} is no checkpoint of this format ({FORMAT})")
-    return told
+    missing = sorted(STATE - state.keys())
+    if missing:
+        raise ValueError(f"{path}: the checkpoint's state lacks {', '.join(missing)}")
+    return state
 
 
 def load_parameters(path: Path, model: Any) -> None:
     """Give a model the parameters and the state of the optimisers of a checkpoint."""
-    groups = read_told(path)["groups"]
+    groups = read_state(path)["groups"]
     parts: dict[str, dict[str, Any]] = {part: {} for part in model.get_parameters()}
-    for part, told in groups.items():
-        parts[part] = {"param_groups": told, "state": {}}
+    for part, group in groups.items():
+        parts[part] = {"param_groups": group, "state": {}}
     with safe_open(path, "pt") as file:
         for name in file.keys():  # noqa: SIM118  it is no mapping
             part, key = name.split("/", 1)

@@ -16,14 +16,14 @@ import numpy as np
 from gymnasium.vector import VectorEnv
 
 from ... import __version__
-from ...envs.backend.files import write_whole
+from ...envs.backend.files import whole, write_whole
 from ..controllers.base import NoControl
 from ..learned.card import Card
 from ..learned.files import save_policy
 from ..rollout import costs_of
 from ..vec_env.env import make_native_env, make_vec_env
 from .algorithms import algorithm_of
-from .checkpoint import load_parameters, read_told, save_checkpoint
+from .checkpoint import load_parameters, read_state, save_checkpoint
 from .export import network_from_sb3
 from .normalise import PerSecond, measured
 
@@ -145,7 +145,10 @@ def task_in(folder: str | Path, **arguments: Any) -> Task:
     path = Path(folder) / CHECKPOINT
     if not path.is_file():
         raise FileNotFoundError(f"{folder} holds no training to go on with: no {CHECKPOINT}")
-    saved = read_told(path)["task"]
+    saved = read_state(path)["task"]
+    missing = [each.name for each in fields(Task) if each.name not in saved]
+    if missing:
+        raise ValueError(f"{path}: the checkpoint's task lacks {', '.join(missing)}")
     task = Task(**{each.name: saved[each.name] for each in fields(Task)})
     for name, value in arguments.items():
         if value != getattr(task, name):
@@ -157,10 +160,10 @@ def task_in(folder: str | Path, **arguments: Any) -> Task:
 
 
 def _start(task: Task, folder: Path, resume: bool) -> dict[str, Any] | None:
-    """What the checkpoint tells, None for a new training in a folder that is ready for it."""
+    """The checkpoint's state, None for a new training in a folder that is ready for it."""
     if resume:
         task_in(folder, **asdict(task))
-        return read_told(folder / CHECKPOINT)
+        return read_state(folder / CHECKPOINT)
     if (folder / CHECKPOINT).exists():
         raise ValueError(
             f"{folder} holds a training already: go on with it (resume), or take another folder"
@@ -271,9 +274,8 @@ class _Keeper(BaseCallback):
             cpu_seconds=now.cpu_seconds,
         )
         save_policy(self.folder / POLICY, network_from_sb3(self.model), card)
-        part = self.folder / f".part-{BEST}"
-        self.model.save(part)
-        part.replace(self.folder / BEST)
+        with whole(self.folder / BEST) as file:
+            self.model.save(file)
 
 
 def with_defaults(**arguments: Any) -> Task:

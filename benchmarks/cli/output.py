@@ -15,6 +15,7 @@ from rich.markup import escape
 from rich.table import Table as RichTable
 
 from ... import __version__
+from ...envs.backend.files import whole
 from ..harness.results import Row, Suite, Table, write_json, write_parquet, write_text
 
 if TYPE_CHECKING:
@@ -42,7 +43,8 @@ def show_episode(
         highlight=False,
     )
     if plot is not None:
-        drive.plot().savefig(plot, dpi=120)
+        with whole(plot) as file:
+            drive.plot().savefig(file, format=plot.suffix[1:] or "png", dpi=120)
     if parquet is not None:
         drive.to_parquet(parquet)
     if kml is not None:

@@ -1,27 +1,29 @@
 """Finished cases on disk: a run that was stopped goes on where it was."""
 
+import contextlib
 import hashlib
 import json
 from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
+import numpy.typing as npt
 
 from ...agents.learned.files import stamp
 from ...envs.backend.cache import source_stamp
-from .episodes import Chunk, Driven, drive
+from ...envs.backend.files import whole
+from .episodes import NUMBERS, SIGNALS, Chunk, Driven, drive
 
 _LENGTH = 24
 
 
 @dataclass(frozen=True)
-class Kept:
+class CachedDrive:
     """`drive` that looks in a folder first and leaves its result there.
 
-    folder: None keeps nothing. salt: of the seeds. Results of other sources, plant and matrix
+    folder: None caches nothing. salt: of the seeds. Results of other sources, plant and matrix
     included, or of a policy's other weights, are not taken for ours.
     """
 
@@ -33,7 +35,7 @@ class Kept:
         if self.folder is None:
             return drive(chunk)
         path = self._path(chunk)
-        found = _read(path)
+        found = _read(path, chunk)
         if found is not None:
             return found
         driven = drive(chunk)
@@ -57,23 +59,34 @@ def sources() -> str:
     return digest.hexdigest()
 
 
-def _read(path: Path) -> Driven | None:
+def _read(path: Path, chunk: Chunk) -> Driven | None:
+    """The chunk's result; None where the file is absent, damaged or another chunk's."""
+    shapes: dict[str, tuple[int, ...]] = {
+        "numbers": (len(chunk.seeds), len(NUMBERS)),
+        "seconds": (),
+    }
     try:
         with np.load(path, allow_pickle=False) as found:
-            return Driven(found["numbers"], float(found["seconds"]), found.get("series"))
-    except (OSError, ValueError, KeyError, BadZipFile):  # absent or cut short: driven again
+            arrays = dict(found)
+        if chunk.keep:
+            shapes["series"] = len(arrays["series"]), 1 + len(SIGNALS)
+        if not all(_fits(arrays[name], shape) for name, shape in shapes.items()):
+            return None
+    except Exception:  # whatever NumPy, zipfile and zlib find wrong with it
         return None
+    return Driven(arrays["numbers"], float(arrays["seconds"]), arrays.get("series"))
+
+
+def _fits(array: npt.NDArray[Any], shape: tuple[int, ...]) -> bool:
+    return array.dtype == np.float64 and array.shape == shape and bool(np.isfinite(array).all())
 
 
 def _write(path: Path, driven: Driven) -> None:
-    """The whole file or none; a full disk loses the kept case, not the run."""
-    part = path.with_suffix(f".{hash(path)}.part.npz")
+    """A full disk loses the file, not the run."""
     arrays: dict[str, Any] = {"numbers": driven.numbers, "seconds": np.array(driven.seconds)}
     if driven.series is not None:
         arrays["series"] = driven.series
-    try:
+    with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
-        np.savez_compressed(part, **arrays)
-        part.replace(path)
-    except OSError:
-        part.unlink(missing_ok=True)
+        with whole(path) as file:
+            np.savez_compressed(file, **arrays)

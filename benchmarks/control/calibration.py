@@ -18,11 +18,12 @@ from rich.console import Console
 
 from ... import __version__
 from ...agents import make_agent
+from ...envs.arguments import is_finite
 from ...envs.backend.cache import source_stamp
 from ...envs.scenarios.manoeuvres import SCENARIOS
 from ...estimators.wrappers.estimate import EstimateObservation
 from ..harness.parallel import run_cases
-from ..harness.results import write_text
+from ..harness.results import made_of, read_objects, write_text
 
 FILE = Path(__file__).with_name("calibration.json")
 SALT, SEEDS = "calibration", 64
@@ -40,7 +41,7 @@ class Case:
     seed: int
     start: str
     estimator: str
-    folder: str  # where finished cases are kept
+    folder: str  # of finished cases
 
     @property
     def path(self) -> Path:
@@ -103,8 +104,9 @@ def measure(case: Case) -> Episode:
     """The ceiling of one episode, from the folder of finished cases where it is there."""
     from ...agents.clairvoyant.plan import actions_of, ceiling
 
-    if case.path.exists():
-        return Episode(**json.loads(case.path.read_text(encoding="utf-8")))
+    done = _finished(case)
+    if done is not None:
+        return done
     env: gym.Env[Any, Any] = gym.make(case.env_id, scenario=case.scenario)
     starts = {}
     if case.start != "none":
@@ -118,6 +120,17 @@ def measure(case: Case) -> Episode:
     )
     write_text(case.path, json.dumps(asdict(episode)))
     return episode
+
+
+def _finished(case: Case) -> Episode | None:
+    """The episode of the case's file; None where it is absent or damaged."""
+    try:
+        entry = json.loads(case.path.read_text(encoding="utf-8"))
+        episode = made_of(Episode, entry, str(case.path))
+    except (OSError, ValueError, RecursionError):
+        return None
+    costs = [episode.cost, episode.costs.get("none", math.nan), episode.seconds]
+    return episode if episode.seed == case.seed and all(map(is_finite, costs)) else None
 
 
 def calibrate(
@@ -202,18 +215,26 @@ def import_solvers() -> None:
 
 
 def read_calibration(path: str | Path = FILE) -> dict[tuple[str, str], Entry]:
-    """The entries of a file by (env id, scenario); FileNotFoundError where there is none."""
+    """The entries of a file by (env id, scenario).
+
+    Raises FileNotFoundError where there is none, ValueError, with file, entry and field, for one
+    that is cut short or lacks something.
+    """
     entries = {}
-    for each in json.loads(Path(path).read_text(encoding="utf-8")):
-        episodes = tuple(Episode(**episode) for episode in each.pop("episodes"))
-        entry = Entry(**each, episodes=episodes)
+    for i, each in enumerate(read_objects(path), 1):
+        where = f"{path}: entry {i}"
+        episodes = each.get("episodes", ())
+        if not isinstance(episodes, list):
+            raise ValueError(f"{where}: episodes is no list")
+        made = (made_of(Episode, one, f"{where}, episode {k}") for k, one in enumerate(episodes, 1))
+        entry = made_of(Entry, each | {"episodes": tuple(made)}, where)
         entries[entry.env_id, entry.scenario] = entry
     return entries
 
 
 def update(path: str | Path, made: Sequence[Entry]) -> None:
     """Replace or add entries of a file, which is made if it is not there."""
-    kept = read_calibration(path) if Path(path).exists() else {}
-    kept |= {(entry.env_id, entry.scenario): entry for entry in made}
-    ordered = [asdict(kept[key]) for key in sorted(kept)]
+    entries = read_calibration(path) if Path(path).exists() else {}
+    entries |= {(entry.env_id, entry.scenario): entry for entry in made}
+    ordered = [asdict(entries[key]) for key in sorted(entries)]
     write_text(path, json.dumps(ordered, indent=1) + "\n")

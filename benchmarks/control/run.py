@@ -8,7 +8,7 @@ import numpy as np
 from rich.console import Console
 
 from ..harness.parallel import run_cases
-from .cache import Kept
+from .cache import CachedDrive
 from .cells import EPISODES, INFORMED, SLOW_EPISODES, Cell
 from .episodes import Chunk, Driven
 from .seeds import salted_seeds
@@ -52,7 +52,7 @@ def measure(
             Chunk(cell, tuple(mine[first : first + CHUNK]), keep=first == 0)
             for first in range(0, len(mine), CHUNK)
         ]
-    driven = run_cases(Kept(keep, salt), chunks, "control", jobs, console)
+    driven = run_cases(CachedDrive(keep, salt), chunks, "control", jobs, console)
     results = Results(salt)
     for cell in cells:
         mine_driven = [d for c, d in zip(chunks, driven, strict=True) if c.cell is cell]

@@ -6,13 +6,18 @@ import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar, get_origin
 
-from ...envs.backend.files import write_whole
+from ...envs.arguments import brief, check_choice, is_finite, listed
+from ...envs.backend.files import whole, write_whole
 from .explorer import Explorer
 from .metrics import METRICS
 from .stats import Estimate
 
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+Made = TypeVar("Made", bound="DataclassInstance")
 VERDICTS = ("", "reproduced", "partly", "not reproduced", "report only")
 
 
@@ -44,10 +49,8 @@ class Row:
     paper: str = ""
 
     def __post_init__(self) -> None:
-        if self.metric not in METRICS:
-            raise ValueError(f"unknown metric {self.metric!r}; known: {', '.join(METRICS)}")
-        if self.verdict not in VERDICTS:
-            raise ValueError(f"unknown verdict {self.verdict!r}")
+        check_choice("metric", self.metric, METRICS)
+        check_choice("verdict", self.verdict, VERDICTS)
 
     @classmethod
     def of(cls, metric: str, number: Estimate, **columns: Any) -> "Row":
@@ -93,16 +96,20 @@ def check_writable(*paths: Path | None) -> None:
     for path in paths:
         if path is None:
             continue
-        folder = path.absolute().parent
-        if not folder.is_dir():
+        if path.is_dir():
+            raise IsADirectoryError(f"cannot write {path}: it is a folder")
+        folder = Path(os.path.realpath(path)).parent
+        if path.exists() and not path.is_file():  # a pipe or a device, which is not replaced
+            folder = path
+        if not folder.exists():
             raise FileNotFoundError(f"cannot write {path}: there is no such folder")
         if not os.access(folder, os.W_OK):
-            raise PermissionError(f"cannot write {path}: its folder is read-only")
+            raise PermissionError(f"cannot write {path}: it, or its folder, is read-only")
 
 
 def write_text(path: str | Path, text: str) -> None:
     """Write a text file or nothing."""
-    write_whole(Path(path), text.encode())
+    write_whole(path, text.encode())
 
 
 def write_json(path: str | Path, rows: Sequence[Row]) -> None:
@@ -118,16 +125,44 @@ def write_json(path: str | Path, rows: Sequence[Row]) -> None:
 
 
 def read_json(path: str | Path) -> list[Row]:
-    """Rows that `write_json` wrote."""
-    names = {entry.name: entry.type for entry in fields(Row)}
+    """Rows that `write_json` wrote; ValueError, with file, row and column, for others."""
     rows = []
-    for entry in json.loads(Path(path).read_text(encoding="utf-8")):
-        unknown = sorted(set(entry) - set(names))
-        if unknown:
-            raise ValueError(f"{path}: unknown column {', '.join(unknown)}")
-        known: dict[str, Any] = {k: math.nan if v is None else v for k, v in entry.items()}
-        rows.append(Row(**known))
+    for i, entry in enumerate(read_objects(path), 1):
+        numbers = {name: math.nan if value is None else value for name, value in entry.items()}
+        rows.append(made_of(Row, numbers, f"{path}: row {i}"))
     return rows
+
+
+def read_objects(path: str | Path) -> list[dict[str, Any]]:
+    """A file's JSON list of objects; ValueError, with the path, for another file."""
+    try:
+        entries = json.loads(Path(path).read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path} is no JSON, or is cut short: {error}") from None
+    if not isinstance(entries, list) or not all(isinstance(each, dict) for each in entries):
+        raise ValueError(f"{path}: expected a JSON list of objects")
+    return entries
+
+
+def made_of(kind: type[Made], entry: Any, where: str) -> Made:
+    """A dataclass's instance from a JSON object; ValueError, with the place and the field, for an
+    unknown or missing field and a value of another type."""
+    if not isinstance(entry, dict):
+        raise ValueError(f"{where}: expected a JSON object, got {brief(entry)}")
+    known: dict[str, Any] = {each.name: each for each in fields(kind)}
+    needed = {name for name, each in known.items() if each.default is each.default_factory}
+    for what, names in (("unknown", entry.keys() - known), ("missing", needed - entry.keys())):
+        if names:
+            raise ValueError(f"{where}: {what} {listed(sorted(names))}")
+    for name, value in entry.items():
+        wanted = get_origin(known[name].type) or known[name].type
+        fits = isinstance(value, wanted) or (wanted is float and is_finite(value))
+        if not fits or isinstance(value, bool):
+            raise ValueError(f"{where}: {name} is {brief(value)}, not {wanted.__name__}")
+    try:
+        return kind(**entry)
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from None
 
 
 def write_parquet(path: str | Path, rows: Sequence[Row]) -> None:
@@ -135,9 +170,5 @@ def write_parquet(path: str | Path, rows: Sequence[Row]) -> None:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    part = Path(path).with_name(f".{Path(path).name}.part")
-    try:
-        pq.write_table(pa.Table.from_pylist([asdict(row) for row in rows]), part)
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
+    with whole(path) as file:
+        pq.write_table(pa.Table.from_pylist([asdict(row) for row in rows]), file)

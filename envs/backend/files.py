@@ -1,18 +1,18 @@
 """Files that are there whole or not at all."""
 
 import contextlib
+import io
 import os
 import stat
 import uuid
 from collections.abc import Iterator
 from pathlib import Path
-from typing import BinaryIO
 
 _OPEN = ("/dev/std", "/dev/fd/", "/proc/")  # what a process has open, by name
 
 
 @contextlib.contextmanager
-def whole(path: Path | str) -> Iterator[BinaryIO]:
+def whole(path: Path | str) -> Iterator[io.BufferedWriter]:
     """A binary file to write, which takes the place of `path` at the end, or none does on an error.
 
     Whoever is killed meanwhile leaves an older file as it was. Links are followed, an older file's
@@ -35,7 +35,7 @@ def whole(path: Path | str) -> Iterator[BinaryIO]:
 
 
 @contextlib.contextmanager
-def replaced(path: Path, mode: int = 0o666) -> Iterator[BinaryIO]:
+def replaced(path: Path, mode: int = 0o666) -> Iterator[io.BufferedWriter]:
     """The same for a plain file or a link, which is replaced itself; `mode` as the umask has it."""
     part = path.with_name(f".{path.name[:200]}.{uuid.uuid4().hex}.part")
     try:

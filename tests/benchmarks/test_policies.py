@@ -18,7 +18,7 @@ from sideslip.agents.learned.network import Network
 from sideslip.benchmarks.control import seeds
 from sideslip.benchmarks.control import suite as control
 from sideslip.benchmarks.control.build import estimate_options, make_contest
-from sideslip.benchmarks.control.cache import Kept
+from sideslip.benchmarks.control.cache import CachedDrive
 from sideslip.benchmarks.control.cells import LEARNED, MANOEUVRES, STEERING, YAW, Cell, cells
 from sideslip.benchmarks.control.episodes import Chunk
 from sideslip.benchmarks.control.seeds import salt_of, salted_seeds
@@ -126,18 +126,18 @@ def test_a_policy_in_a_cell_gets_the_estimate_it_was_trained_on(tmp_path: Path) 
     assert agent.needs == ("gyro",)
 
 
-def test_seeds_and_kept_cases_are_of_these_weights(
+def test_seeds_and_cached_cases_are_of_these_weights(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = a_file(tmp_path)
     cell = Cell(YAW, "gust", "", str(path), {"scenario": SHORT})
-    kept = Kept(tmp_path / "kept", "salt")
-    first = kept(Chunk(cell, (1, 2)))
-    assert np.array_equal(kept(Chunk(cell, (1, 2))).numbers, first.numbers)
+    cached = CachedDrive(tmp_path / "cached", "salt")
+    first = cached(Chunk(cell, (1, 2)))
+    assert np.array_equal(cached(Chunk(cell, (1, 2))).numbers, first.numbers)
     policy = load_policy(path)
     other = replace(policy.network, biases=[np.ones(1)])
     save_policy(path, other, policy.card)
-    assert not np.array_equal(kept(Chunk(cell, (1, 2))).numbers, first.numbers)
+    assert not np.array_equal(cached(Chunk(cell, (1, 2))).numbers, first.numbers)
     salt = salt_of()
     monkeypatch.setattr(seeds, "_CONTESTANTS", {"estimators": (".py", ".toml"), "agents": (".py",)})
     assert salt_of() != salt

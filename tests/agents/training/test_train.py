@@ -26,7 +26,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sideslip.agents.training import train
 from sideslip.agents.training.algorithms import ALGORITHMS
-from sideslip.agents.training.checkpoint import read_told
+from sideslip.agents.training.checkpoint import read_state
 from sideslip.agents.training.export import network_from_sb3
 from sideslip.agents.training.normalise import CLIP, Standardised, measured
 from sideslip.agents.training.train import BEST, CHECKPOINT, CURVE, POLICY, Progress, Task, task_in
@@ -188,7 +188,7 @@ def test_a_kill_at_any_time_leaves_a_checkpoint_that_goes_on(tmp_path: Path) -> 
         time.sleep(wait)
         child.kill()
         assert child.communicate()[1] == b"" and child.returncode == -signal.SIGKILL
-        reached.append(read_told(path)["steps"])
+        reached.append(read_state(path)["steps"])
         assert reached[-1] > reached[-2]
 
 
@@ -228,6 +228,24 @@ def test_a_file_that_is_no_checkpoint_says_so(folder: Path, tmp_path: Path) -> N
     (tmp_path / CHECKPOINT).write_bytes(save({"a": torch.zeros(1)}))
     with pytest.raises(ValueError, match="is no checkpoint of this format"):
         task_in(tmp_path)
+
+
+def test_a_checkpoint_that_lacks_something_names_it(folder: Path, tmp_path: Path) -> None:
+    path, state = tmp_path / CHECKPOINT, read_state(folder / CHECKPOINT)
+    for key in state.keys() - {"format"}:
+        text = json.dumps({name: value for name, value in state.items() if name != key})
+        path.write_bytes(save({"a": torch.zeros(1)}, {"checkpoint": text}))
+        with pytest.raises(ValueError, match=f"{CHECKPOINT}: the checkpoint's state lacks {key}"):
+            task_in(tmp_path)
+    task = {name: value for name, value in state["task"].items() if name != "algo"}
+    for text, message in (
+        (json.dumps(state | {"task": task}), f"{CHECKPOINT}: the checkpoint's task lacks algo"),
+        ("{", f"{CHECKPOINT} is no checkpoint: its state is no JSON"),
+        ("[1]", f"{CHECKPOINT} is no checkpoint of this format"),
+    ):
+        path.write_bytes(save({"a": torch.zeros(1)}, {"checkpoint": text}))
+        with pytest.raises(ValueError, match=message):
+            task_in(tmp_path)
 
 
 def test_what_cannot_be_trained_says_why_and_leaves_no_checkpoint(tmp_path: Path) -> None:

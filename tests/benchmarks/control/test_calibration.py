@@ -1,6 +1,8 @@
 """Calibration: seeds of its own, entries that say what made them, runs that can be stopped."""
 
 import dataclasses
+import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -76,6 +78,54 @@ def test_a_file_keeps_other_entries(asked: list[int], tmp_path: Path) -> None:
     changed = dataclasses.replace(both[0], none=7.0)
     update(path, [changed])
     assert read_calibration(path) == {(ID, "gust"): changed, (ID, "sine"): both[1]}
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda text: "", "is no JSON, or is cut short"),
+        (lambda text: text[: len(text) // 2], "is no JSON, or is cut short"),
+        (lambda text: text[1:-2], "expected a JSON list of objects"),
+        (lambda text: text.replace('"salt"', '"salted"'), "entry 1: unknown salted"),
+        (lambda text: text.replace('"none_error": 0.0,', ""), "entry 1: missing none_error"),
+        (lambda text: text.replace('"none": 20.0,', '"none": "20",', 1), "none is '20', not float"),
+        (lambda text: text.replace('"winner": "from none",', ""), "episode 1: missing winner"),
+        (lambda text: text.replace('"episodes"', '"others"'), "entry 1: episodes is no list"),
+    ],
+)
+def test_a_file_that_lacks_something_is_refused_with_its_path(
+    spoil: Callable[[str], str], message: str, asked: list[int], tmp_path: Path
+) -> None:
+    path = tmp_path / "calibration.json"
+    update(path, calibrate(["gust"], tmp_path / "cases", seeds=2, start="none", jobs=1))
+    spoiled = spoil(path.read_text())
+    path.write_text(spoiled)
+    for use in (read_calibration, lambda path: update(path, [])):
+        with pytest.raises(ValueError, match=message) as caught:
+            use(path)
+        assert str(caught.value).startswith(str(path)) and len(str(caught.value)) < 500
+    assert path.read_text() == spoiled
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        *("", "{", "[]", "null", "{}", "[" * 99999),
+        *(("winner", None), ("seed", 7), ("cost", "1"), ("cost", float("nan")), ("costs", {})),
+    ],
+    ids=range(11),
+)
+def test_a_damaged_case_is_sought_again(content: Any, asked: list[int], tmp_path: Path) -> None:
+    first = calibrate(["gust"], tmp_path / "cases", seeds=2, start="none", jobs=1)
+    path = next((tmp_path / "cases").iterdir())
+    if isinstance(content, tuple):
+        key, value = content
+        content = json.dumps(json.loads(path.read_text()) | {key: value})
+    path.write_text(content)
+    assert calibrate(["gust"], tmp_path / "cases", seeds=2, start="none", jobs=1) == first
+    assert len(asked) == 3
+    assert calibrate(["gust"], tmp_path / "cases", seeds=2, start="none", jobs=1) == first
+    assert len(asked) == 3  # the file is whole again
 
 
 @pytest.mark.long

@@ -13,7 +13,7 @@ from sideslip.benchmarks.control import build as contest
 from sideslip.benchmarks.control import episodes as drive
 from sideslip.benchmarks.control import run as results
 from sideslip.benchmarks.control import suite as control
-from sideslip.benchmarks.control.cache import Kept
+from sideslip.benchmarks.control.cache import CachedDrive
 from sideslip.benchmarks.control.calibration import read_calibration
 from sideslip.benchmarks.control.ceiling import refusals_of
 from sideslip.benchmarks.control.cells import MANOEUVRES, STEERING, YAW, Cell, cells
@@ -164,24 +164,24 @@ def test_standing_car_and_diverging_plant_end_finite() -> None:
 
 def test_a_stopped_run_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     chunk = Chunk(Cell(YAW, "gust", "", "none"), SEEDS, keep=True)
-    kept = Kept(tmp_path, "salt")
-    first = kept(chunk)
+    cached = CachedDrive(tmp_path, "salt")
+    first = cached(chunk)
     monkeypatch.setattr("sideslip.benchmarks.control.cache.drive", None)
-    again = kept(chunk)
+    again = cached(chunk)
     assert np.array_equal(first.numbers, again.numbers)
     assert first.series is not None and again.series is not None
     assert np.array_equal(first.series, again.series)
     with pytest.raises(TypeError):  # another salt or chunk is driven
-        Kept(tmp_path, "other")(chunk)
+        CachedDrive(tmp_path, "other")(chunk)
     monkeypatch.setattr("sideslip.benchmarks.control.cache.sources", lambda: "edited")
     with pytest.raises(TypeError):  # other sources: driven again
-        kept(chunk)
+        cached(chunk)
     monkeypatch.undo()
     monkeypatch.setattr("sideslip.benchmarks.control.cache.drive", None)
     (found,) = tmp_path.iterdir()
     found.write_bytes(found.read_bytes()[:100])  # cut short by a kill or a full disk
     with pytest.raises(TypeError):
-        kept(chunk)
+        cached(chunk)
 
 
 def test_a_small_matrix_from_end_to_end(monkeypatch: pytest.MonkeyPatch) -> None:

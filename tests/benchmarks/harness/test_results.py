@@ -9,6 +9,7 @@ import pytest
 
 from sideslip.benchmarks.harness.results import (
     Row,
+    check_writable,
     read_json,
     write_json,
     write_parquet,
@@ -58,7 +59,45 @@ def test_words_outside_the_vocabulary_are_refused(tmp_path: Path) -> None:
         Row("a", "b", "swiftness", 1.0)
     with pytest.raises(ValueError, match="unknown verdict 'good'"):
         Row("a", "b", "rmse", 1.0, verdict="good")
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("", "is no JSON, or is cut short"),
+        ('[{"suite": "a", ', "is no JSON, or is cut short"),
+        ("[" * 99999, "is no JSON, or is cut short"),
+        ("\0", "is no JSON"),
+        ('{"suite": "a"}', "expected a JSON list of objects"),
+        ('[{"suite": "a"}, 3]', "expected a JSON list of objects"),
+        ('[{"suite": "a", "colour": "red"}]', "row 1: unknown colour"),
+        ("[GOOD, {}]", "row 2: missing metric, scenario, suite, value"),
+        ('[GOOD, {"suite": "a", "scenario": "b", "metric": "rmse"}]', "row 2: missing value"),
+        ('[GOOD, {"suite": null, "scenario": "b", "metric": "rmse", "value": 1}]', "suite is nan"),
+        ('[{"suite": "a", "scenario": "b", "metric": "rmse", "value": "1"}]', "value is '1', not"),
+        ('[{"suite": "a", "scenario": "b", "metric": "rmse", "value": true}]', "value is True"),
+        ('[{"suite": "a", "scenario": "b", "metric": "rmse", "value": HUGE}]', "value is 1111"),
+        ('[{"suite": "a", "scenario": "b", "metric": "fun", "value": 1}]', "row 1: unknown metric"),
+    ],
+)
+def test_rows_that_are_none_are_refused_with_their_file(
+    content: str, message: str, tmp_path: Path
+) -> None:
     path = tmp_path / "rows.json"
-    path.write_text('[{"suite": "a", "colour": "red"}]')
-    with pytest.raises(ValueError, match=r"rows\.json: unknown column colour"):
+    write_json(path, ROWS[:1])
+    good = path.read_text()[1:-2]
+    path.write_text(content.replace("GOOD", good).replace("HUGE", "1" * 400))
+    with pytest.raises(ValueError, match=message) as caught:
         read_json(path)
+    assert str(caught.value).startswith(str(path)) and len(str(caught.value)) < 500
+
+
+def test_what_cannot_be_written_is_refused_before_the_work(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "link").symlink_to(tmp_path / "nowhere" / "file")
+    check_writable(None, tmp_path / "file", tmp_path / "pipe", Path("/dev/null"))
+    with pytest.raises(IsADirectoryError, match="it is a folder"):
+        check_writable(tmp_path)
+    for path in (tmp_path / "nowhere" / "file", tmp_path / "link"):
+        with pytest.raises(FileNotFoundError, match="there is no such folder"):
+            check_writable(path)

@@ -1,0 +1,77 @@
+"""A case on disk is a result only where it is whole and its own."""
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sideslip.benchmarks.control import episodes
+from sideslip.benchmarks.control.cache import CachedDrive
+from sideslip.benchmarks.control.cells import YAW, Cell
+from sideslip.benchmarks.control.episodes import Chunk, Driven
+
+SEEDS = (3, 4, 5)
+NUMBERS, SIGNALS = len(episodes.NUMBERS), 1 + len(episodes.SIGNALS)
+
+
+def _spoiled(path: Path, **changes: Any) -> None:
+    with np.load(path) as found:
+        arrays = dict(found) | changes
+    np.savez_compressed(path, **{name: each for name, each in arrays.items() if each is not None})
+
+
+def _turned_over(path: Path, share: float) -> None:
+    content = bytearray(path.read_bytes())
+    for i in range(int(share * len(content)), int(share * len(content)) + 8):
+        content[i] ^= 0xFF
+    path.write_bytes(content)
+
+
+DAMAGE: dict[str, Callable[[Path], object]] = {
+    "empty": lambda path: path.write_bytes(b""),
+    "no archive": lambda path: path.write_bytes(b"PK\x03\x04" + b"\0" * 99),
+    "another archive": lambda path: path.write_bytes(b"\x93NUMPY\x01\x00v\x00{'descr': "),
+    **{f"turned over at {s}": partial(_turned_over, share=s) for s in (0.1, 0.4, 0.7, 0.9)},
+    "few seeds": lambda path: _spoiled(path, numbers=np.zeros((1, NUMBERS))),
+    "few numbers": lambda path: _spoiled(path, numbers=np.zeros((len(SEEDS), NUMBERS - 1))),
+    "a number": lambda path: _spoiled(path, numbers=np.float64(1.0)),
+    "texts": lambda path: _spoiled(path, numbers=np.full((len(SEEDS), NUMBERS), "a")),
+    "NaN": lambda path: _spoiled(path, numbers=np.full((len(SEEDS), NUMBERS), np.nan)),
+    "no seconds": lambda path: _spoiled(path, seconds=None),
+    "seconds": lambda path: _spoiled(path, seconds=np.zeros(3)),
+    "NaN seconds": lambda path: _spoiled(path, seconds=np.nan),
+    "no series": lambda path: _spoiled(path, series=None),
+    "NaN in the series": lambda path: _spoiled(path, series=np.full((9, SIGNALS), np.nan)),
+    "a narrow series": lambda path: _spoiled(path, series=np.zeros((9, SIGNALS - 1))),
+    "pickled": lambda path: _spoiled(path, numbers=np.full((len(SEEDS), NUMBERS), None)),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_a_damaged_case_is_driven_again(
+    damage: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not taken for a result, and no error."""
+    rng = np.random.default_rng(1)
+    numbers, series = rng.normal(size=(len(SEEDS), NUMBERS)), rng.normal(size=(9, SIGNALS))
+    driven: list[Chunk] = []
+
+    def drive_it(chunk: Chunk) -> Driven:
+        driven.append(chunk)
+        return Driven(numbers, 1.0, series)
+
+    monkeypatch.setattr("sideslip.benchmarks.control.cache.drive", drive_it)
+    cached = CachedDrive(tmp_path, "salt")
+    chunk = Chunk(Cell(YAW, "gust", "", "none"), SEEDS, keep=True)
+    cached(chunk)
+    (path,) = tmp_path.iterdir()
+    DAMAGE[damage](path)
+    for _ in range(2):  # the second time from the file, which is whole again
+        found = cached(chunk)
+        assert np.array_equal(found.numbers, numbers)
+        assert found.series is not None and np.array_equal(found.series, series)
+    assert len(driven) == 2
+    assert list(tmp_path.iterdir()) == [path]
