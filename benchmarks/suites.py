@@ -13,7 +13,7 @@ from .harness.results import Suite
 
 @dataclass(frozen=True)
 class Request:
-    """How to run a suite.
+    """The options of a run.
 
     quick: few seeds. jobs: processes, None for all processors. episodes: of a cell of the matrix,
     None for the suite's own number. keep: a folder for finished cases.

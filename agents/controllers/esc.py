@@ -40,7 +40,7 @@ def yaw_gains(vehicle: Vehicle, speed: float, bandwidth: float = BANDWIDTH) -> t
 
 @jit
 def beyond(value: Any, band: Any) -> Any:
-    """What of a value lies outside of +-band, with its sign."""
+    """The part of a value outside of +-band, with its sign."""
     if value > band:
         return value - band
     if value < -band:

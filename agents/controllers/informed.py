@@ -26,14 +26,14 @@ GRIP = 0.7
 0.9 and no limit it costs least on low-friction (without one 8 % of the cars spin there).
 """
 STEER_WEIGHT = 100.0
-"""Of added steering in the design, times the cost's. A compromise between 1, where the steering
+"""The design's weight of added steering over the cost's. A compromise between 1, where the steering
 chatters at its rate limit, and 2500: on random-steering and sine-with-dwell it has the least median
 cost, on gust 25, on brake-in-turn 2500.
 """
 
 
 TYRES = 4.0
-"""How much more than the scenario's disturbance an informed filter expects where tyres saturate.
+"""The disturbance that an informed filter expects where tyres saturate, over the scenario's.
 
 What Fiala tyres lack against their own stiffness is a disturbance to a linear filter. Of 1, 2, 4
 and 8, tried on random-steering of YawFusion and YawVision (seeds 1000 to 1029), 8 has the least

@@ -41,7 +41,7 @@ def _program(
 
 
 class Mpc(Lqr):
-    """What `lqr` minimises, over a horizon with limits, then as if there were none.
+    """Predictive control: `lqr`'s cost over a horizon with limits, then as if there were none.
 
     Limits are those of the yaw moment and, where the env steers, of the added angle and its rate.
     Where none is met this is the LQR. The program is that of the nearest speed of `SPEEDS`.

@@ -1,1 +1,1 @@
-"""What controllers are designed from: the sampled car, PI gains, gain schedules, the QP of MPC."""
+"""Models and gains for controllers: the nominal and the sampled car, PI, schedules, MPC's QP."""

@@ -103,4 +103,4 @@ def sample_pi(
 
 
 COMS_PI = PI(-19000.506, -115535.531)
-"""What `design_pi` gives for the COMS at 25 km/h: used where python-control is not installed."""
+"""`design_pi` of the COMS at 25 km/h, used where python-control is not installed."""

@@ -27,7 +27,7 @@ DYNAMIC = ("beta", "gamma", "N_z", "delta_f")
 steering in rad."""
 
 HELD = ("driver", "beta_ref", "gamma_ref")
-"""What is taken to stay as it is: the driver's steering in rad and the references."""
+"""Quantities held constant: the driver's steering in rad and the references."""
 
 DISTURBANCES: dict[str, tuple[str, ...]] = {
     "none": (),
@@ -40,7 +40,7 @@ them, or d_1 and d_2 in rad/s and rad/s2, which stay: dakf-stability (8)-(9), (1
 
 @dataclass(frozen=True)
 class Purpose:
-    """What a design is for: everything but the car and its speed.
+    """The parameters of a design, but for the car and its speed.
 
     period: ticks. full_scale: N m of the first input. steers: whether steering is the second.
     kind: of `REFERENCES` by number. disturbances: of `DISTURBANCES`.
@@ -150,7 +150,7 @@ def _tick_of_the_plane(vehicle: Vehicle, speed: float, purpose: Purpose) -> tupl
 
 
 def _weights(purpose: Purpose) -> Sequence[float]:
-    """Of the four that the cost judges: docs/ARCHITECTURE.md, "Cost and score"."""
+    """The weights of the four that the cost judges: docs/ARCHITECTURE.md, "Cost and score"."""
     return (
         1.0 / BETA_SCALE**2,
         0.0 if purpose.kind == ZERO_SLIP else 1.0 / GAMMA_SCALE**2,

@@ -12,7 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from ..harness.results import check_writable
-from .output import give, show_episode
+from .output import show_episode, write_output
 
 if TYPE_CHECKING:
     from ...agents.learned.files import Policy
@@ -44,7 +44,7 @@ def enjoy_command(
         return
     check_writable(html, json, parquet, plot)
     found = enjoy(policy, episodes, env_id=env, scenario=scenario, seed=seed)
-    give(console, [suite_of(found)], html, json, parquet)
+    write_output(console, [suite_of(found)], html, json, parquet)
     first = found.cells[found.policy.name]
     show_episode(console, run_of(first, found.seeds[0]), found.policy.name, plot)
 

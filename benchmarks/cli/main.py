@@ -14,7 +14,7 @@ from ..harness.results import check_writable
 from ..suites import SUITES, Request, run_suite
 from .calibrate import calibrate_command
 from .enjoy import enjoy_command
-from .output import give, show_episode
+from .output import show_episode, write_output
 from .train import train_command
 from .tune import tune_app
 
@@ -64,7 +64,7 @@ def face(
 
 @app.command("list")
 def list_names() -> None:
-    """What there is: environments, scenarios, vehicles, estimators, agents, policies, suites."""
+    """The names of environments, scenarios, vehicles, estimators, agents, policies, suites."""
     import gymnasium as gym
 
     from ...agents import AGENTS
@@ -147,7 +147,7 @@ def bench(
     done += [run_suite(name, request) for name in names]
     order = [*names, "replay"]
     done.sort(key=lambda suite: order.index(suite.name))
-    give(console, done, html, json, parquet)
+    write_output(console, done, html, json, parquet)
     if picture is not None:
         from ..picture import write_picture
 
@@ -183,4 +183,4 @@ def replay(
         bias_deg=course_bias,
         gyro_bias_degps=gyro_bias,
     )
-    give(console, [suite], html, json, parquet)
+    write_output(console, [suite], html, json, parquet)

@@ -1,4 +1,4 @@
-"""What a command gives: tables and lines on the screen, and the files that were asked for."""
+"""The output of commands: tables and lines on the screen, and files."""
 
 import platform
 import shlex
@@ -32,7 +32,7 @@ def show_episode(
     parquet: Path | None = None,
     kml: Path | None = None,
 ) -> None:
-    """Say an episode's score in a line and draw it; who: drove it."""
+    """Print an episode's score in a line and draw it; who: its driver."""
     from ..report.kml import track_kml
 
     slip = drive["beta"]
@@ -51,14 +51,14 @@ def show_episode(
         write_text(kml, track_kml(drive.log.name, {who: (drive["X"], drive["Y"])}))
 
 
-def give(
+def write_output(
     console: Console,
     suites: Sequence[Suite],
     html: Path | None = None,
     json: Path | None = None,
     parquet: Path | None = None,
 ) -> None:
-    """Print the tables and write what was asked for."""
+    """Print the tables and write the files that have a path."""
     for suite in suites:
         print_suite(console, suite)
     rows: list[Row] = [row for suite in suites for row in suite.rows]
@@ -76,7 +76,7 @@ def give(
 
 
 def command_line() -> str:
-    """What was typed."""
+    """The command line of this process."""
     return shlex.join(["sideslip", *sys.argv[1:]])
 
 

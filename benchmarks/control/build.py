@@ -57,7 +57,7 @@ def outputs_for(estimator: str) -> tuple[str, ...]:
 
 
 def estimate_options(cell: Cell) -> dict[str, Any]:
-    """Of `EstimateObservation` for a cell; a policy gets the estimate it was trained on."""
+    """Options of `EstimateObservation` for a cell; a policy gets the estimate it was trained on."""
     if is_policy(cell.controller):
         card = load_policy(cell.controller).card
         if card.estimator == cell.estimator:

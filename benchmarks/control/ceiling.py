@@ -9,7 +9,7 @@ from .scores import Array, Ceiling
 
 _OF_THE_CAR = ("none", "spin", "off-road")
 KNOWN = 0.1
-"""Of the way from none to the ceiling: a larger standard error of the ceiling is no yardstick."""
+"""A share of the way from none to the ceiling: with a larger standard error there is no score."""
 _ERRORS = 3.0  # standard errors by which a method must win to become the ceiling
 
 
@@ -53,7 +53,7 @@ def judged(results: Results, env_id: str, tops: dict[str, Ceiling]) -> list[str]
 
 
 def calibrated_by() -> str:
-    """How the ceilings were made; their file keeps the command of each."""
+    """The command of the ceilings; their file has that of each."""
     entries = read_calibration() if FILE.is_file() else {}
     if not entries:
         return "No ceiling is calibrated."

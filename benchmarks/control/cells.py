@@ -58,7 +58,7 @@ class Cell:
 
     @property
     def env_options(self) -> dict[str, Any]:
-        """Of the env: an action that is none ends the episode."""
+        """Options of the env: an action that is none ends the episode."""
         return {"scenario": self.scenario, "on_bad_action": "fail"} | self.options
 
     @property

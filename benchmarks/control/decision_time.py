@@ -1,4 +1,4 @@
-"""How long a contestant takes to decide: its estimator's step and its controller's `predict`."""
+"""The time of a contestant's decision: its estimator's step and its controller's `predict`."""
 
 import time
 from collections.abc import Callable

@@ -71,7 +71,7 @@ def run(
 
 
 def _learned(env_id: str) -> list[str]:
-    """What the policies of a table were trained on."""
+    """The training of the policies in a table."""
     cards = {name: load_policy(name).card for _, name in LEARNED[env_id] if is_policy(name)}
     return [
         f"{name}: {card.algorithm}, {card.steps:.2g} steps of {card.env_id} alone, "
@@ -92,7 +92,7 @@ def _refusals(all_results: list[Results]) -> list[Table]:
 
 
 def _price_rows(prices: list[Price], n: int, salt: str) -> list[Row]:
-    """Rows of the price of delay; the scenario names the delay."""
+    """Rows of the price of delay; the scenario has the delay."""
     return [
         Row.of(
             metric,

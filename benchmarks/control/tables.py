@@ -190,7 +190,7 @@ def motion_table(title: str, found: list[Standing]) -> Table:
 
 
 def yardsticks(results: Results, env_id: str, tops: dict[str, Ceiling]) -> Table:
-    """What 0 and 1 mean on every manoeuvre, and where there is a score."""
+    """The costs that scores of 0 and 1 stand for on every manoeuvre, and where there is a score."""
     cells, scored = [], judged(results, env_id, tops)
     for scenario in dict.fromkeys(c.scenario for c in results.found if c.env_id == env_id):
         none = results.of(env_id, scenario, "none")

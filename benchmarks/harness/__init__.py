@@ -1,1 +1,1 @@
-"""What all suites share: rows of results, statistics, parallel cases, the explorer's data."""
+"""Shared by all suites: rows, metrics, statistics, parallel cases, drives, the explorer's data."""

@@ -1,4 +1,4 @@
-"""What suites drive: envs with an estimator in front, and recorded episodes for estimators."""
+"""Envs with an estimator in front, and recorded episodes for estimators."""
 
 import warnings
 from collections.abc import Callable, Mapping

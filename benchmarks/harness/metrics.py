@@ -33,7 +33,7 @@ class Moment(NamedTuple):
 
 
 class Fold(NamedTuple):
-    """How the values of an episode's steps make one number, starting from 0.
+    """A reduction of the values of an episode's steps to one number, starting from 0.
 
     add: from the number so far and a step's value. finish: from the last of them and the steps.
     """
@@ -81,7 +81,7 @@ def _error(name: str) -> Callable[[Moment], Array]:
 
 
 def _change(i: int) -> Callable[[Moment], Array]:
-    """Of what is asked of an input from one decision to the next."""
+    """The change of what is asked of an input, from one decision to the next."""
     return lambda m: np.abs(m.asked[:, i] - m.before[:, i]) * m.full[i]
 
 

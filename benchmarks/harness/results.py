@@ -74,7 +74,7 @@ class Table:
 
 @dataclass
 class Suite:
-    """What a benchmark module gives: rows for machines, tables and figures for people.
+    """The result of a benchmark module: rows for machines, tables and figures for people.
 
     figures: (title, plotly figure, a sentence on what to see). Empty where the extra `report` is
     not installed or pictures were not asked for. explorers: figures with menus. files: what the

@@ -55,7 +55,7 @@ def run(seeds: int = SEEDS, jobs: int | None = None, console: Console | None = N
 
 
 def simulate(seeds: int, jobs: int | None = None, console: Console | None = None) -> Results:
-    """What every simulation and analysis gives, by name."""
+    """The results of every simulation and analysis, by name."""
     cases = [(name, chunk) for name, each in SIMULATIONS.items() for chunk in each.chunks(seeds)]
     parts: dict[str, list[Measured]] = {name: [] for name in SIMULATIONS}
     done = run_cases(measure, cases, NAME, jobs, console)
@@ -94,7 +94,7 @@ def _numbers(ledger: Ledger, paper: str) -> Table:
 
 
 def _notes(ledger: Ledger) -> Table:
-    """What was found out about some claims."""
+    """Remarks on some claims."""
     cells = [[_where(claim), claim.note] for claim, _ in ledger if claim.note]
     return Table("Why", ("paper", "what was found"), cells, keyed=False)
 
@@ -127,7 +127,7 @@ def _checked(found: Found) -> str:
 
 
 def _met(found: tuple[Found, ...]) -> str:
-    """How many of a claim's thresholds are met."""
+    """Whether a claim's thresholds are met, or how many are not."""
     checked = [each.threshold_met for each in found if each.threshold_met is not None]
     if not checked:
         return ""

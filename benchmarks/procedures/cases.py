@@ -1,4 +1,4 @@
-"""What the suite drives and what it finds."""
+"""The suite's cases and their results."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -11,7 +11,7 @@ NAME = "procedures"
 
 @dataclass(frozen=True)
 class Case:
-    """What to drive: a procedure, a car or outside model, a contestant's index, seeds."""
+    """A drive: a procedure, a car or outside model, a contestant's index, seeds."""
 
     procedure: str
     car: str
@@ -39,7 +39,7 @@ class Transient:
 
 
 Done = dict[Case, Any]
-"""What every case gave."""
+"""The result of every case."""
 
 
 def of(done: Done, procedure: str) -> Done:

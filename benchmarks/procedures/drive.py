@@ -33,7 +33,7 @@ CALM: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class Series:
-    """What a car did, (n,) each, at even times, SI units.
+    """The motion of a car, (n,) each, at even times, SI units.
 
     steer: front wheels. v_x, v_y, gamma, psi, X, Y: of the centre of gravity. moment: the yaw
     moment delivered, N m. failed: the episode ended by a failure.

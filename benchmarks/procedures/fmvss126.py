@@ -121,7 +121,7 @@ def sine_with_dwell(car: TestCar, amplitude: float) -> Fields:
 
 
 def judge(series: Series, amplitude: float, A: float) -> Run:
-    """What a run gave; amplitude and A: rad at the steering wheel."""
+    """The result of a run; amplitude and A: rad at the steering wheel."""
     towards = -math.copysign(1.0, amplitude)
     steered = (series.t >= REVERSAL) & (series.t <= COMPLETION)
     peak = float(np.max(towards * series.gamma[steered], initial=0.0))

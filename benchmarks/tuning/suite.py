@@ -100,7 +100,7 @@ def _numbers(task: Task, found: dict[str, float]) -> Table:
 
 
 def entry(task: Task, found: dict[str, float], command: str, note: str = "") -> dict[str, Any]:
-    """What the estimator used in the end, as an entry of a tunings file."""
+    """The tuning that was found, as an entry of a tunings file."""
     used = task.options | found
     q = {key.removeprefix("q_"): value for key, value in used.items() if key.startswith("q_")}
     q = TUNINGS.get((task.estimator, task.sensors), {}) | q

@@ -1,4 +1,4 @@
-"""What is tuned: an estimator on a scenario's drives, its error, and the numbers to be found."""
+"""The task of a tuning: an estimator on a scenario's drives, its error, the numbers to be found."""
 
 import dataclasses
 import hashlib

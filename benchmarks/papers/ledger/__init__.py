@@ -1,1 +1,1 @@
-"""What claims are measured with: simulations, filters, controllers, plots, the verdicts' rule."""
+"""The means to measure claims: simulations, filters, controllers, plots, the verdicts' rule."""

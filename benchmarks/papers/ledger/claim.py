@@ -39,7 +39,7 @@ class Example:
 
 @dataclass
 class Measured:
-    """What a simulation or an analysis gave.
+    """The result of a simulation or an analysis.
 
     numbers: (seeds,) by who and metric. example: None but for the chunk with the first seed.
     """
@@ -49,7 +49,7 @@ class Measured:
 
 
 Results = Mapping[str, Measured]
-"""What was measured, by the name of the simulation or analysis."""
+"""Results by the name of the simulation or analysis."""
 
 MOST = 0.9  # of the seeds
 

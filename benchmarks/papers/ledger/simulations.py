@@ -1,4 +1,4 @@
-"""What a simulation of the ledger is: seeds in cases, and the numbers that they give.
+"""A simulation of the ledger: seeds in cases, and the numbers that they give.
 
 A simulation is data and gives the same `Measured` whatever it is: filters over one drive
 (`estimation`), controllers over the same manoeuvre (`controlled`), or a computation without a car
@@ -49,7 +49,7 @@ class Analysis:
         return chunked(seeds if self.random else 1, CHUNK)
 
     def measure(self, seeds: tuple[int, ...]) -> Measured:
-        """What the function gives."""
+        """The function's result."""
         return self.function(seeds)
 
 

@@ -22,7 +22,7 @@ STATES = ("beta", "gamma", "d1", "d2")
 
 @dataclass(frozen=True)
 class Tracking:
-    """How closely an episode followed its reference.
+    """The errors of an episode from its reference.
 
     rms_beta (rad), rms_gamma (rad/s): of the error, over all ticks. peak_beta (rad): of the slip
     itself. saturated: share of the ticks that ask for the whole yaw moment. steered: the largest

@@ -1,4 +1,4 @@
-"""What becomes of an estimation error between slow samples: maps from the error at the sample.
+"""Estimation errors between slow samples: maps from the error at the sample.
 
 dual-rate's letters: X~_{k+i|k+i} after i steps of 1 / r of the sampling period, from the prediction
 error X~_{k|k-1} at the sample, without noise.

@@ -52,7 +52,7 @@ def literal_gain(Q: Array) -> Array:
 
 
 def spectral_radius(K: Array) -> float:
-    """Of the map of (error, estimated error e) over a frame: (19)-(22) with the gyro at 1 ms."""
+    """Growth of (error, estimated error e) over a frame: (19)-(22) with the gyro at 1 ms."""
     held, latched = transitions()
     I, zero = np.eye(6), np.zeros((6, 6))  # noqa: E741
     inverse = C.T @ np.linalg.inv(C @ C.T)
@@ -96,7 +96,7 @@ def _shipped(Q: Array) -> float:
 
 
 def intersample_maps(seeds: tuple[int, ...]) -> Measured:
-    """How far the error dynamics with pseudo-residuals are from those of a fast camera.
+    """The difference of the error dynamics with pseudo-residuals from those of a fast camera.
 
     The vision model at 1 ms, every row slow, a Kalman gain of random process noise a seed. The
     example has the size of the maps of the appendix's three cases, of the first seed.

@@ -95,7 +95,7 @@ def _response(
 
 
 def _zeros(function: "Callable[[float], float]", grid: Array, values: Array) -> list[float]:
-    """Where the function changes its sign, refined from a grid."""
+    """The zeros of a function, refined from changes of sign on a grid."""
     signs = np.sign(values)
     return [
         float(brentq(function, grid[i], grid[i + 1], xtol=1e-14 * grid[i], rtol=1e-14))

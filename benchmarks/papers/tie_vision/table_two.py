@@ -38,7 +38,7 @@ INTEGRALS = {"forward-euler": 0.0, "tustin": 0.5, "backward-euler": 1.0}  # shar
 
 @dataclass(frozen=True)
 class LoopDesign:
-    """What Table II leaves open.
+    """The choices that Table II leaves open.
 
     speed: m/s. placement, pole: of `design_pi`. integral: of `INTEGRALS`. sensors: what the Kalman
     filter measures in every step: the yaw rate; with psi and y_l; these one step late, (12)-(13).
@@ -70,7 +70,7 @@ class LoopDesign:
 
 
 def _direct(pi: PI, dt: float, integral: str) -> float:
-    """What the PI passes on at once; what it adds up is k_i dt error in all three forms."""
+    """The PI's direct gain; its sum grows by k_i dt error in all three forms."""
     return pi.k_p + INTEGRALS[integral] * pi.k_i * dt
 
 
