@@ -7,19 +7,17 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-import numpy.typing as npt
 from rich.console import Console
 
 from .. import __version__
 from ..agents.rollout import Rollout, rollout
+from ..envs.record import Array
 from ..estimators.analysis.bound import bound
 from .harness.drives import SETTLED, facts_of
 from .harness.parallel import chunked, run_cases
 from .harness.results import Row, Suite, Table
 from .harness.stats import Estimate, interval, ratio_of_roots, root_mean
 from .papers.ledger.filters import Filter, filters_for
-
-Array = npt.NDArray[np.float64]
 
 SEEDS = 100
 QUICK_SEEDS = 10

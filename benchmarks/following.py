@@ -8,13 +8,13 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-import numpy.typing as npt
 from rich.console import Console
 
 from .. import __version__
 from ..agents import make_agent
 from ..agents.controllers.model_following import feedback_gains
 from ..agents.rollout import steps_of
+from ..envs.record import Array
 from ..envs.scenarios.manoeuvres import scenario_from
 from ..envs.ticks import TICK
 from ..envs.vehicle.dynamics import Motion
@@ -25,8 +25,6 @@ from .harness.parallel import run_cases
 from .harness.results import Row, Suite, Table
 from .harness.stats import Estimate, interval
 from .papers.ledger.tracking import drive, tracking
-
-Array = npt.NDArray[np.float64]
 
 BANDWIDTHS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)  # rad/s, K_beta = K_gamma
 SEEDS, QUICK_SEEDS = 10, 2

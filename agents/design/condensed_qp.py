@@ -3,12 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.linalg import block_diag
 
+from ...envs.record import Array
 from .sampled_model import DesignModel, cost_to_go
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)

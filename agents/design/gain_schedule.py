@@ -6,13 +6,11 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from ...envs.backend.decorators import jit
+from ...envs.record import Array
 from ...envs.vehicle.vehicle import Vehicle
 from .sampled_model import Purpose, design_model, regulator
-
-Array = npt.NDArray[np.float64]
 
 SPEEDS = tuple(np.geomspace(2.0, 60.0, 48).tolist())
 """m/s: gains are designed at these, interpolated between and held beyond."""

@@ -3,15 +3,13 @@
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from ...envs.backend.arrays import offsets
 from ...envs.backend.decorators import jit
 from ...envs.backend.rebuild import plain
+from ...envs.record import Array
 from ...envs.vehicle.linear import bicycle_coefficients
 from ...envs.vehicle.vehicle import Vehicle
-
-Array = npt.NDArray[np.float64]
 
 
 class NominalCar(NamedTuple):

@@ -11,16 +11,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ...envs.record import Array
 from ...envs.task.cost import BETA_SCALE, EFFORT_WEIGHT, GAMMA_SCALE, STEER_SCALE
 from ...envs.task.reference import ZERO_SLIP
 from ...envs.ticks import TICK
 from ...envs.vehicle.actuators import lag_of
 from ...envs.vehicle.linear import LinearModel, bicycle
 from ...envs.vehicle.vehicle import Vehicle
-
-Array = npt.NDArray[np.float64]
 
 DYNAMIC = ("beta", "gamma", "N_z", "delta_f")
 """States that the inputs move: rad, rad/s, delivered yaw moment as a share of full scale, applied

@@ -5,15 +5,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 from rich.console import Console
 
+from ...envs.record import Array
 from ..harness.stats import Estimate
 from .cells import INFORMED, YAW, Cell
 from .run import Results, measure
 from .scores import Ceiling, Resampled
-
-Array = npt.NDArray[np.float64]
 
 DELAYS = (0.0, 0.03, 0.06, 0.1, 0.15, 0.2, 0.25, 0.3)  # s, of camera and GPS alike
 FRAME = 0.05  # s: so slow that a camera's frames 0.3 s late find room under way

@@ -5,10 +5,10 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from ...agents import make_agent
 from ...agents.rollout import Rollout, rollout
+from ...envs.record import Array
 from ...envs.vehicle.vehicle import VEHICLES
 from ..harness.drives import make_env
 from ..harness.explorer import Explorer, Panel
@@ -21,8 +21,6 @@ from .delay_price import DELAYS, Price, lines
 from .episodes import SIGNALS
 from .run import Results
 from .tables import Standing
-
-Array = npt.NDArray[np.float64]
 
 _SHOWN = (  # in motion
     Cell(YAW, "", "", "none"),

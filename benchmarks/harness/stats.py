@@ -5,10 +5,9 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy.stats import bootstrap
 
-Array = npt.NDArray[np.float64]
+from ...envs.record import Array
 
 LEVEL = 0.95
 RESAMPLES = 2000

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from ....agents import make_agent
 from ....agents.rollout import Rollout, rollout
@@ -13,7 +12,6 @@ from ....envs.scenarios.scenario import Scenario
 from ...harness.drives import make_env
 from .simulations import rms
 
-Array = npt.NDArray[np.float64]
 Manoeuvre = str | Mapping[str, Any] | Scenario
 
 ENV_ID = "sideslip/AfsYawFusion-v0"

@@ -5,11 +5,9 @@ error X~_{k|k-1} at the sample, without noise.
 """
 
 import numpy as np
-import numpy.typing as npt
 
+from ....envs.record import Array
 from ....estimators.design import dual_rate as spread
-
-Array = npt.NDArray[np.float64]
 
 
 def fast(A: Array, C: Array, L: Array, r: int) -> list[Array]:

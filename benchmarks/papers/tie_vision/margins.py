@@ -9,10 +9,11 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import brentq
 
+from ....envs.record import Array
+
 if TYPE_CHECKING:
     from control import StateSpace, TransferFunction
 
-Array = npt.NDArray[np.float64]
 
 _DECADES, _POINTS = 6, 4000  # of the frequency grid, below half the sampling rate
 

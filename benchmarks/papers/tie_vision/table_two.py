@@ -13,11 +13,11 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.linalg import solve_discrete_are
 
 from ....agents.controllers.two_dof import CAMERA_PERIOD
 from ....agents.design.pi import PI, PLACEMENTS, POLE, design_pi
+from ....envs.record import Array
 from ....envs.scenarios.draws import KMH
 from ....envs.ticks import TICK
 from ....envs.vehicle.linear import bicycle, vision
@@ -28,7 +28,6 @@ from .margins import Margins, margins
 if TYPE_CHECKING:
     from control import StateSpace
 
-Array = npt.NDArray[np.float64]
 Parts = tuple[Array, Array, Array, Array]
 
 PRINTED = (5.92, 22.8)  # dB, single-rate and multirate: Table II of tie-vision
