@@ -9,7 +9,6 @@ from .arrays import at as at
 from .arrays import lane_count as lane_count
 from .arrays import offsets as offsets
 from .arrays import put as put
-from .arrays import put_along as put_along
 from .arrays import ramp as ramp
 from .arrays import read as read
 from .arrays import write as write

@@ -3,8 +3,9 @@
 """Packed arrays: where the numbers of NamedTuples lie in them, and how they are read and written.
 
 A single car's numbers lie in a vector or matrix; those of several cars in SIMD lanes have one axis
-more, the last, and the same functions read and write lanes there. The compiler is taught them as
-plain loads and stores.
+more, the last, and the same functions read and write lanes there. Lanes that are written to a
+C-contiguous matrix of single numbers go along its row. The compiler is taught them as plain loads
+and stores.
 """
 
 from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
@@ -73,18 +74,13 @@ def put(array: Any, value: Any, *index: int) -> None:
 
 
 def lane_count() -> int:
-    """How many numbers `ramp` gives and `put_along` writes at once."""
+    """How many numbers `ramp` makes at once."""
     return 1
 
 
 def ramp(first: int) -> Any:
-    """The whole numbers from `first` on, `lane_count` of them."""
+    """The whole numbers from `first` on, `lane_count` of them, in lanes."""
     return first
-
-
-def put_along(array: Any, values: Any, i: int, j: int) -> None:
-    """Write `lane_count` numbers into the row i of a C-contiguous matrix from the column j on."""
-    array[i, j] = values
 
 
 def _place(context, builder, kind, array, index):
@@ -112,6 +108,8 @@ def _write(context, builder, kind, array, index, value, of):
     where = _place(context, builder, kind, array, index)
     if kind.ndim > len(index):
         builder.store(context.cast(builder, value, of, FLOATS), where, align=8)
+    elif of == FLOATS and kind.ndim == 2 and kind.layout == "C":
+        builder.store(value, builder.bitcast(where, FLOATS.value.as_pointer()), align=8)
     else:
         store_item(context, builder, kind, context.cast(builder, value, of, kind.dtype), where)
 
@@ -216,19 +214,3 @@ class _Ramp(AbstractTemplate):
 @lower_builtin(ramp, types.int64)
 def _lower_ramp(context, builder, sig, args):
     return builder.add(splat(builder, args[0], INTS), ir.Constant(INTS.value, list(range(LANES))))
-
-
-@infer_global(put_along)
-class _PutAlong(AbstractTemplate):
-    def generic(self, args, kws):
-        array, _, _, _ = args
-        matrix = isinstance(array, types.Array) and array.ndim == 2 and array.layout == "C"
-        return signature(types.none, array, FLOATS, types.intp, types.intp) if matrix else None
-
-
-@lower_builtin(put_along, types.Array, FLOATS, types.intp, types.intp)
-def _lower_put_along(context, builder, sig, args):
-    array, values, i, j = args
-    where = _place(context, builder, sig.args[0], array, [i, j])
-    builder.store(values, builder.bitcast(where, FLOATS.value.as_pointer()), align=8)
-    return context.get_dummy_value()

@@ -23,16 +23,17 @@ from .packing import EpisodeConfig, episode_config
 
 
 def in_scenario(sensors: dict[str, SlowSensor], scenario: Scenario) -> dict[str, SlowSensor]:
-    """The sensors with the clocks and delays that a scenario sets for those that are there."""
-    changed = dict(sensors)
-    if "camera" in changed and scenario.camera_delays is not None:
-        changed["camera"] = dataclasses.replace(
-            changed["camera"], delays=scenario.camera_delays, jitter=scenario.camera_jitter
-        )
-    if "gps" in changed and scenario.gps_period is not None:
-        changed["gps"] = dataclasses.replace(changed["gps"], period=scenario.gps_period)
-    if "gps" in changed and scenario.gps_delays is not None:
-        changed["gps"] = dataclasses.replace(changed["gps"], delays=scenario.gps_delays, jitter=0.0)
+    """The sensors with the clocks and delays of a scenario: its fields `<sensor>_period`,
+    `<sensor>_delays` and, with these, `<sensor>_jitter`, where it has them."""
+    changed = {}
+    for name, sensor in sensors.items():
+        period, delays = (getattr(scenario, f"{name}_{key}", None) for key in ("period", "delays"))
+        if period is not None:
+            sensor = dataclasses.replace(sensor, period=period)
+        if delays is not None:
+            jitter = getattr(scenario, f"{name}_jitter", 0.0)
+            sensor = dataclasses.replace(sensor, delays=delays, jitter=jitter)
+        changed[name] = sensor
     return changed
 
 

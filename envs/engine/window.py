@@ -8,7 +8,7 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
-from ..backend.arrays import lane_count, offsets, put, put_along, ramp, read, write
+from ..backend.arrays import lane_count, offsets, put, ramp, read, write
 from ..backend.decorators import jit
 from ..backend.primitives import to_float, whole
 from ..backend.random import CHANNELS, normals
@@ -50,16 +50,10 @@ def foresee(p: Any, z: Any, n: int, follows: int, window: Any) -> None:
         ticks = ramp(first + j)
         inertial = normals(key_low, key_high, ticks, CHANNELS.inertial)
         wheels = normals(key_low, key_high, ticks, CHANNELS.wheels)
-        put_along(window, inertial[0], WINDOW.inertial[0], j)
-        put_along(window, inertial[1], WINDOW.inertial[1], j)
-        put_along(window, inertial[2], WINDOW.inertial[2], j)
-        put_along(window, inertial[3], WINDOW.inertial[3], j)
-        put_along(window, wheels[0], WINDOW.wheels[0], j)
-        put_along(window, wheels[1], WINDOW.wheels[1], j)
-        put_along(window, wheels[2], WINDOW.wheels[2], j)
-        put_along(window, wheels[3], WINDOW.wheels[3], j)
+        write(window, inertial, WINDOW.inertial, j)
+        write(window, wheels, WINDOW.wheels, j)
         if not follows:
-            put_along(window, steering_at(to_float(ticks), programme), WINDOW.ahead, j)
+            put(window, steering_at(to_float(ticks), programme), WINDOW.ahead, j)
 
 
 @jit
