@@ -16,12 +16,17 @@ CAMERA_KIND = SlowKind(
 
 
 @jit
-def camera_sample(motion: Any, road: Any, l_pre: Any, noise: Any, n: Any) -> Any:
-    """(psi, y_l): heading relative to the road, and offset at the preview point.
+def lane_offset(motion: Any, road: Any, l_pre: Any) -> Any:
+    """Lateral offset in m at the preview point, positive to the left of the lane's centre line.
 
     y_l = y_cg + l_pre psi - kappa l_pre^2 / 2, tie-vision (4) with curvature.
     """
-    psi = motion.psi - motion.theta
     bend = 0.5 * curvature_at(road, motion.s) * l_pre * l_pre
-    y_l = motion.y + l_pre * psi - bend
+    return motion.y + l_pre * (motion.psi - motion.theta) - bend
+
+
+@jit
+def camera_sample(motion: Any, road: Any, l_pre: Any, noise: Any, n: Any) -> Any:
+    """(psi, y_l): heading relative to the road, and `lane_offset`."""
+    psi, y_l = motion.psi - motion.theta, lane_offset(motion, road, l_pre)
     return wrap(psi + noise.camera_psi * n[0]), y_l + noise.camera_y * n[1]
