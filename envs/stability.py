@@ -41,8 +41,7 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
     steps nothing; with `on_bad_action="fail"` it ends the episode as a failure.
 
     ## Observation
-    A float32 summary whose length does not depend on the control period. `layout` gives name,
-    unit and bounds of each entry:
+    float32, as long for every control period. `layout` has name, unit and bounds of each entry:
 
     | entries | unit | meaning |
     |---|---|---|
@@ -76,15 +75,14 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
     (floats, `failure` an int code of `sideslip.envs.FAILURES`, `is_success` a bool).
 
     ## Options of reset
-    `scenario`, `vehicle`, `friction`, `state` (mapping of `v_x, v_y, gamma, psi, X, Y, s, y,
-    theta, phi, phi_dot`; the last two where the scenario rolls), `duration` (s), for that
-    episode; unknown keys raise ValueError.
+    `scenario`, `vehicle`, `friction`, `duration` (s), `state` (mapping of `v_x, v_y, gamma, psi, X,
+    Y, s, y, theta`, and `phi, phi_dot` where the car rolls); unknown keys raise ValueError.
 
     ## Arguments
-    All JSON-able. sensors: "vision", "vision-uneven", "gps" or "fusion" (camera and GPS).
-    scenario: a name or a mapping. vehicle: the true one; nominal: what estimators and controllers
-    are told (default: the vehicle). control_period: ticks of 1 ms. reference: "zero-slip", "model"
-    (the nominal steady state) or "limited" (by friction). fast: "summary" or "all". camera, gps:
+    All JSON-able. sensors: "vision", "vision-uneven", "gps" or "fusion" (camera and GPS). scenario:
+    a name or a mapping. vehicle: the true one; nominal: that of estimators and controllers
+    (default: vehicle). control_period: ticks of 1 ms. reference: "zero-slip", "model" (its steady
+    state) or "limited" (by friction). fast: "summary" or "all". slow, by name ("camera", "gps"):
     fields of `SlowSensor` that replace the id's. yaw_first: yaw moment before acceleration where
     both pass the motors' limit. steering: the action may steer too.
     """

@@ -1,4 +1,4 @@
-"""An estimator of a user's own around one environment: FilterPy's UKF, and whatever is none."""
+"""An estimator of a user's own around one environment: FilterPy's UKF and a constant."""
 
 import copy
 import functools
@@ -20,7 +20,6 @@ from sideslip.estimators import (
     EstimatorFactory,
     EstimatorLike,
     make_estimator,
-    smooth,
 )
 from sideslip.estimators.make import ESTIMATORS, register_estimator
 from sideslip.estimators.protocol import ForeignEstimator
@@ -224,87 +223,6 @@ def test_a_spec_of_anything_else_is_no_json() -> None:
             env.spec.to_json()
     with pytest.raises(TypeError, match="cannot build Constant once more: it was passed as an obj"):
         gym.make(built.spec)
-
-
-def without(member: str) -> Any:
-    """A class like `Constant` that lacks a member."""
-    body = {key: value for key, value in vars(Constant).items() if key != member}
-    return type("Lacking", (), {key: body[key] for key in body if not key.startswith("__d")})
-
-
-@pytest.mark.parametrize(
-    ("source", "error", "message"),
-    [
-        (3, TypeError, "int is no estimator: int has no names, reset, step"),
-        (without("reset"), TypeError, "Lacking is no estimator: Lacking has no reset;"),
-        (without("step")(), TypeError, "Lacking is no estimator: Lacking has no step;"),
-        (without("names"), TypeError, "Lacking has no names;"),
-        (lambda **_: None, TypeError, "NoneType has no names, reset, step"),
-        (lambda vehicle: None, TypeError, "unexpected keyword argument"),
-        ("no.such:Thing", ValueError, "there is no module 'no'"),
-        (f"{__name__}:Thing", ValueError, "has no 'Thing'"),
-        (f"{__name__}:STILL", TypeError, "is no factory but of type ndarray"),
-        ("exact-fk", ValueError, "unknown estimator 'exact-fk'; did you mean 'exact-kf'"),
-    ],
-)
-def test_what_is_no_estimator_is_refused_at_once(source: Any, error: Any, message: str) -> None:
-    with pytest.raises(error, match=message):
-        EstimateObservation(gym.make(VISION), source)
-
-
-@pytest.mark.parametrize("names", [(), "beta", ("beta", "beta"), ("beta", 3), ("beta", "")])
-def test_names_are_distinct_words(names: Any) -> None:
-    own = Constant()
-    own.names = names
-    with pytest.raises(ValueError, match="Constant: names are distinct words, one a state, got"):
-        EstimateObservation(gym.make(VISION), own)
-
-
-@pytest.mark.parametrize(
-    ("value", "error", "message"),
-    [
-        (np.zeros((3, 1)), ValueError, r"x has shape \(3,\) for the states mu, gamma, beta, got"),
-        (0.1, ValueError, r"x has shape .* got \(\)"),
-        ("fast", TypeError, "x is no array of numbers"),
-        (None, ValueError, r"got \(\)"),
-    ],
-)
-def test_a_wrong_estimate_is_named_at_the_reset(value: Any, error: Any, message: str) -> None:
-    env: Any = EstimateObservation(gym.make(VISION), Constant(value))
-    with pytest.raises(error, match=message):
-        env.reset(seed=0)
-
-
-def test_other_bad_arguments() -> None:
-    with pytest.raises(ValueError, match="Constant has no state 'psi'; it has: mu, gamma, beta"):
-        EstimateObservation(gym.make(VISION), Constant, outputs=["psi"])
-    lacking: Any = EstimateObservation(gym.make(VISION), without("P"))
-    with pytest.raises(TypeError, match=r"P is no array of numbers.*no attribute 'P'"):
-        lacking.reset(seed=0)
-    for more in ({"vehicle": COMS}, {"options": {"gain": 1}}):
-        with pytest.raises(ValueError, match="Constant is built already: a vehicle and options"):
-            EstimateObservation(gym.make(VISION), Constant(), **more)
-    base: Any = gym.make(VISION).unwrapped
-    slower = make_estimator("bicycle-kf", sensors=base.slow_sensors, dt=2e-3)
-    with pytest.raises(ValueError, match=r"bicycle-kf was built for ticks of 0.002 s, the env has"):
-        EstimateObservation(gym.make(VISION), slower)
-    with pytest.raises(ValueError, match="tick of 0"):
-        make_estimator(Constant, dt=0.0)
-    register_estimator("constant", Constant)
-    with pytest.raises(TypeError, match="needs a filter of the catalogue, got <constant: mu"):
-        smooth("constant", rollout(gym.make(VISION), options={"duration": 0.05}).log, gain=2)
-
-
-def test_a_record_without_rows_or_of_other_ticks() -> None:
-    log = rollout(gym.make(VISION, **FIG7), seed=3, options={"duration": 0.05}).log
-    found = make_estimator(Constant, sensors=log.slow)
-    assert found.run(log)["mu"].tolist() == [0.8] * len(log.record.fast)
-    log.record.dt = 2e-3
-    with pytest.raises(ValueError, match=r"ticks of 0.001 s, the record has 51 of 0.002 s"):
-        found.run(log)
-    log.record.fast, log.record.dt = log.record.fast[:0], 1e-3
-    with pytest.raises(ValueError, match="the record has 0 of"):
-        found.run(log)
 
 
 def test_it_can_be_tuned() -> None:
