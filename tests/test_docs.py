@@ -58,7 +58,8 @@ def test_the_readmes_examples_run(tmp_path: Path) -> None:
 
 
 EXTENDING = "".join(path.read_text() for path in DOCUMENTS if path.name == "EXTENDING.md")
-SECTIONS = dict(section.split("\n", 1) for section in EXTENDING.split("\n## ")[1:])
+PREAMBLE, *_SECTIONS = EXTENDING.split("\n## ")
+SECTIONS = dict(section.split("\n", 1) for section in _SECTIONS)
 
 
 @pytest.mark.parametrize("title", SECTIONS)
@@ -71,12 +72,14 @@ def test_an_extension_runs_in_a_copy_with_its_edits(title: str, tmp_path: Path) 
     for face in ("__init__.py", "__main__.py"):
         shutil.copy(ROOT / face, package)
     edited, code = set(), []
-    for kind, place, text in FENCE.findall(SECTIONS[title]):
+    for kind, place, text in FENCE.findall(PREAMBLE + SECTIONS[title]):
         if kind == "python":
             code.append(text)
         else:
-            edited.add(place)
-            edit(package / place, text)
+            _, *parts = re.split(r"^\+\+\+ (\S+)\n", f"+++ {place}\n{text}", flags=re.MULTILINE)
+            for file, diff in zip(parts[::2], parts[1::2], strict=True):
+                edited.add(file)
+                edit(package / file, diff)
     assert len(edited) <= MOST_FILES[title.removeprefix("A ")]
     assert code
     run("\n".join(code), tmp_path / "empty", package.parent, NUMBA_DISABLE_JIT="1")
