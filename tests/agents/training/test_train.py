@@ -28,7 +28,6 @@ from sideslip.agents.training import train
 from sideslip.agents.training.algorithms import ALGORITHMS
 from sideslip.agents.training.checkpoint import read_state
 from sideslip.agents.training.export import network_from_sb3
-from sideslip.agents.training.normalise import CLIP, Standardised, measured
 from sideslip.agents.training.train import BEST, CHECKPOINT, CURVE, POLICY, Progress, Task, task_in
 from sideslip.agents.vec_env.env import make_vec_env
 
@@ -264,19 +263,6 @@ def test_what_cannot_be_trained_says_why_and_leaves_no_checkpoint(tmp_path: Path
         with pytest.raises(ValueError, match=said):
             train.train(task, 10, tmp_path)
     assert not (tmp_path / CHECKPOINT).exists()
-
-
-def test_observations_are_standardised_by_the_network() -> None:
-    env = TINY.vector_env(16)
-    mean, scale = measured(env, 0.4, 5)
-    names = [entry.name for entry in env.unwrapped.layout]  # type: ignore[attr-defined]
-    assert scale[names.index("gamma_ref")] == 0.0  # zero-slip: it never varies
-    layer = Standardised(env.single_observation_space, mean.tolist(), scale.tolist())
-    obs = 30.0 * np.random.default_rng(0).standard_normal((50, len(mean)))
-    wanted = np.clip((obs - mean) * scale, -CLIP, CLIP)
-    given = layer(torch.tensor(obs, dtype=torch.float32)).numpy()
-    assert given == pytest.approx(wanted, abs=1e-3)
-    assert np.abs(wanted).max() == CLIP and not list(layer.parameters())
 
 
 def test_the_network_of_the_file_standardises_as_torch_does(folder: Path) -> None:

@@ -1,0 +1,23 @@
+"""What a network sees: standardised observations, clipped."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip("stable_baselines3")
+import torch
+
+from sideslip.agents.training.normalise import CLIP, Standardised, measured
+from sideslip.agents.training.train import Task
+
+
+def test_observations_are_standardised_by_the_network() -> None:
+    env = Task(env_options={"scenario": "sine-with-dwell"}, seed=3).vector_env(16)
+    mean, scale = measured(env, 0.4, 5)
+    names = [entry.name for entry in env.unwrapped.layout]  # type: ignore[attr-defined]
+    assert scale[names.index("gamma_ref")] == 0.0  # zero-slip: it never varies
+    layer = Standardised(env.single_observation_space, mean.tolist(), scale.tolist())
+    obs = 30.0 * np.random.default_rng(0).standard_normal((50, len(mean)))
+    wanted = np.clip((obs - mean) * scale, -CLIP, CLIP)
+    given = layer(torch.tensor(obs, dtype=torch.float32)).numpy()
+    assert given == pytest.approx(wanted, abs=1e-3)
+    assert np.abs(wanted).max() == CLIP and not list(layer.parameters())
