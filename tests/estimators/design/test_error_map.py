@@ -133,3 +133,12 @@ def test_random_delay_is_judged_by_its_extremes() -> None:
 def test_spectral_radius_of_a_rotation_is_its_growth() -> None:
     turn = 1.25 * np.array([[0.0, -1.0], [1.0, 0.0]])
     assert spectral_radius(turn) == pytest.approx(1.25)
+
+
+def test_a_filter_with_two_slow_sensors_is_checked_with_the_first_alone() -> None:
+    """Its states, so that the directions are those that a second sensor may see."""
+    both = {"camera": CAMERA, "gps": SlowSensor(0.1, (0.25,))}
+    fused = make_estimator("exact-kf", sensors=both, slow=["camera", "gps"], speed=7.0)
+    alone = make_estimator("exact-kf", sensors=both, slow="camera", speed=7.0)
+    assert fused.unobservable == alone.unobservable == ()
+    assert fused.spectral_radius == alone.spectral_radius
