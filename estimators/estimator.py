@@ -19,7 +19,7 @@ from .core.run import begin_all
 from .core.transition import KINEMATIC, LATERAL, VELOCITY_ROLL
 from .design.config import FilterConfig
 from .design.error_map import MARGINAL, error_map, spectral_radius, unobservable
-from .design.models import UNITS
+from .design.models import STATES
 from .design.periodic import design, table_shape
 from .design.schedule import Schedule, whole_ticks
 from .estimates import Estimates, UnobservableWarning
@@ -50,7 +50,7 @@ class Estimator:
     ) -> None:
         self.config, self.name, self.dt = config, config.name, dt
         self.names = config.states
-        self.units = tuple(UNITS[state] for state in self.names)
+        self.units = tuple(STATES[state].unit for state in self.names)
         self.sensors = dict(config.sensors)
         self.filters, self._schedules = filters, schedules
         f = self._f

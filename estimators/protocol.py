@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from ..envs.record import PACKET, Log, Record
 from ..envs.sensors.link import SlowSensor
-from .design.models import UNITS
+from .design.models import FOREIGN_STATE, STATES
 from .estimates import Estimates
 
 Array = npt.NDArray[np.float64]
@@ -26,7 +26,7 @@ class EstimatorLike(Protocol):
     def names(self) -> Sequence[str]:
         """Of the n states; "beta" and "gamma" are the sideslip angle and the yaw rate.
 
-        States with a name of `design.models.UNITS` are in that unit; others have the unit "-".
+        States with a name of `design.models.STATES` are in that unit; others have the unit "-".
         """
 
     @property
@@ -84,7 +84,7 @@ class ForeignEstimator:
         words = all(isinstance(each, str) and each for each in self.names)
         if not (self.names and words and len(set(self.names)) == len(self.names)):
             raise ValueError(f"{name}: names are distinct words, one a state, got {inner.names!r}")
-        self.units = tuple(UNITS.get(state, "-") for state in self.names)
+        self.units = tuple(STATES.get(state, FOREIGN_STATE).unit for state in self.names)
 
     def reset(self, sensors: Mapping[str, SlowSensor] | None = None, first: int = 0) -> None:
         """Forget everything; as `EstimatorLike.reset`, None for the clocks of the last time."""

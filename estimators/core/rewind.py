@@ -28,7 +28,7 @@ def _slot(f: Memory, tick: int) -> int:
 
 
 @jit
-def _shoot(f: Memory, slot: int) -> None:
+def _snapshot(f: Memory, slot: int) -> None:
     """Store states and covariance in a snapshot."""
     for i in range(f.n):
         f.snapshot_x[slot, i] = f.x[i]
@@ -53,7 +53,7 @@ def remember(f: Memory) -> None:
     copied(f.y, f.past_y[slot])
     f.past_speed[slot], f.past_turning[slot] = f.model_speed, f.turning
     if (f.tick - f.start) % EVERY == 0:
-        _shoot(f, _slot(f, f.tick))
+        _snapshot(f, _slot(f, f.tick))
 
 
 @jit
@@ -134,7 +134,7 @@ def _filter_anew(f: Memory, gains: Gains, first: int, new: int) -> bool:
     """Filter anew from the snapshot at `first` to now; False, and back to now, if the gate refuses
     the sample at the place `new`."""
     now, invalid, count = f.tick, f.counts[COUNTERS.invalid], _since(f, first)
-    _shoot(f, _NOW)
+    _snapshot(f, _NOW)
     _restore(f, _slot(f, first))
     passed = True
     for tick in range(first, now + 1):
@@ -143,7 +143,7 @@ def _filter_anew(f: Memory, gains: Gains, first: int, new: int) -> bool:
             advance_state(f, f.u)
             correct_fast(f, gains)
             if (tick - f.start) % EVERY == 0:
-                _shoot(f, _slot(f, tick))
+                _snapshot(f, _slot(f, tick))
         if not _measure_again(f, gains, tick, count, new):  # no snapshot was changed before
             passed = False
             break

@@ -8,6 +8,7 @@ from .innovation import dilution
 from .memory import COUNTERS, WINDOW, Gains, Memory, Row
 from .packets import receive_sample
 from .speed import finite
+from .transition import BETA
 
 
 @jit
@@ -20,9 +21,9 @@ def pass_on(first: Memory, second: Memory, gains: Gains, packet: Row) -> None:
     of the angle, (V sigma_beta)^2, and of the speed, (sigma_V sin(beta))^2.
     """
     s, captured = int(packet[PACKET.sensor]), int(packet[PACKET.captured])
-    beta = first.x[0]
+    beta = first.x[BETA]
     if captured >= maximum(first.start, first.tick - WINDOW + 1) and captured < first.tick:
-        beta = first.predicted[captured % WINDOW, 0]
+        beta = first.predicted[captured % WINDOW, BETA]
     sine, cosine = sincos(beta)
     V = packet[first.speed_column[s]]
     if not finite(V):
@@ -35,5 +36,5 @@ def pass_on(first: Memory, second: Memory, gains: Gains, packet: Row) -> None:
     factor = dilution(first, s, packet)
     along = second.r_speed * factor * factor
     second.r[s, 0] = along
-    second.r[s, 1] = V * V * first.P[0, 0] + along * sine * sine
+    second.r[s, 1] = V * V * first.P[BETA, BETA] + along * sine * sine
     receive_sample(second, gains)

@@ -10,7 +10,8 @@ from .memory import CAR, CORE, INPUTS, SLOW, Memory
 
 LATERAL, ROLL, KINEMATIC, VELOCITY_ROLL, YAW, FORCES, LINEAR = range(7)
 """Kinds of models; LINEAR is any linear system, whose matrices are arguments."""
-PSI = 2  # the place of the heading in a bicycle's states
+BETA, GAMMA, PSI, Y_L = range(4)
+"""Places of a bicycle's states."""
 
 SLOWEST = 1.5  # m/s: below it the model stays that of this speed
 
@@ -23,7 +24,7 @@ def _lateral(f: Memory, V: Any) -> None:
     if f.forces == 1:
         B[0, INPUTS], B[1, INPUTS + 1] = 1.0 / (f.car[CAR.mass] * V), B[1, 1]
     if f.fasts > 1:
-        f.C_fast[1, 0], f.C_fast[1, 1] = V * A[0, 0], V * (A[0, 1] + 1.0)
+        f.C_fast[1, BETA], f.C_fast[1, GAMMA] = V * A[0, 0], V * (A[0, 1] + 1.0)
         f.D_fast[1, 0] = V * B[0, 0]
 
 

@@ -1,6 +1,6 @@
 """The Kalman filter in textbook letters, and the generalised inverses that pseudo-residuals need.
 
-Shapes: x (n,), P (n, n), F (n, n), Q (n, n), C (p, n), R (p, p), y (p,).
+Shapes: P (n, n), C (p, n), R (p, p), y = C x + v (p,).
 """
 
 import numpy as np
@@ -10,11 +10,6 @@ Array = npt.NDArray[np.float64]
 
 RIDGE = 1e-3  # lambda of Tikhonov's inverse, in SI units squared
 INVERSES = ("moore-penrose", "p-weighted", "tikhonov", "bayes")
-
-
-def predict(x: Array, P: Array, F: Array, Q: Array) -> tuple[Array, Array]:
-    """Mean and covariance one step on; inputs are added to the mean by the caller."""
-    return F @ x, F @ P @ F.T + Q
 
 
 def gain(P: Array, C: Array, R: Array) -> Array:
@@ -27,18 +22,11 @@ def gain(P: Array, C: Array, R: Array) -> Array:
     return np.asarray(np.linalg.solve((C @ PC + R).T, PC.T).T, np.float64)
 
 
-def update(x: Array, P: Array, C: Array, R: Array, y: Array) -> tuple[Array, Array]:
-    """Mean and covariance given y = C x + v.
-
-    The covariance takes Joseph's form: a sum of two squares stays symmetric and positive
-    semidefinite under rounding, and it holds for every gain, not only the optimal one.
-    """
-    K = gain(P, C, R)
-    return x + K @ (y - C @ x), joseph(P, K, C, R)
-
-
 def joseph(P: Array, K: Array, C: Array, R: Array) -> Array:
-    """Covariance after a correction by any gain K: (I - K C) P (I - K C)^T + K R K^T."""
+    """Covariance after a correction by any gain K: (I - K C) P (I - K C)^T + K R K^T.
+
+    A sum of two squares stays symmetric and positive semidefinite under rounding.
+    """
     rest = np.eye(len(P)) - K @ C
     after: Array = rest @ P @ rest.T + K @ R @ K.T
     return after

@@ -24,34 +24,36 @@ Array = npt.NDArray[np.float64]
 
 
 class State(NamedTuple):
-    """A state: its unit, and the usual standard deviation at the start."""
+    """A state: unit, usual standard deviation at the start, and bound of estimates observed."""
 
     unit: str
     prior: float
+    bound: float
 
 
 STATES = {
-    "beta": State("rad", 0.02),
-    "gamma": State("rad/s", 0.05),
-    "psi": State("rad", 0.05),
-    "y_l": State("m", 0.3),
-    "psi_late": State("rad", 0.05),
-    "y_l_late": State("m", 0.3),
-    "v_x": State("m/s", 0.1),
-    "v_y": State("m/s", 0.1),
-    "phi": State("rad", 0.02),
-    "phi_rate": State("rad/s", 0.05),
-    "F_yf": State("N", 500.0),
-    "F_yr": State("N", 500.0),
-    "d1": State("rad/s", 0.1),
-    "d2": State("rad/s2", 1.0),
-    "d3": State("rad/s", 0.1),
-    "d": State("rad/s2", 1.0),
-    "F_d": State("N", 0.0),
-    "N_d": State("N m", 100.0),
+    "beta": State("rad", 0.02, np.pi / 2.0),
+    "gamma": State("rad/s", 0.05, 10.0),
+    "psi": State("rad", 0.05, np.pi),
+    "y_l": State("m", 0.3, 200.0),
+    "psi_late": State("rad", 0.05, np.pi),
+    "y_l_late": State("m", 0.3, 200.0),
+    "v_x": State("m/s", 0.1, 100.0),
+    "v_y": State("m/s", 0.1, 100.0),
+    "phi": State("rad", 0.02, np.pi / 2.0),
+    "phi_rate": State("rad/s", 0.05, 10.0),
+    "F_yf": State("N", 500.0, 1e5),
+    "F_yr": State("N", 500.0, 1e5),
+    "d1": State("rad/s", 0.1, 100.0),
+    "d2": State("rad/s2", 1.0, 1000.0),
+    "d3": State("rad/s", 0.1, 100.0),
+    "d": State("rad/s2", 1.0, 1000.0),
+    "F_d": State("N", 0.0, 1e5),
+    "N_d": State("N m", 100.0, 1e5),
 }
 """All states of all models, by name."""
-UNITS = {name: state.unit for name, state in STATES.items()}
+FOREIGN_STATE = State("-", 0.0, 1e6)
+"""Any other, which only a user's estimator has."""
 
 
 @dataclass(frozen=True)

@@ -11,33 +11,10 @@ from ...envs.backend.elementary import wrap
 from ...envs.backend.primitives import ARRAYS
 from ...envs.backend.rebuild import plain
 from ...envs.task.observation import Entry
-from ..design.models import UNITS
+from ..design.models import FOREIGN_STATE, STATES
 from ..protocol import EstimatorLike, deviations
 
 Array = npt.NDArray[np.float64]
-
-BOUNDS = {
-    "beta": np.pi / 2.0,
-    "gamma": 10.0,
-    "psi": np.pi,
-    "y_l": 200.0,
-    "psi_late": np.pi,
-    "y_l_late": 200.0,
-    "v_x": 100.0,
-    "v_y": 100.0,
-    "phi": np.pi / 2.0,
-    "phi_rate": 10.0,
-    "F_yf": 1e5,
-    "F_yr": 1e5,
-    "d1": 100.0,
-    "d2": 1000.0,
-    "d3": 100.0,
-    "d": 1000.0,
-    "F_d": 1e5,
-    "N_d": 1e5,
-}
-"""Estimates are clipped here, headings are wrapped."""
-OTHER_BOUND = 1e6  # of a state that only a user's estimator has
 
 TRUTHS = {"beta": 1, "gamma": 2}  # states whose truth stands in the info
 BETA, STD, NEES = 0, 1, 2  # places in the summary of a step
@@ -83,9 +60,10 @@ def outputs_of(
         if output not in states:
             raise ValueError(f"{estimator} has no state {output!r}; it has: {', '.join(states)}")
     before = "" if name is None else f"{name}_"
-    known = [(s, UNITS.get(s, "-"), BOUNDS.get(s, OTHER_BOUND)) for s in outputs]
-    hats = [Entry(f"{before}{s}_hat", unit, -bound, bound) for s, unit, bound in known]
-    stds = [Entry(f"{before}{s}_std", unit, 0.0, bound) for s, unit, bound in known]
+    kinds = [STATES.get(s, FOREIGN_STATE) for s in outputs]
+    each = list(zip(outputs, kinds, strict=True))
+    hats = [Entry(f"{before}{s}_hat", kind.unit, -kind.bound, kind.bound) for s, kind in each]
+    stds = [Entry(f"{before}{s}_std", kind.unit, 0.0, kind.bound) for s, kind in each]
     layout = (*inner, *hats, *(stds if std else ()))
     names = [each.name for each in layout]
     twice = sorted({each for each in names if names.count(each) > 1})
@@ -99,7 +77,7 @@ def outputs_of(
         layout,
         len(inner),
         np.array(columns, np.int64).T.copy(),
-        np.array([bound for *_, bound in known]).astype(np.float32).astype(np.float64),
+        np.array([kind.bound for kind in kinds]).astype(np.float32).astype(np.float64),
         tuple((before + key, place) for key, place in keys),
     )
 

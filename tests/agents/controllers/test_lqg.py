@@ -18,7 +18,7 @@ from sideslip.agents import Lqr, make_agent
 from sideslip.envs.ticks import TICK
 from sideslip.envs.vehicle.linear import LinearModel, bicycle
 from sideslip.estimators import EstimateObservation
-from sideslip.estimators.analysis.bound import riccati
+from tests.estimators.riccati import riccati
 
 V, STEPS, PERIOD = 7.0, 200, 10
 LEVELS = {"force_sd": 15.0, "moment_sd": 6.0, "disturbance_time": 0.3, "gyro_noise": 0.002}

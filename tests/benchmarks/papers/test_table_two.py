@@ -21,7 +21,7 @@ from sideslip.benchmarks.papers.tie_vision.table_two import (
 )
 from sideslip.envs import COMS
 from sideslip.envs.vehicle.linear import bicycle, vision
-from sideslip.estimators.design.kalman import gain, joseph, predict
+from sideslip.estimators.design.kalman import gain, joseph
 
 V = 25.0 / 3.6
 DESIGN = LoopDesign()
@@ -58,7 +58,7 @@ def test_the_loop_is_what_a_step_by_step_controller_does(sensors: str, integral:
     P, R = np.eye(len(F)), design.noise * np.eye(len(measured))
     for _ in range(3000):
         K = gain(P, measured, R)
-        _, P = predict(np.zeros(len(F)), joseph(P, K, measured, R), F, Q)
+        P = F @ joseph(P, K, measured, R) @ F.T + Q
     x, seen, hat, total, out = np.zeros(n), np.zeros(2), np.zeros(len(F)), 0.0, []
     for k in range(steps):
         y = C @ x if not late else np.array([x[1], *seen])

@@ -7,7 +7,8 @@ import pytest
 
 from sideslip.envs.sensors.link import SlowSensor
 from sideslip.estimators import make_estimator
-from sideslip.estimators.analysis.bound import bound, riccati
+from sideslip.estimators.analysis.bound import bound
+from tests.estimators.riccati import riccati
 from tests.estimators.simulation import CAMERA, FIG7, GPS, error, simulate
 
 SETS = {
@@ -50,11 +51,3 @@ def test_lost_frames_raise_the_bound() -> None:
     full = bound(FIG7.truth, record=log.record, **common)
     log.record.packets = log.record.packets[::3]
     assert (bound(FIG7.truth, record=log.record, **common)[100:] >= full[100:]).all()
-
-
-def test_riccati_refuses_what_has_no_limit() -> None:
-    jittery = {"camera": SlowSensor(0.033, (0.01,), jitter=0.02)}
-    with pytest.raises(ValueError, match="camera's delay is random"):
-        riccati(FIG7.truth, sensors=jittery, speed=7.0)
-    with pytest.raises(TypeError, match="wobble"):
-        riccati(FIG7.truth, sensors={}, speed=7.0, wobble=1.0)

@@ -16,11 +16,11 @@ from sideslip.envs import Log
 from sideslip.envs.record import PACKET
 from sideslip.envs.scenarios.manoeuvres import scenario_from
 from sideslip.estimators import Estimator, make_estimator
-from sideslip.estimators.analysis.bound import riccati
 from sideslip.estimators.design.config import DISTURBANCE, NOISE
 from sideslip.estimators.design.measurements import MEASUREMENTS
 from sideslip.estimators.design.models import states_for
 from tests.estimators.drives import Drives, told
+from tests.estimators.riccati import riccati
 
 RUNS = 128
 SURE = 0.999
