@@ -235,5 +235,5 @@ def test_it_can_be_tuned() -> None:
     base: Any = gym.make(VISION, **FIG7).unwrapped
     drives = [Drive(log, facts_of(base))]
     assert squares(task, drives, {"gyro": 0.005}) < squares(task, drives, {"gyro": 1.0})
-    with pytest.raises(ValueError, match="has no process noise to search; say which options"):
+    with pytest.raises(ValueError, match="has no process noise to search; name the options"):
         make_task(UKF, "tie-vision-fig7", seeds=1)
