@@ -39,6 +39,7 @@ DAMAGE: dict[str, Callable[[Path], object]] = {
     "few numbers": lambda path: _spoiled(path, numbers=np.zeros((len(SEEDS), NUMBERS - 1))),
     "a number": lambda path: _spoiled(path, numbers=np.float64(1.0)),
     "texts": lambda path: _spoiled(path, numbers=np.full((len(SEEDS), NUMBERS), "a")),
+    "whole numbers": lambda path: _spoiled(path, numbers=np.zeros((len(SEEDS), NUMBERS), int)),
     "NaN": lambda path: _spoiled(path, numbers=np.full((len(SEEDS), NUMBERS), np.nan)),
     "no seconds": lambda path: _spoiled(path, seconds=None),
     "seconds": lambda path: _spoiled(path, seconds=np.zeros(3)),

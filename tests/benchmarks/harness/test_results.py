@@ -92,7 +92,9 @@ def test_rows_that_are_none_are_refused_with_their_file(
     assert str(caught.value).startswith(str(path)) and len(str(caught.value)) < 500
 
 
-def test_what_cannot_be_written_is_refused_before_the_work(tmp_path: Path) -> None:
+def test_what_cannot_be_written_is_refused_before_the_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "link").symlink_to(tmp_path / "nowhere" / "file")
     check_writable(None, tmp_path / "file", tmp_path / "pipe", Path("/dev/null"))
@@ -101,3 +103,8 @@ def test_what_cannot_be_written_is_refused_before_the_work(tmp_path: Path) -> No
     for path in (tmp_path / "nowhere" / "file", tmp_path / "link"):
         with pytest.raises(FileNotFoundError, match="there is no such folder"):
             check_writable(path)
+    writable = {tmp_path / "pipe"}
+    monkeypatch.setattr(os, "access", lambda path, mode: path in writable)
+    check_writable(tmp_path / "pipe")  # whatever its folder is
+    with pytest.raises(PermissionError, match="read-only"):
+        check_writable(tmp_path / "file")

@@ -1,12 +1,13 @@
 """A file is whole or as it was; links, modes, pipes and devices stay what they are."""
 
 import os
+import pty
 import stat
 import subprocess
 import sys
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -69,7 +70,7 @@ def test_a_link_stays_and_its_target_is_written(there: bool, path: Path) -> None
 def test_a_pipe_is_written_and_stays(path: Path) -> None:
     os.mkfifo(path)
     read: list[bytes] = []
-    reader = threading.Thread(target=lambda: read.append(path.read_bytes()))
+    reader = threading.Thread(target=lambda: read.append(path.read_bytes()), daemon=True)
     reader.start()
     write_whole(path, b"new")
     reader.join(timeout=10)
@@ -78,8 +79,11 @@ def test_a_pipe_is_written_and_stays(path: Path) -> None:
 
 
 def test_a_device_is_written_and_stays() -> None:
-    write_whole("/dev/null", b"new")
-    assert stat.S_ISCHR(os.stat("/dev/null").st_mode)
+    ours, theirs = pty.openpty()
+    write_whole(os.ttyname(theirs), b"new")
+    assert os.read(ours, 3) == b"new" and stat.S_ISCHR(os.stat(os.ttyname(theirs)).st_mode)
+    os.close(ours)
+    os.close(theirs)
 
 
 WRITE = """
@@ -139,15 +143,13 @@ def test_writers_at_once_leave_one_whole_file(path: Path) -> None:
     contents = [bytes([65 + i]) * 100_000 for i in range(8)]
     started = threading.Barrier(len(contents))
 
-    def write(content: bytes) -> Any:
-        started.wait()
-        write_whole(path, content)
+    def write(content: bytes) -> None:
+        with whole(path) as file:
+            started.wait(timeout=10)  # all are at it
+            file.write(content)
 
-    threads = [threading.Thread(target=write, args=(content,)) for content in contents]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    with ThreadPoolExecutor(len(contents)) as pool:
+        list(pool.map(write, contents))
     assert path.read_bytes() in contents and os.listdir(path.parent) == ["file"]
 
 

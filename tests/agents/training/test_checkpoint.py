@@ -1,0 +1,47 @@
+"""A checkpoint that lacks something says what, and where."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("stable_baselines3")
+import torch
+from safetensors.torch import save
+
+from sideslip.agents.training.checkpoint import FORMAT, STATE
+from sideslip.agents.training.train import CHECKPOINT, Task, task_in
+
+WHOLE = dict.fromkeys(sorted(STATE), 0) | {"format": FORMAT, "task": dataclasses.asdict(Task())}
+
+
+def without(key: str, values: dict[str, object]) -> dict[str, object]:
+    return {name: value for name, value in values.items() if name != key}
+
+
+@pytest.mark.parametrize(
+    ("state", "message"),
+    [
+        *((without(key, WHOLE), f": the checkpoint's state lacks {key}") for key in sorted(STATE)),
+        *(
+            (WHOLE | {"task": without(each.name, WHOLE["task"])}, f"'s task lacks {each.name}")  # type: ignore[arg-type]
+            for each in dataclasses.fields(Task)
+        ),
+        (without("format", WHOLE), "is no checkpoint of this format"),
+        ([1], "is no checkpoint of this format"),
+        ("cut", "is no checkpoint: its state is no JSON"),
+    ],
+)
+def test_what_a_checkpoint_lacks_is_named(state: object, message: str, tmp_path: Path) -> None:
+    text = "{" if state == "cut" else json.dumps(state)
+    (tmp_path / CHECKPOINT).write_bytes(save({"a": torch.zeros(1)}, {"checkpoint": text}))
+    with pytest.raises(ValueError, match=message) as caught:
+        task_in(tmp_path)
+    assert str(caught.value).startswith(str(tmp_path / CHECKPOINT))
+
+
+def test_a_whole_checkpoint_is_read(tmp_path: Path) -> None:
+    state = {"checkpoint": json.dumps(WHOLE)}
+    (tmp_path / CHECKPOINT).write_bytes(save({"a": torch.zeros(1)}, state))
+    assert task_in(tmp_path) == Task()
