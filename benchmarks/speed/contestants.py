@@ -1,10 +1,10 @@
-"""The contestants of one comparison, and those that could not come; what they took, shown."""
+"""The contestants of one comparison, those that could not come, and the table of their costs."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 from ..harness.results import Row, Suite, Table
-from .timing import Contestant, Taken, spread
+from .timing import Contestant, Effort, Taken, interleaved, spread
 
 
 class AbsentError(Exception):
@@ -29,52 +29,36 @@ class Field:
                 raise
             self.absent[name] = f"{package} is not installed"
 
+    def measure(
+        self, suite: Suite, title: str, unit: str, effort: Effort, note: str
+    ) -> tuple[dict[str, Taken], dict[str, str]]:
+        """Time the contestants, add rows and a table; (times by name, why others are absent).
+
+        unit: "step" or "tick".
+        """
+        taken, cells = interleaved(self.contestants, effort), []
+        for name, values in taken.items():
+            middle, *ends = add_row(suite, name, f"us_per_{unit}", values)
+            cells.append([name, three(middle), " .. ".join(map(three, ends)), rate(middle)])
+        if cells:
+            header = ("", f"us per {unit}", "range", "per CPU-s")
+            text = note + absences(self.absent)
+            suite.tables.append(Table(title, header, cells, text, keyed=False))
+        return taken, self.absent
+
+
+def add_row(suite: Suite, name: str, metric: str, values: Taken) -> tuple[float, float, float]:
+    """Add a row of a suite; its (median, least, largest)."""
+    middle, low, high = spread(values)
+    suite.rows.append(Row(suite.name, name, metric, middle, low=low, high=high, n=len(values)))
+    return middle, low, high
+
 
 def absences(absent: Mapping[str, str]) -> str:
     """A sentence on those that could not come, or nothing."""
     if not absent:
         return ""
     return f" Not measured: {'; '.join(f'{name} ({why})' for name, why in absent.items())}."
-
-
-def add_rows(suite: Suite, name: str, taken: Taken, unit: str) -> None:
-    """CPU and wall time as rows; unit: "step" or "tick"."""
-    for values, metric in ((taken.cpu, f"us_per_{unit}"), (taken.wall, f"wall_us_per_{unit}")):
-        middle, low, high = spread(values)
-        suite.rows.append(Row(suite.name, name, metric, middle, low=low, high=high, n=len(values)))
-
-
-def add_costs(
-    suite: Suite,
-    title: str,
-    unit: str,
-    taken: Mapping[str, Taken],
-    note: str,
-    absent: Mapping[str, str],
-) -> None:
-    """A row and a table's line for each contestant."""
-    cells = []
-    for name, each in taken.items():
-        add_rows(suite, name, each, unit)
-        middle, low, high = spread(each.cpu)
-        cells.append(
-            [
-                name,
-                three(middle),
-                f"{three(low)} .. {three(high)}",
-                rate(middle),
-                rate(spread(each.wall)[0]),
-            ]
-        )
-    suite.tables.append(
-        Table(
-            title,
-            ("", f"us per {unit}", "range", "per CPU-s", "per s"),
-            cells,
-            note + absences(absent),
-            keyed=False,
-        )
-    )
 
 
 def three(value: float) -> str:

@@ -6,7 +6,6 @@ Ours is 10 ms of driving, ten ticks of plant and sensors, infos included. Single
 
 import warnings
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -15,8 +14,8 @@ import numpy as np
 from ...estimators.vector.estimate import EstimateObservation as EstimateObservations
 from ...estimators.wrappers.estimate import EstimateObservation
 from ..harness.results import Suite
-from .contestants import Field, add_costs
-from .timing import Contestant, Effort, Taken, interleaved
+from .contestants import Field
+from .timing import Contestant, Effort, Taken
 
 COUNT = 1024  # environments at once
 EPISODE, CHUNK = 500, 50  # steps, the most; in one call
@@ -25,18 +24,12 @@ STEPS, FRAMES = 10, 33  # of a batch, in one call; until camera frames fall on s
 FUSION_ID, VISION_ID = "sideslip/YawFusion-v0", "sideslip/YawVision-v0"
 FUSION, VISION = "YawFusion-v0", "YawVision-v0"
 PROMPT: dict[str, Any] = {"camera": {"delays": [0.0]}}
-FILTERS: dict[str, tuple[str, dict[str, Any]]] = {
-    "multirate-kf": ("multirate-kf", {}),
-    "exact-kf, full P": ("exact-kf", {"gains": "covariance"}),
-    "exact-kf, full P, adaptive": ("exact-kf", {"gains": "covariance", "adapt": 0.02}),
-}
+FILTER: dict[str, Any] = {"estimator": "exact-kf", "options": {"gains": "covariance"}}
 AT_ONCE = f"{FUSION} x {COUNT}"
-FULL_COVARIANCE = f"{AT_ONCE} + exact-kf, full P"
-AT_ENDS = f"{AT_ONCE}, infos at ends"
+ALONE_FILTERED, FILTERED = (f"{who} + exact-kf, full P" for who in (FUSION, AT_ONCE))
 LATE, NONE_LATE = f"{VISION} x {COUNT}", f"{VISION} x {COUNT}, no delay"
-CARTPOLE, PENDULUM, LANE = "CartPole-v1", "Pendulum-v1", "lane-keeping-v0 (highway-env)"
-CARTPOLES = f"{CARTPOLE} x {COUNT}"
-PENDULUMS = f"{PENDULUM} x {COUNT} (EnvPool)"
+CARTPOLE, LANE = "CartPole-v1", "lane-keeping-v0 (highway-env)"
+CARTPOLES, PENDULUMS = f"{CARTPOLE} x {COUNT}", f"Pendulum-v1 x {COUNT} (EnvPool)"
 
 Policy = Callable[[Any], Any]
 
@@ -107,7 +100,7 @@ def _cartpoles() -> Contestant:
 def _pendulums() -> Contestant:
     import envpool
 
-    env: Any = envpool.make(PENDULUM, env_type="gymnasium", num_envs=COUNT, num_threads=1)
+    env: Any = envpool.make("Pendulum-v1", env_type="gymnasium", num_envs=COUNT, num_threads=1)
     env.reset()
     idle = np.zeros((COUNT, 1), np.float32)
 
@@ -128,31 +121,16 @@ def _vector(env_id: str, **arguments: Any) -> Any:
     return gym.make_vec(env_id, COUNT, **arguments)
 
 
-def _filtered(label: str) -> Contestant:
-    name, options = FILTERS[label]
-    return episode(EstimateObservation(gym.make(FUSION_ID), name, options=options))
-
-
-def _all_filtered(label: str) -> Contestant:
-    name, options = FILTERS[label]
-    return batch(EstimateObservations(_vector(FUSION_ID), name, options=options))
-
-
 def contestants() -> Field:
     """All environments; those of packages that are not installed are absent."""
     field = Field()
     field.add(FUSION, lambda: episode(gym.make(FUSION_ID)))
     field.add(AT_ONCE, lambda: batch(_vector(FUSION_ID)))
-    field.add(AT_ENDS, lambda: batch(_vector(FUSION_ID, info="ends")))
-    for label in FILTERS:
-        field.add(f"{FUSION} + {label}", partial(_filtered, label))
-        field.add(f"{AT_ONCE} + {label}", partial(_all_filtered, label))
-    field.add(VISION, lambda: episode(gym.make(VISION_ID)))
-    field.add(f"{VISION}, no delay", lambda: episode(gym.make(VISION_ID, **PROMPT)))
+    field.add(ALONE_FILTERED, lambda: episode(EstimateObservation(gym.make(FUSION_ID), **FILTER)))
+    field.add(FILTERED, lambda: batch(EstimateObservations(_vector(FUSION_ID), **FILTER)))
     field.add(LATE, lambda: batch(_vector(VISION_ID), FRAMES))
     field.add(NONE_LATE, lambda: batch(_vector(VISION_ID, **PROMPT), FRAMES))
     field.add(CARTPOLE, lambda: episode(gym.make(CARTPOLE), upright))
-    field.add(PENDULUM, lambda: episode(gym.make(PENDULUM)))
     field.add(LANE, _lane_keeping, "highway-env")
     field.add(CARTPOLES, _cartpoles)
     field.add(PENDULUMS, _pendulums, "envpool")
@@ -161,17 +139,10 @@ def contestants() -> Field:
 
 def add(suite: Suite, effort: Effort) -> tuple[dict[str, Taken], dict[str, str]]:
     """Rows and a table; what each contestant took, and why others are absent."""
-    field = contestants()
-    taken = interleaved(field.contestants, effort)
-    add_costs(
-        suite,
-        "Cost of an env-step",
-        "step",
-        taken,
+    note = (
         "Ours: 10 ms of driving, ten ticks of plant and sensors, with infos. Singles through "
         f"gym.make, in episodes of at most {EPISODE} steps; x {COUNT}: a step of one environment "
         "of a batch. Filters with full P compute the covariance of six states at every tick; a "
-        "filter's own cost is the difference to the line without.",
-        field.absent,
+        "filter's own cost is the difference to the line without."
     )
-    return taken, field.absent
+    return contestants().measure(suite, "Cost of an env-step", "step", effort, note)

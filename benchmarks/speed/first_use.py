@@ -9,9 +9,9 @@ import subprocess
 import sys
 from tempfile import TemporaryDirectory
 
-from ..harness.results import Row, Suite, Table
-from .contestants import AbsentError
-from .timing import spread
+from ..harness.results import Suite, Table
+from .contestants import AbsentError, add_row
+from .timing import Taken
 
 FIRST = "gym.make to the first step, kernels on disk"
 KERNEL = "cold compile of the dearest kernel"
@@ -99,69 +99,33 @@ def _python(code: str, variables: dict[str, str] | None = None, limit: float | N
     return run.stdout.splitlines()[-1]
 
 
-def add(suite: Suite, runs: int, compiling: bool) -> tuple[dict[str, list[float]], dict[str, str]]:
-    """Rows and tables; the targets' CPU seconds, and why others are absent.
+def add(suite: Suite, runs: int, compiling: bool) -> tuple[dict[str, Taken], dict[str, str]]:
+    """Rows and a table; the targets' CPU seconds, and why others are absent.
 
     runs: processes whose first one does not count. compiling: also everything cold, which takes
     minutes.
     """
-    seconds, absent = dict[str, list[float]](), dict[str, str]()
+    columns, absent = dict[str, Taken](), dict[str, str]()
     try:
-        seconds[FIRST] = _add_first(suite, runs)
+        taken = [warm() for _ in range(runs + 1)][1:]
+        columns = {f"first use: {name}": [run[name] for run in taken] for name in taken[0]}
+        ours = ("import numba", "gym.make", "first reset", "first step")
+        columns[FIRST] = [sum(run[name] for name in ours) for run in taken]
     except AbsentError as error:
         absent[FIRST] = str(error)
     if compiling:
         kernels = cold()
-        seconds[KERNEL] = [max(taken for _, taken in kernels)]
-        _add_kernels(suite, kernels)
+        columns["cold compile of all kernels"] = [sum(seconds for _, seconds in kernels)]
+        columns[KERNEL] = [max(seconds for _, seconds in kernels)]
     else:
         absent[KERNEL] = "in the full form only"
-    return seconds, absent
-
-
-def _add_first(suite: Suite, runs: int) -> list[float]:
-    """Rows and a table of fresh processes; CPU seconds up to the first step."""
-    taken = [warm() for _ in range(runs + 1)][1:]
-    columns = {name: [run[name] for run in taken] for name in taken[0]}
-    ours = ("import numba", "gym.make", "first reset", "first step")
-    columns[FIRST] = [sum(run[name] for name in ours) for run in taken]
-    columns["whole process"] = [sum(run.values()) for run in taken]
     cells = []
     for name, values in columns.items():
-        middle, low, high = spread(values)
-        _row(suite, f"first use: {name}", values)
+        middle, low, high = add_row(suite, name, "cpu_seconds", values)
         cells.append([name, f"{middle:.3f}", f"{low:.3f} .. {high:.3f}"])
-    note = "Fresh processes. The first gym.make imports numba, which is shown apart and counted."
-    suite.tables.append(
-        Table("Cost of the first use", ("", "CPU-s", "range"), cells, note, keyed=False)
+    note = (
+        "Fresh processes; the first gym.make imports numba, which is shown apart and counted. "
+        "Cold: environment and exact-kf, single and batch, with nothing on disk."
     )
-    return columns[FIRST]
-
-
-def _add_kernels(suite: Suite, kernels: list[tuple[str, float]]) -> None:
-    total: dict[str, float] = {}
-    for name, taken in kernels:  # a function may be compiled for several types
-        total[name] = total.get(name, 0.0) + taken
-    order = sorted(total, key=lambda name: -total[name])
-    cells = [[name, f"{total[name]:.2f}"] for name in order if total[name] >= 0.5]
-    cells.append(["all", f"{sum(total.values()):.2f}"])
-    for name in total:
-        _row(suite, f"cold compile: {name}", [total[name]])
-    _row(suite, "cold compile: all", [sum(total.values())])
-    suite.tables.append(
-        Table(
-            "Cost of compiling",
-            ("kernel", "CPU-s"),
-            cells,
-            "Nothing on disk; environment and exact-kf, single and batch. Kernels that are called "
-            "from Python, with what they call where it was not compiled before; those above 0.5 s.",
-            keyed=False,
-        )
-    )
-
-
-def _row(suite: Suite, name: str, values: list[float]) -> None:
-    middle, low, high = spread(values)
-    suite.rows.append(
-        Row(suite.name, name, "cpu_seconds", middle, low=low, high=high, n=len(values))
-    )
+    suite.tables.append(Table("Cost of the first use", ("", "CPU-s", "range"), cells, note, False))
+    return {name: columns[name] for name in (FIRST, KERNEL) if name in columns}, absent

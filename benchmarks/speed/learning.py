@@ -5,15 +5,13 @@ its defaults, as its users start; through the bridge a rollout comes from many e
 that batches are large and few.
 """
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
 from ...envs.ticks import TICK
 from ..harness.results import Suite
-from .contestants import Field, add_costs
-from .timing import Contestant, Effort, Taken, interleaved
+from .contestants import Field
+from .timing import Contestant, Effort, Taken
 
 OURS = "PPO, YawFusion-v0"
 PENDULUM = "PPO, Pendulum-v1"
@@ -49,39 +47,17 @@ def _settings() -> dict[str, Any]:
     return algorithm_of("ppo").options(10 * TICK, COUNT)
 
 
-@contextmanager
-def _torch_on_one_thread() -> Iterator[None]:
-    try:
-        import torch
-    except ModuleNotFoundError:
-        yield
-        return
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
-
-
 def add(suite: Suite, effort: Effort) -> tuple[dict[str, Taken], dict[str, str]]:
     """Rows and a table; what each contestant took, and why others are absent."""
     field = Field()
     field.add(OURS, _ours, "stable-baselines3")
     field.add(PENDULUM, lambda: _learner("Pendulum-v1", DEFAULTS), "stable-baselines3")
-    if not field.contestants:
-        return {}, field.absent
-    with _torch_on_one_thread():
-        fewer = replace(effort, rounds=max(1, min(effort.rounds // 2, ROUNDS)))
-        taken = interleaved(field.contestants, fewer)
-    settings = ", ".join(f"{name} = {value}" for name, value in _settings().items())
-    add_costs(
-        suite,
-        "Cost of a learned env-step",
-        "step",
-        taken,
-        "PPO of stable-baselines3, rollout and gradient steps. YawFusion-v0 through the bridge: "
-        f"{COUNT} environments, {settings}; the rest, and all on Pendulum-v1, is its default.",
-        field.absent,
+    settings = ", ".join(
+        f"{name} = {value}" for name, value in (_settings() if field.contestants else {}).items()
     )
-    return taken, field.absent
+    note = (
+        "PPO of stable-baselines3, rollout and gradient steps. YawFusion-v0 through the bridge: "
+        f"{COUNT} environments, {settings}; the rest, and all on Pendulum-v1, is its default."
+    )
+    fewer = replace(effort, rounds=max(1, min(effort.rounds // 2, ROUNDS)))
+    return field.measure(suite, "Cost of a learned env-step", "step", fewer, note)

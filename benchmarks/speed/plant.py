@@ -1,4 +1,4 @@
-"""Cost of a tick of the plant alone: ours, the same in C, and CommonRoad's single track.
+"""Cost of a tick of the plant alone: ours, and the same in C.
 
 A tick is a millisecond of one car of `YawFusion-v0`: actuators that lag, the loads at the tick's
 middle and end, Fiala tyres, roll, and Runge-Kutta's four stages; no sensors, no driver.
@@ -15,22 +15,20 @@ from ...envs.backend.arrays import offsets, read, write
 from ...envs.backend.decorators import inlined, jit
 from ...envs.backend.simd import LANES
 from ...envs.engine.layout import P, Z
-from ...envs.outside.plants import BMW_320I
 from ...envs.ticks import TICK
 from ...envs.vehicle.actuators import lagged
 from ...envs.vehicle.dynamics import Car, Motion, Push, Road, rk4
 from ...envs.vehicle.tyres import FIALA, Inputs, load_of, shifts
 from ..harness.results import Suite
 from .c_plant import c_plant
-from .contestants import Field, add_costs
-from .timing import Contestant, Effort, Taken, interleaved
+from .contestants import Field
+from .timing import Contestant, Effort, Taken
 
 Array = npt.NDArray[np.float64]
 
 CARS, TICKS = 1024, 10  # cars at once; ticks a call
 OURS = "plant"
 C = "plant in C"
-SINGLE_TRACK = "single track, CommonRoad"
 
 _CAR, _ROAD, _MOTION, _PUSH, _INPUTS = (
     offsets(kind)[0] for kind in (Car, Road, Motion, Push, Inputs)
@@ -161,32 +159,6 @@ def in_c() -> Advance:
     return advance_in_c
 
 
-def single_track() -> Contestant:
-    """CommonRoad's single track by the Runge-Kutta method in Python, as its users write it.
-
-    Raises ModuleNotFoundError without commonroad-vehicle-models.
-    """
-    from vehiclemodels.vehicle_dynamics_st import vehicle_dynamics_st
-    from vehiclemodels.vehicle_parameters import setup_vehicle_parameters
-
-    p, x = setup_vehicle_parameters(BMW_320I), np.zeros(7)
-
-    def rate(x: Array) -> Array:
-        return np.array(vehicle_dynamics_st(x.tolist(), [0.0, 0.0], p))
-
-    def start() -> None:
-        x[:] = 0.0, 0.0, 0.02, 15.0, 0.0, 0.0, 0.0  # X, Y, steering, speed, heading, yaw rate, slip
-
-    def work() -> None:
-        for _ in range(TICKS):
-            a = rate(x)
-            b = rate(x + 0.5 * TICK * a)
-            c = rate(x + 0.5 * TICK * b)
-            x[:] = x + TICK / 6.0 * (a + 2.0 * (b + c) + rate(x + TICK * c))
-
-    return Contestant(work, TICKS, start)
-
-
 def _many(advance: Advance, cars: Cars) -> Contestant:
     """Cars from the middle of their drives on, in every round the same ones."""
     running = cars.twin()
@@ -198,21 +170,13 @@ def _many(advance: Advance, cars: Cars) -> Contestant:
 
 
 def add(suite: Suite, effort: Effort) -> tuple[dict[str, Taken], dict[str, str]]:
-    """Add rows and a table; returns each contestant's time, and why others are absent."""
+    """Rows and a table; each contestant's time, and why others are absent."""
     cars, field = cars_of(CARS), Field()
     field.add(OURS, lambda: _many(ours, cars))
     field.add(C, lambda: _many(in_c(), cars))
-    field.add(SINGLE_TRACK, single_track, "commonroad-vehicle-models")
-    taken = interleaved(field.contestants, effort)
-    add_costs(
-        suite,
-        "Cost of a tick of the plant",
-        "tick",
-        taken,
+    note = (
         f"One car, one millisecond: lag, load, Fiala tyres, roll, Runge-Kutta; {CARS} cars at "
         "once. The C is the same text in blocks of as many cars, compiled on the spot "
-        "(-O3 -march=native, no fused multiply-add), with the same numbers. CommonRoad's single "
-        "track has linear tyres and no roll, one car, in Python.",
-        field.absent,
+        "(-O3 -march=native, no fused multiply-add), with the same numbers."
     )
-    return taken, field.absent
+    return field.measure(suite, "Cost of a tick of the plant", "tick", effort, note)

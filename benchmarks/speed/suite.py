@@ -3,24 +3,22 @@
 from rich.console import Console
 
 from ..harness.results import Suite
-from . import env_steps, filters, first_use, learning, plant, scaling, targets
+from . import env_steps, first_use, learning, plant, targets
 from .timing import FULL, QUICK
 
 RUNS, QUICK_RUNS = 5, 2  # fresh processes
 
 
 def run(quick: bool = False, console: Console | None = None) -> Suite:
-    """CPU and wall time of steps, ticks, learning and first use: median of rounds, and range.
+    """CPU time of steps, ticks, learning and first use: median of rounds, and range.
 
-    quick: few rounds, batches of up to 4096 environments, nothing compiled anew.
+    quick: few rounds, nothing compiled anew.
     """
     suite = Suite(
         "speed",
         "What a step costs",
         "CPU time on one thread, median and range of rounds in which the contestants of a table "
-        "take turns; per second is on the wall. An env-step of ours is 10 ms of driving: ten "
-        "ticks of plant and sensors. A filter's tick is one sample of the gyro, and every 33rd a "
-        "sample of the camera.",
+        "take turns. An env-step of ours is 10 ms of driving: ten ticks of plant and sensors.",
     )
     effort = QUICK if quick else FULL
     taken, absent = env_steps.add(suite, effort)
@@ -28,9 +26,6 @@ def run(quick: bool = False, console: Console | None = None) -> Suite:
         more, away = part.add(suite, effort)
         taken |= more
         absent |= away
-    scaling.against_count(suite, effort, scaling.QUICK_COUNTS if quick else scaling.COUNTS)
-    scaling.against_ticks(suite, effort)
-    filters.add(suite, effort)
     seconds, away = first_use.add(suite, QUICK_RUNS if quick else RUNS, compiling=not quick)
     targets.add(suite, taken, seconds, absent | away)
     return suite

@@ -1,11 +1,10 @@
-"""Side by side: CPU and wall time of contestants in interleaved rounds, in one process, on one
-thread."""
+"""CPU time of contestants side by side: interleaved rounds in one process, on one thread."""
 
 import statistics
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
@@ -17,24 +16,13 @@ class Contestant:
 
     work: Callable[[], object]
     units: int
-    start: Callable[[], object] | None = None
-
-
-@dataclass
-class Taken:
-    """Microseconds a unit, round by round: of the processor, and on the wall."""
-
-    cpu: list[float] = field(default_factory=list)
-    wall: list[float] = field(default_factory=list)
+    start: Callable[[], object] = lambda: None
 
 
 @dataclass(frozen=True)
 class Effort:
-    """How long to measure.
-
-    rounds: how many count. seconds: of CPU, the least that a contestant works in each round, by
-    whole calls of its work.
-    """
+    """How long to measure: rounds that count, and the CPU seconds that a contestant works at least
+    in each of them, by whole calls of its work."""
 
     rounds: int
     seconds: float
@@ -44,47 +32,40 @@ QUICK = Effort(9, 0.01)
 FULL = Effort(25, 0.04)
 """Many short rounds: what the machine does meanwhile falls on all contestants of one round."""
 
+Taken = list[float]
+"""CPU microseconds a unit, round by round."""
+
 
 def interleaved(contestants: Mapping[str, Contestant], effort: Effort) -> dict[str, Taken]:
-    """Each contestant's time in every round, after one that does not count.
-
-    Whatever else the machine does falls on neighbours alike.
-    """
+    """Each contestant's time in every round, after one that does not count."""
     with one_thread():
-        calls = {
-            name: _calls(contestant, effort.seconds) for name, contestant in contestants.items()
-        }
-        taken = {name: Taken() for name in contestants}
+        calls = {name: _calls(each, effort.seconds) for name, each in contestants.items()}
+        taken: dict[str, Taken] = {name: [] for name in contestants}
         for _ in range(effort.rounds):
-            for name, contestant in contestants.items():
-                cpu, wall = _timed(contestant, calls[name])
-                taken[name].cpu.append(cpu)
-                taken[name].wall.append(wall)
+            for name, each in contestants.items():
+                taken[name].append(_timed(each, calls[name]))
     return taken
 
 
-def _timed(contestant: Contestant, calls: int) -> tuple[float, float]:
-    """(CPU, wall) microseconds a unit of some calls of the work."""
-    if contestant.start is not None:
-        contestant.start()
-    wall, cpu = time.perf_counter(), time.process_time()
+def _timed(contestant: Contestant, calls: int) -> float:
+    """CPU microseconds a unit of some calls of the work."""
+    contestant.start()
+    start = time.process_time()
     for _ in range(calls):
         contestant.work()
-    cpu, wall = time.process_time() - cpu, time.perf_counter() - wall
-    scale = 1e6 / (calls * contestant.units)
-    return cpu * scale, wall * scale
+    return 1e6 * (time.process_time() - start) / (calls * contestant.units)
 
 
 def _calls(contestant: Contestant, seconds: float) -> int:
     """How many calls take so many seconds, by the second call: the first may compile."""
     _timed(contestant, 1)
-    once = _timed(contestant, 1)[0] * contestant.units * 1e-6
+    once = _timed(contestant, 1) * contestant.units * 1e-6
     return max(1, round(seconds / max(once, 1e-9)))
 
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Linear algebra keeps to one thread, where threadpoolctl is installed."""
+    """Linear algebra and torch on one thread, where threadpoolctl is installed."""
     try:
         from threadpoolctl import threadpool_limits
     except ModuleNotFoundError:
@@ -94,11 +75,6 @@ def one_thread() -> Iterator[None]:
         yield
 
 
-def spread(values: list[float]) -> tuple[float, float, float]:
+def spread(values: Taken) -> tuple[float, float, float]:
     """(median, least, largest)."""
     return statistics.median(values), min(values), max(values)
-
-
-def ratios(values: list[float], of: list[float]) -> list[float]:
-    """values / of, round by round."""
-    return [value / other for value, other in zip(values, of, strict=True)]

@@ -1,9 +1,7 @@
 """FilterPy's Kalman filter on the car with gyro and camera, as its users would write it.
 
 Late camera samples are used exactly by a rewind written by hand: everything since the capture is
-kept, the filter goes back, takes the sample and repeats the ticks since. The speed suite measures
-it beside the filters of `estimators`, and a test holds its estimates against theirs. Building one
-needs filterpy, the extra `bench`.
+held, the filter goes back, takes the sample and repeats the ticks since.
 """
 
 import math
@@ -11,13 +9,11 @@ from collections import deque
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
+from filterpy.kalman import KalmanFilter
 
-from ...envs.record import FAST, PACKET, Record
-from ...envs.vehicle.linear import LinearModel, vision
-from ...envs.vehicle.vehicle import Vehicle
-
-Array = npt.NDArray[np.float64]
+from sideslip.envs.record import FAST, PACKET, Array, Record
+from sideslip.envs.vehicle.linear import LinearModel, vision
+from sideslip.envs.vehicle.vehicle import Vehicle
 
 Q = {"beta": 2e-3, "gamma": 2e-2, "psi": 1e-6, "y_l": 1e-4}  # per second
 NOISE = {"gyro_noise": 0.005, "psi_noise": 3.5e-3, "y_l_noise": 0.02}
@@ -53,12 +49,6 @@ def six_states(vehicle: Vehicle, speed: float, dt: float) -> Any:
 
 
 def _filter(F: Array, B: Array, process: Array, prior: list[float]) -> Any:
-    try:
-        from filterpy.kalman import KalmanFilter
-    except ModuleNotFoundError:
-        raise ModuleNotFoundError(
-            "the comparison needs filterpy: pip install 'sideslip[bench]'", name="filterpy"
-        ) from None
     n = len(F)
     kf = KalmanFilter(dim_x=n, dim_z=1, dim_u=2)
     kf.F, kf.B, kf.Q = F, B, process
