@@ -18,9 +18,9 @@ import numpy.typing as npt
 from ...envs.record import PACKET_WIDTH
 from ...envs.sensors.slow import SLOW_NAMES
 
-CORE = 8  # states of a model
+CORE = 9  # states of a model
 INPUTS = 4  # that drive it
-FASTS = 2  # measurements of a fast row
+FASTS = 3  # measurements of a fast row
 SLOW = len(SLOW_NAMES)  # sensors
 ROWS = 4  # of C, of one slow sensor
 FRAMES = 8  # of one slow sensor, captured and not here yet
@@ -78,11 +78,13 @@ _MODEL = [  # dx = A x + B u on the first `dense` states; those behind them deca
     ("delayed", _INT),  # the last dense states that lag behind what the camera sees
     ("total", _INT),  # states and clones
     ("forces", _INT),  # 1: disturbances are a force and a moment; 0: they push states
-    ("pushed", _INT, (CORE,)),  # the state that each disturbance pushes
+    ("pushed", _INT, (CORE,)),  # the state that each one behind pushes; -1: none
+    ("rolling", _INT),  # where a bicycle's phi and phi_rate stand; 0: it does not roll
     ("car", _FLOAT, (len(Car._fields),)),
     ("roll_stiffness", _FLOAT),  # K_x / I_x
     ("roll_damping", _FLOAT),  # C_x / I_x
     ("roll_arm", _FLOAT),  # M_s h_s / I_x
+    ("sway", _FLOAT),  # m, M_s h_s / M
     ("preview", _FLOAT),  # m
     ("step", _FLOAT),  # s, the filter's own step
     ("relax", _FLOAT),  # share by which the delayed states follow in a step
@@ -105,6 +107,7 @@ _FAST = [  # inputs and fast measurements: sums of two columns of the fast row
     ("y_factor", _FLOAT, (FASTS, 2)),
     ("C_fast", _FLOAT, (FASTS, CORE)),
     ("D_fast", _FLOAT, (FASTS, INPUTS)),
+    ("accel_row", _INT),  # the fast measurement that is a bicycle's a_y; 0: none
     ("r_fast", _FLOAT, (FASTS,)),  # variances
 ]
 _SLOW = [  # slow sensors: what each one measures, how noisy it is, when it captures

@@ -18,14 +18,45 @@ SLOWEST = 1.5  # m/s: below it the model stays that of this speed
 
 @jit
 def _lateral(f: Memory, V: Any) -> None:
-    """tie-vision (8), dakf-stability (5)-(11); a_y = V (beta' + gamma) is an output."""
+    """tie-vision (8), dakf-stability (5)-(11), a body that rolls and what a_y feels of it."""
     A, B = f.A, f.B
-    write_lateral(A, B, f.car, V, f.dense - f.delayed, f.preview)
+    rolling = 2 if f.rolling > 0 else 0
+    write_lateral(A, B, f.car, V, f.dense - f.delayed - rolling, f.preview)
     if f.forces == 1:
         B[0, INPUTS], B[1, INPUTS + 1] = 1.0 / (f.car[CAR.mass] * V), B[1, 1]
-    if f.fasts > 1:
-        f.C_fast[1, BETA], f.C_fast[1, GAMMA] = V * A[0, 0], V * (A[0, 1] + 1.0)
-        f.D_fast[1, 0] = V * B[0, 0]
+    if rolling > 0:
+        _write_body(f, V)
+    if f.accel_row > 0:
+        _write_accel(f, V)
+
+
+@jit
+def _write_body(f: Memory, V: Any) -> None:
+    """phi and phi_rate, and how they push beta: double-layer-gps (1), (3), solved for phi''."""
+    A, B, i = f.A, f.B, f.rolling
+    share = 1.0 / (1.0 - f.roll_arm * f.sway)
+    lift, lag = share * f.roll_arm, f.sway / V
+    stiffness = share * (f.roll_stiffness - f.roll_arm * GRAVITY)
+    write_roll(A, B, i, 0, stiffness, share * f.roll_damping, lift * V * B[0, 0])
+    A[i + 1, BETA], A[i + 1, GAMMA] = lift * V * A[0, BETA], lift * V * (A[0, GAMMA] + 1.0)
+    B[i + 1, INPUTS] = lift * V * B[0, INPUTS]  # the force that pushes beta
+    for j in range(f.dense):
+        A[0, j] += lag * A[i + 1, j]
+    B[0, 0] += lag * B[i + 1, 0]
+    B[0, INPUTS] += lag * B[i + 1, INPUTS]
+
+
+@jit
+def _write_accel(f: Memory, V: Any) -> None:
+    """The specific force a_y = V (beta' + gamma) + g phi, a row with feed-through of steering."""
+    row = f.C_fast[f.accel_row]
+    for j in range(f.dense):
+        row[j] = V * f.A[0, j]
+    row[GAMMA] = V * (f.A[0, GAMMA] + 1.0)
+    row[f.dense] = V * f.B[0, INPUTS]
+    if f.rolling > 0:
+        row[f.rolling] += GRAVITY
+    f.D_fast[f.accel_row, 0] = V * f.B[0, 0]
 
 
 @jit
@@ -39,7 +70,8 @@ def continuous(f: Memory, V: Any, turning: Any) -> None:
             B[i, j] = 0.0
     if f.forces == 0:
         for j in range(f.n - f.dense):
-            B[f.pushed[j], INPUTS + j] = 1.0
+            if f.pushed[j] >= 0:
+                B[f.pushed[j], INPUTS + j] = 1.0
     if f.kind == LATERAL:
         _lateral(f, V)
     elif f.kind == ROLL or f.kind == VELOCITY_ROLL:

@@ -17,7 +17,7 @@ from . import dual_rate
 from .checks import check_covariance
 from .kalman import INVERSES
 from .measurements import COURSE_SPEED, MEASUREMENTS
-from .models import DISTURBANCES, MODELS, STATES, Model, bicycle_model
+from .models import DISTURBANCES, INERTIAL, MODELS, STATES, Model, bicycle_model
 from .options import Options
 from .tunings import TUNINGS
 
@@ -59,6 +59,11 @@ class FilterConfig:
     disturbances: of a bicycle, "none", "walk" (d1 and d2 push beta and gamma), "walk-all" (d3
         pushes psi) or "forces" (an Ornstein-Uhlenbeck force and moment).
     leak: 1/s, by which disturbances decay on top of that.
+    fast: of a bicycle with a covariance of its own (exact-kf, course-kf, dakf), what it measures in
+        every row, the gyro among it (default): "gyro", "accel_y", "roll_rate". With more than the
+        gyro its body rolls: states phi and phi_rate.
+    bias_sd: of the same ones, rad/s: above 0 (default) a state `bias`, a constant drawn with this
+        deviation that the gyro measures on top of the yaw rate; with q_bias it walks.
     q_beta, q_gamma, ...: process noise of a state per second, (unit)^2/s; or Q, (n, n) or (n,)
         (default: of `tunings.toml`).
     gyro_noise (rad/s), psi_noise (rad), y_l_noise (m), course_noise (rad at every speed; default
@@ -114,7 +119,8 @@ def configure(
     read = Options(name, options)
     used = _slow_sensors(row, sensors, read)
     rules = _rules(row, used, read)
-    models = _models(row, used, rules["delay"], read)
+    fast, bias_sd = _inertial(row, read)
+    models = _models(row, used, rules["delay"], fast, bias_sd > 0.0, read)
     states = [state for model in models for state in model.names]
     if rules["poles"] and len(rules["poles"]) != len(states):
         raise read.wrong("poles", f"are one for each of {', '.join(states)}", rules["poles"])
@@ -125,7 +131,7 @@ def configure(
         sensors={sensor: sensors[sensor] for sensor in used},
         models=models,
         **rules,
-        leak=read.number("leak", 0.0, "is in 1/s and not negative", lambda v: 0.0 <= v < math.inf),
+        leak=read.not_negative("leak", "1/s"),
         Q=_process_noise(states, TUNINGS.get((name, ",".join(used)), {}), read),
         noise=noise,
         noise_over_speed=noise_over_speed,
@@ -133,7 +139,7 @@ def configure(
         satellites=read.number("satellites", SATELLITES),
         gate=_gate(read),
         adapt=read.number("adapt", 0.0, "is a share from 0 to 1", lambda v: 0.0 <= v < 1.0),
-        prior=_prior(states, noise, read),
+        prior=_prior(states, noise, bias_sd, read),
         allow_unstable=bool(read.value("allow_unstable", False)),
     )
     read.done()
@@ -199,12 +205,27 @@ def _rules(row: Filter, used: Sequence[str], read: Options) -> dict[str, Any]:
     }
 
 
-def _models(row: Filter, used: tuple[str, ...], delay: str, read: Options) -> tuple[Model, ...]:
+def _inertial(row: Filter, read: Options) -> tuple[tuple[str, ...], float]:
+    """The fast sensors, and the standard deviation of the gyro's bias."""
+    if row.model != "bicycle" or row.gains != "covariance" or row.second:
+        return row.fast, 0.0
+    return read.some_of("fast", row.fast, INERTIAL), read.not_negative("bias_sd", "rad/s")
+
+
+def _models(
+    row: Filter,
+    used: tuple[str, ...],
+    delay: str,
+    fast: tuple[str, ...],
+    bias: bool,
+    read: Options,
+) -> tuple[Model, ...]:
     """The model of each layer."""
     if row.model != "bicycle":
         return (MODELS[row.model],)
     disturbances = read.one_of("disturbances", row.disturbances, DISTURBANCES)
-    first = bicycle_model(used, row.fast, disturbances, delay in ("literal", "lag"))
+    late, rolls = delay in ("literal", "lag"), fast != row.fast
+    first = bicycle_model(used, fast, disturbances, late, rolls, bias)
     return (first, MODELS[row.second]) if row.second else (first,)
 
 
@@ -233,9 +254,13 @@ def _noise(forces: bool, read: Options) -> tuple[dict[str, float], dict[str, flo
     return noise, {name: noise[name] * COURSE_SPEED for name in growing}
 
 
-def _prior(states: Sequence[str], noise: Mapping[str, float], read: Options) -> dict[str, float]:
+def _prior(
+    states: Sequence[str], noise: Mapping[str, float], bias_sd: float, read: Options
+) -> dict[str, float]:
     """Standard deviations of all states at the start."""
     found = {state: STATES[state].prior for state in states}
+    if "bias" in found:
+        found["bias"] = bias_sd
     if "force" in noise:
         found |= {"F_d": noise["force"], "N_d": noise["moment"]}
     prior = read.value("prior", {})

@@ -38,6 +38,21 @@ class Options:
             raise self.wrong(key, f"is one of {', '.join(filter(None, known))}", value)
         return str(value)
 
+    def some_of(self, key: str, default: Sequence[str], known: Sequence[str]) -> tuple[str, ...]:
+        """An option that is the first of some words and any others, in their order; raises
+        ValueError for anything else."""
+        value = self.value(key, default)
+        words = list(value) if isinstance(value, list | tuple) else [value]
+        found = tuple(word for word in known if word in words)
+        if len(found) != len(words) or known[0] not in found:
+            raise self.wrong(key, f"is {known[0]!r} and any of {', '.join(known[1:])}", value)
+        return found
+
+    def not_negative(self, key: str, unit: str) -> float:
+        """A number that is 0 (its default) or more, in a unit."""
+        expected = f"is in {unit} and not negative"
+        return self.number(key, 0.0, expected, lambda v: 0.0 <= v < np.inf)
+
     def number(self, key: str, default: float, expected: str = "", fits: Fits = _any) -> float:
         """An option that is a number; raises as `checked`."""
         return self.checked(key, self.value(key, default), expected, fits)

@@ -25,6 +25,7 @@ from .schedule import Schedule
 
 SETTLED = 1e-12
 LONGEST = 600.0  # s of the recursion
+WALKED = 10.0  # s in which a bias walks by its prior where a filter is checked
 
 
 @jit
@@ -109,6 +110,7 @@ def design(
     copy.cycle, copy.pattern = schedule.cycle, max(1, len(schedule.lags))
     copy.period[copy.period > 0] = schedule.period
     copy.phase[:] = 0
+    _stir(copy)
     s = int(f.first_slow)
     table = np.zeros(table_shape(f, schedule))
     table[0, 0] = 1.0
@@ -129,6 +131,14 @@ def design(
         R = np.diag([*copy.r_fast[: copy.fasts], *copy.r[s, : copy.rows[s]]])
         _pseudo_gains(copy, schedule, table, inverse(config.inverse, C, before, R))
     return table, copy.G[: copy.dense, : copy.n].copy()
+
+
+def _stir(f: Memory) -> None:
+    """Let a constant bias walk by its prior in 10 s: what never moves has no settled gain, but
+    whether it is seen is the same. Only a filter with gains of its own has one."""
+    for i in range(int(f.dense), int(f.n)):
+        if f.pushed[i - f.dense] < 0:
+            f.Q[i, i] += f.prior[i, i] * f.step / WALKED
 
 
 def measured_rows(f: Memory, frame: int, lag: int = 1) -> Array:

@@ -16,35 +16,58 @@ from sideslip.envs.sensors.slow import SLOW_NAMES
 from sideslip.envs.vehicle.linear import vision
 from sideslip.envs.vehicle.vehicle import COMS
 
-STATES = ("beta", "gamma", "psi", "y_l")
+STATES = ("beta", "gamma", "psi", "y_l", "phi", "phi_rate")
 PUSHED = {"d1": 0, "d2": 1, "d3": 2}
 NOISE = {"camera": (3.5e-3, 0.02), "gps": (math.radians(0.14) * 60.0 / 3.6,)}  # course: x 1/V
 MEASURED = {"camera": (("psi",), ("y_l",)), "gps": (("beta", "psi"),)}
 GYRO = 0.005
+FAST_SD = {"gyro": GYRO, "accel_y": 0.1, "roll_rate": 0.005}
 ARM = COMS.rear_track / (2.0 * COMS.wheel_radius)
 
 
-def transition(names: Any, V: float, dt: float) -> Any:
-    """F (n, n) and B (n, 2) of a tick; disturbances and inputs are held over it."""
-    model = vision(COMS, V)
-    behind = [name for name in names if name not in STATES]
-    block = np.zeros((6 + len(behind), 6 + len(behind)))
-    block[:4, :4], block[:4, 4:6] = model.A, model.B[:, :2]
-    for j, name in enumerate(behind, 6):
+def continuous(behind: Any, V: float, rolls: bool) -> Any:
+    """dx/dt of `STATES` and the specific force a_y, (7, 8 + m): columns `STATES`, steering, yaw
+    moment, then what is behind. A body that rolls leaves beta' and phi'' in one pair of equations,
+    double-layer-gps (1) and (3): M V (beta' + gamma) - S phi'' = F_y, I_x phi'' = S a_y - ...
+    """
+    model, at = vision(COMS, V), 8
+    rows = np.zeros((7, at + len(behind)))
+    rows[:4, :4], rows[:4, 6:8] = model.A, model.B[:, :2]
+    for j, name in enumerate(behind, at):
         if name in ("F_d", "N_d"):
-            at, push = (0, 1.0 / (COMS.mass * V)) if name == "F_d" else (1, 1.0 / COMS.yaw_inertia)
-            block[at, j] = push
-        else:
-            block[PUSHED[name], j] = 1.0
+            to, push = (0, 1.0 / (COMS.mass * V)) if name == "F_d" else (1, 1.0 / COMS.yaw_inertia)
+            rows[to, j] = push
+        elif name != "bias":
+            rows[PUSHED[name], j] = 1.0
+    S = COMS.sprung_mass * COMS.roll_arm
+    phi, phi_rate = np.eye(rows.shape[1])[4:6]
+    if rolls:
+        M = COMS.mass * V
+        both = np.array([[M, -S], [-S * V, COMS.roll_inertia]])
+        felt = S * (V * np.eye(rows.shape[1])[1] + 9.81 * phi)
+        pull = felt - COMS.roll_stiffness * phi - COMS.roll_damping * phi_rate
+        rows[0], rows[5] = np.linalg.solve(both, np.array([M * rows[0], pull]))
+        rows[4] = phi_rate
+    rows[6] = V * (rows[0] + np.eye(rows.shape[1])[1]) + 9.81 * phi
+    return rows
+
+
+def transition(names: Any, V: float, dt: float) -> Any:
+    """F (n, n), B (n, 2) of a tick, and a_y's row (n,) and feed-through (2,); disturbances and
+    inputs are held over it."""
+    behind = [name for name in names if name not in STATES]
+    slopes = continuous(behind, V, "phi" in names)
+    block = np.zeros((slopes.shape[1],) * 2)
+    block[:6] = slopes[:6]
     exact = expm(block * dt)
-    keep = math.exp(-dt / 0.3) if "F_d" in names else 1.0
     rows = [STATES.index(name) for name in names if name in STATES]
     n, m = len(names), len(rows)
     F, B = np.zeros((n, n)), np.zeros((n, 2))
-    F[:m, :m], F[:m, m:] = exact[np.ix_(rows, rows)], exact[rows, 6:]
-    F[m:, m:] = keep * np.eye(n - m)
-    B[:m] = exact[rows, 4:6]
-    return F, B
+    F[:m, :m], F[:m, m:] = exact[np.ix_(rows, rows)], exact[rows, 8:]
+    for j, name in enumerate(behind, m):
+        F[j, j] = math.exp(-dt / 0.3) if name in ("F_d", "N_d") else 1.0
+    B[:m] = exact[rows, 6:8]
+    return F, B, np.concatenate([slopes[6, rows], slopes[6, 8:]]), slopes[6, 6:8]
 
 
 def speeds(fast: Any, dt: float) -> Any:
@@ -86,7 +109,7 @@ class Posterior:
         prior: Any,
         Q: Any,
         V: Any,
-        gyro: bool = True,
+        fast: tuple[str, ...] = ("gyro",),
         factor: Any = lambda hdop: 1.0,
     ) -> None:
         n, K = len(names), len(record.fast)
@@ -95,22 +118,29 @@ class Posterior:
         self.mean: Any = np.zeros((K, n))
         self.T: Any = np.zeros((K, n, n + (K - 1) * q))
         self.T[0, :, :n] = np.diag(np.sqrt(prior))
-        models: Any = {}
+        models = {speed: transition(names, speed, record.dt) for speed in set(V)}
+        arm = ARM * (record.fast[:, FAST.torque_right] - record.fast[:, FAST.torque_left])
+        acted = np.column_stack([record.fast[:, FAST.steer], arm])
         for k in range(1, K):
-            row, a = record.fast[k], n + (k - 1) * q
-            if V[k] not in models:
-                models[V[k]] = transition(names, V[k], record.dt)
-            F, B = models[V[k]]
-            u = row[FAST.steer], ARM * (row[FAST.torque_right] - row[FAST.torque_left])
+            a, u = n + (k - 1) * q, acted[k]
+            F, B, _, _ = models[V[k]]
             self.mean[k] = F @ self.mean[k - 1] + B @ u
             self.T[k, :, :a] = F @ self.T[k - 1, :, :a]
             self.T[k, noisy, np.arange(a, a + q)] = np.sqrt(Q[noisy])
         M: Any = [np.eye(n + (K - 1) * q)]
         b: Any = [np.zeros(n + (K - 1) * q)]
-        if gyro:
-            g = names.index("gamma")
-            M.append(self.T[:, g] / GYRO)
-            b.append((record.fast[:, FAST.gyro] - self.mean[:, g]) / GYRO)
+        for name in fast:
+            rows, through = np.zeros((K, n)), np.zeros((K, 2))
+            if name == "accel_y":
+                rows[:] = [models[speed][2] for speed in V]
+                through[:] = [models[speed][3] for speed in V]
+            else:
+                rows[:, names.index({"gyro": "gamma", "roll_rate": "phi_rate"}[name])] = 1.0
+            if name == "gyro" and "bias" in names:
+                rows[:, -1] = 1.0
+            known = np.einsum("kn,kn->k", rows, self.mean) + np.einsum("ki,ki->k", through, acted)
+            M.append(np.einsum("kn,knm->km", rows, self.T) / FAST_SD[name])
+            b.append((record.fast[:, getattr(FAST, name)] - known) / FAST_SD[name])
         for packet in first_of_each(record.packets):
             name, k = SLOW_NAMES[int(packet[PACKET.sensor])], int(packet[PACKET.captured])
             for i, states in enumerate(MEASURED[name]):
@@ -137,6 +167,8 @@ def inputs(rng: Any, rows: int) -> Any:
     fast[:, FAST.steer] = 0.05 * rng.standard_normal(rows)
     fast[:, FAST.torque_right] = 20.0 * rng.standard_normal(rows)
     fast[:, FAST.gyro] = 0.1 * rng.standard_normal(rows)
+    fast[:, FAST.accel_y] = rng.standard_normal(rows)
+    fast[:, FAST.roll_rate] = 0.1 * rng.standard_normal(rows)
     V = rng.uniform(2.0, 15.0) + np.linspace(0.0, 3.0, rows)
     fast[:, FAST.wheel_left] = fast[:, FAST.wheel_right] = V
     return fast

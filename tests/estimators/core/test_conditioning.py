@@ -16,7 +16,8 @@ from tests.estimators.dense import GYRO, Posterior, arrivals, inputs, speeds
 pytestmark = pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning")
 
 PRIOR = {"beta": 0.02, "gamma": 0.05, "psi": 0.05, "y_l": 0.3, "F_d": 50.0, "N_d": 20.0}
-PRIOR |= {"d1": 0.1, "d2": 1.0}
+PRIOR |= {"d1": 0.1, "d2": 1.0, "phi": 0.02, "phi_rate": 0.05, "bias": 0.01}
+INERTIAL = ("gyro", "accel_y", "roll_rate")
 HDOP = ((1.0, 1.0), (2.0, 1.5), (5.0, 4.0))
 EXACT = 1e-10  # of the posterior's standard deviation
 SCHEDULES = 20  # of each case
@@ -64,7 +65,9 @@ class Case:
         """Of the states at all ticks."""
         noise = np.array(self.Q) * self.dt if self.Q else np.zeros(len(names))
         if "F_d" in names:
-            noise[-2:] = (1.0 - math.exp(-self.dt / 0.3) ** 2) * np.array([50.0, 20.0]) ** 2
+            at = names.index("F_d")
+            drawn = (1.0 - math.exp(-self.dt / 0.3) ** 2) * np.array([50.0, 20.0]) ** 2
+            noise[at : at + 2] = drawn
         V = speeds(record.fast, record.dt)
         return Posterior(
             list(names),
@@ -72,7 +75,7 @@ class Case:
             np.array([PRIOR[name] for name in names]) ** 2,
             noise,
             V if self.speed is None else np.full_like(V, self.speed),
-            gyro=self.name != "vision-only-kf",
+            fast=self.options.get("fast", () if self.name == "vision-only-kf" else ("gyro",)),
             factor=lambda hdop: np.interp(hdop, *np.array(HDOP).T),
         )
 
@@ -98,6 +101,24 @@ CASES = {
     ),
     "none, vision alone": Case("vision-only-kf", {"camera": CAMERA}, None, (3e-3, 2e-2, 0.0, 0.0)),
     "walk, gps": Case("dakf", {"gps": GPS}, 7.0, (4e-4, 4e-4, 1e-8, 3e-2, 0.2)),
+    "accelerometer, roll rate, bias": Case(
+        "exact-kf",
+        {"camera": CAMERA, "gps": GPS},
+        7.0,
+        options={"fast": ["gyro", "accel_y", "roll_rate"], "bias_sd": 0.01},
+    ),
+    "accelerometer, measured speed": Case(
+        "exact-kf", {"camera": CAMERA}, options={"fast": ["gyro", "accel_y"]}
+    ),
+    "roll rate, gps": Case("exact-kf", {"gps": FAST_GPS}, 12.0, options={"fast": INERTIAL[::2]}),
+    "bias, gps": Case("exact-kf", {"gps": FAST_GPS}, options={"bias_sd": 0.01}),
+    "walk, accelerometer, bias": Case(
+        "dakf",
+        {"gps": GPS},
+        7.0,
+        (4e-4, 4e-4, 1e-8, 0.0, 0.0, 3e-2, 0.2, 0.0),
+        {"fast": INERTIAL, "bias_sd": 0.01},
+    ),
     "walk, gps, measured speed": Case("dakf", {"gps": GPS}, None, (4e-4, 4e-4, 1e-8, 3e-2, 0.2)),
 }
 for _case in CASES.values():  # HDOP is told to all that hear a GPS
