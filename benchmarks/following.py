@@ -1,9 +1,8 @@
 """Question: what do steering and yaw moment do together? dakf-stability's bandwidth K, and lanes
 held on curved roads from camera and gyro, the aim of uneven-delay."""
 
-from dataclasses import dataclass
 from functools import partial
-from itertools import islice
+from itertools import islice, product
 from typing import Any
 
 import gymnasium as gym
@@ -77,21 +76,14 @@ def loop_radius(scenario: str | dict[str, Any], bandwidth: float) -> float:
     return float(np.abs(np.linalg.eigvals(loop)).max())
 
 
-@dataclass(frozen=True)
-class Case:
-    """A bandwidth (0: no control) on one seed of STEP."""
+def follow(case: tuple[float, int]) -> Array:
+    """(rms_beta, rms_gamma, saturated, failed) of an episode of STEP with dakf in the loop.
 
-    bandwidth: float
-    seed: int
-
-
-def follow(case: Case) -> Array:
-    """(rms_beta, rms_gamma, saturated, failed) of an episode with dakf in the loop."""
-    control = case.bandwidth > 0.0
-    K = (case.bandwidth, case.bandwidth)
-    options: dict[str, Any] = {"bandwidth": K} if control else {}
-    agent = "model-following" if control else "none"
-    found = tracking(drive(case.seed, STEP, agent, **options))
+    case: the bandwidth (0: no control) and the seed.
+    """
+    K, seed = case
+    options: dict[str, Any] = {"bandwidth": (K, K)} if K > 0.0 else {"agent": "none"}
+    found = tracking(drive(seed, STEP, **options))
     return np.array([found.rms_beta, found.rms_gamma, found.saturated, found.failed], float)
 
 
@@ -107,10 +99,10 @@ def keep_lane(keeper: int, cars: int) -> Array:
     y = Motion._fields.index("y")
     for step in islice(steps_of(env, agent, 0), 1, None):
         on = step.running
-        most = np.where(on, np.maximum(most, np.abs(base.motion[:, y])), most)
-        squares += np.where(on, step.info["beta"] ** 2, 0.0)
+        np.maximum(most, np.abs(base.motion[:, y]), out=most, where=on)
+        squares += on * step.info["beta"] ** 2
         steps += on
-        left = np.where(on & step.terminated, 1.0, left)
+        left[on & step.terminated] = 1.0
     return np.stack([most, np.sqrt(squares / steps), left], axis=1)
 
 
@@ -119,7 +111,7 @@ def run(
 ) -> Suite:
     """Both questions; seeds of the step, cars on the road."""
     suite = Suite("following", "What steering and yaw moment do together", _TEXT)
-    cases = [Case(K, seed) for K in (0.0, *BANDWIDTHS) for seed in range(seeds)]
+    cases = list(product((0.0, *BANDWIDTHS), range(seeds)))
     found = np.array(run_cases(follow, cases, "bandwidth", jobs, console))
     _bandwidths(suite, found.reshape(len(BANDWIDTHS) + 1, seeds, -1))
     keep = partial(keep_lane, cars=cars)
@@ -171,20 +163,14 @@ def _lanes(suite: Suite, lanes: list[Array]) -> None:
         label = f"{what} on {estimator}" if what != "none" else what
         cells.append([label, *most.text(), f"{1e3 * slip.value:.1f}", f"{100.0 * left.value:.1f}"])
         for metric, each in (("offset", most), ("rms_slip", slip), ("departure_rate", left)):
-            suite.rows.append(_row(ROAD, metric, each, len(numbers), estimator, what))
+            who = {"estimator": estimator, "controller": what}
+            suite.rows.append(_row(ROAD, metric, each, len(numbers), **who))
     header = ("controller", "largest offset / m", "95 % interval", "RMS slip / mrad", "left / %")
     note = "The largest offset of the centre of gravity from the lane's centre, mean over cars."
     suite.tables.append(Table("Keeping the lane on curved roads", header, cells, note))
 
 
-def _row(
-    scenario: str,
-    metric: str,
-    number: Estimate,
-    n: int,
-    estimator: str = "dakf",
-    controller: str = "model-following",
-) -> Row:
-    who = {"estimator": estimator, "controller": controller}
+def _row(scenario: str, metric: str, number: Estimate, n: int, **who: str) -> Row:
+    who = {"estimator": "dakf", "controller": "model-following"} | who
     common = {"suite": "following", "salt": "fixed", "env_version": __version__}
     return Row.of(metric, number, scenario=scenario, n=n, **who, **common)

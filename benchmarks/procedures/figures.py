@@ -20,14 +20,12 @@ def add(suite: Suite, done: Done) -> None:
     """Every figure of what was found."""
     for car in CARS:
         mine = {case: found for case, found in done.items() if case.car == car}
-        suite.figures.append(
-            (
-                f"FMVSS 126, {car}: yaw rate at 5 A over its own peak",
-                yaw_rates(of(mine, "fmvss-126")),
-                "Bars: at most 35 % and 20 % of the peak after the steer reversal may be left. A "
-                "car that spins before completion of steer is left out.",
-            )
+        title = f"FMVSS 126, {car}: yaw rate at 5 A over its own peak"
+        text = (
+            "Bars: at most 35 % and 20 % of the peak after the steer reversal may be left. A car "
+            "that spins before completion of steer is left out."
         )
+        suite.figures.append((title, yaw_rates(of(mine, "fmvss-126")), text))
         for name in iso3888.TRACKS:
             runs = {case: _best(found) for case, found in of(mine, name).items()}
             speeds = ", ".join(f"{_label(k)} {3.6 * run.speed:.0f} km/h" for k, run in runs.items())
@@ -96,18 +94,14 @@ def bode(found: Transient) -> Any:
     figure = make_subplots(rows=2, cols=2, shared_xaxes=True, vertical_spacing=0.06)
     for column, name in enumerate(iso7401.OUTPUTS, 1):
         measured, linear = found.sweep[name], found.linear_sweep[name]
-        for H, mode, who in ((measured.H, "markers", "measured"), (linear, "lines", "linear")):
+        for H, mode, who in (
+            (measured.H, "markers", "measured"),
+            (linear, "lines", "linear model"),
+        ):
             for row, values in ((1, np.abs(H)), (2, np.degrees(np.unwrap(np.angle(H))))):
-                trace = go.Scatter(
-                    x=measured.frequency,
-                    y=values,
-                    mode=mode,
-                    name=f"{who} model" if who == "linear" else who,
-                    legendgroup=who,
-                    showlegend=row == column == 1,
-                    marker={"color": colour("two-dof")},
-                    line={"color": GREY},
-                )
+                legend = {"name": who, "legendgroup": who, "showlegend": row == column == 1}
+                pen = {"marker": {"color": colour("two-dof")}, "line": {"color": GREY}}
+                trace = go.Scatter(x=measured.frequency, y=values, mode=mode, **legend, **pen)
                 figure.add_trace(trace, row=row, col=column)
     figure.update_xaxes(title_text="frequency / Hz", row=2, automargin=True)
     for column, unit in enumerate(("yaw rate / (1/s)", "a_y / (m/s2/rad)"), 1):

@@ -27,16 +27,10 @@ def add(suite: Suite, done: Done) -> None:
 
 def _row(case: Case, metric: str, value: float, of: str = "", **more: Any) -> Row:
     """of: what is measured, if a case has several."""
-    contestant = CONTESTANTS[case.contestant]
-    who: dict[str, Any] = {"estimator": contestant.estimator, "controller": contestant.agent}
-    return Row(
-        NAME,
-        f"{case.procedure} {case.car}" + (f", {of}" if of else ""),
-        metric,
-        value,
-        env_version=__version__,
-        **(who | more),
-    )
+    who = CONTESTANTS[case.contestant]
+    columns = {"estimator": who.estimator, "controller": who.agent, "env_version": __version__}
+    where = f"{case.procedure} {case.car}" + (f", {of}" if of else "")
+    return Row(NAME, where, metric, value, **columns | more)
 
 
 def _who(case: Case) -> list[str]:

@@ -3,7 +3,6 @@
 import dataclasses
 import math
 import time
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -13,8 +12,8 @@ import numpy as np
 from ...envs.record import Array, Log
 from ...envs.sensors.link import SlowSensor
 from ...envs.vehicle.vehicle import Vehicle
-from ...estimators.estimates import UnobservableWarning
 from ...estimators.make import make_estimator
+from ..harness.drives import SETTLED, quietly
 from .emulate import Emulation
 
 GYRO_ONLY = "bicycle-kf"
@@ -29,7 +28,6 @@ ESTIMATORS: dict[str, tuple[str, ...]] = {
 }
 """The estimators of a replay and the slow sensors that serve them, the better one first."""
 
-SETTLED = 2.0  # s: errors count from here on
 LEAST_NOISE = 0.01  # deg, of the course, the least that estimators assume
 
 
@@ -124,10 +122,8 @@ def run_estimators(drives: Sequence[Log], vehicle: Vehicle, how: Settings) -> Re
     log, result = drives[0], Result()
     counts = log.time >= log.time[0] + SETTLED - 1e-9
     truth = log.truth.get("beta")
-    if truth is not None:
-        counts &= np.isfinite(truth)
-        if not counts.any():
-            raise ValueError(f"{log.name}: the sideslip truth is unknown from {SETTLED:g} s on")
+    if truth is not None and not (counts := counts & np.isfinite(truth)).any():
+        raise ValueError(f"{log.name}: the sideslip truth is unknown from {SETTLED:g} s on")
     for name, serves in ESTIMATORS.items():
         if how.estimators is not None and name not in (GYRO_ONLY, *how.estimators):
             continue
@@ -166,6 +162,5 @@ def _estimator(name: str, slow: str | None, log: Log, vehicle: Vehicle, how: Set
         options |= {"slow": slow, "q_psi": how.q_psi}
     if slow == "gps":
         options["course_noise"] = math.radians(max(how.course_noise_deg, LEAST_NOISE))
-    with warnings.catch_warnings():  # the result names them
-        warnings.simplefilter("ignore", UnobservableWarning)
-        return make_estimator(name, vehicle=vehicle, sensors=sensors, dt=log.record.dt, **options)
+    facts = {"vehicle": vehicle, "sensors": sensors, "dt": log.record.dt}
+    return quietly(make_estimator, name, **facts, **options)  # the result names what is unseen

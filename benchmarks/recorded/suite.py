@@ -13,9 +13,11 @@ from ...envs.record import Log
 from ...envs.recordings.columns import parse_mapping
 from ...envs.recordings.log_file import read_log
 from ...envs.vehicle.vehicle import Vehicle
+from ..harness.drives import SETTLED
 from ..harness.results import Row, Suite, Table
+from ..harness.stats import Estimate
 from .emulate import path
-from .run import ESTIMATORS, GYRO_ONLY, SETTLED, Result, Settings, drives_of, run_estimators
+from .run import ESTIMATORS, GYRO_ONLY, Result, Settings, drives_of, run_estimators
 from .vehicles import read_vehicle
 
 __all__ = ["Settings", "corners", "read_vehicle", "replay", "replay_file"]
@@ -144,30 +146,16 @@ def _text(log: Log, drives: Sequence[Log], car: Vehicle, how: Settings) -> str:
 def _rows(result: Result, scenario: str, car: Vehicle, how: Settings) -> list[Row]:
     """Every number of a result."""
     spec = json.dumps({"vehicle": car.to_dict(), "settings": how.as_dict()})
+    common = {"salt": f"seed {how.seed}", "env_version": f"replay {__version__}", "spec": spec}
     rows = []
     for name, cost in result.cost.items():
-        measured: dict[str, tuple[float, ...]] = {"us_per_tick": (cost,)}
-        seeds = 1
+        measured = {"us_per_tick": Estimate(cost, math.nan, math.nan)}
+        n = len(result.squares.get(name, [cost]))
         if name in result.squares:
-            measured = {"rmse": result.rmse(name), "ratio": result.ratio(name)} | measured
-            seeds = len(result.squares[name])
-        for metric, (value, *around) in measured.items():
-            low, high = around or (math.nan, math.nan)
-            rows.append(
-                Row(
-                    suite="replay",
-                    scenario=scenario,
-                    estimator=name,
-                    metric=metric,
-                    value=value,
-                    low=low,
-                    high=high,
-                    n=seeds,
-                    salt=f"seed {how.seed}",
-                    env_version=f"replay {__version__}",
-                    spec=spec,
-                )
-            )
+            errors = {"rmse": Estimate(*result.rmse(name)), "ratio": Estimate(*result.ratio(name))}
+            measured = errors | measured
+        where = {"suite": "replay", "scenario": scenario, "estimator": name, "n": n}
+        rows += [Row.of(metric, number, **where, **common) for metric, number in measured.items()]
     return rows
 
 
@@ -207,35 +195,24 @@ def _figures(result: Result, log: Log) -> list[tuple[str, Any, str]]:
     near = np.abs(log.time - most) <= WINDOW
     close = {name: beta[near] for name, beta in slips.items()}
     paths = {name: path(log, beta) for name, beta in traces.items()}
+    whole = _few(time_series(log.time, slips, label), result)
     shown = [
-        (
-            f"{log.name}: the sideslip angle and its estimates",
-            _few(time_series(log.time, slips, label), result),
-            HIDDEN,
-        ),
-        (
-            f"{log.name}: where the car slips most",
-            time_series(log.time[near], close, label),
-            f"The {2 * WINDOW:g} s around the largest sideslip angle, all estimators.",
-        ),
-        (
-            f"{log.name}: the track",
-            _few(track(paths), result),
+        ("the sideslip angle and its estimates", whole, HIDDEN),
+        ("where the car slips most", time_series(log.time[near], close, label),
+            f"The {2 * WINDOW:g} s around the largest sideslip angle, all estimators."),
+        ("the track", _few(track(paths), result),
             "Dead reckoning from wheel speed, the integral of the logged yaw rate and each "
-            f"sideslip angle: what a degree of sideslip is worth on the road. {HIDDEN}",
-        ),
-    ]
-    if truth is None:
-        return shown
-    errors = {name: DEGREES * (beta - truth) for name, beta in result.traces.items()}
-    figure = error_series(log.time, errors, f"error of the {label}")
-    shown.insert(
-        2, (f"{log.name}: errors", _few(figure, result), f"Estimate minus truth. {HIDDEN}")
-    )
-    value, low, high = (DEGREES * np.array([result.rmse(name) for name in result.squares])).T
-    bars = bars_with_interval(list(result.squares), value, low, high, f"RMSE of the {label}")
-    text = f"Median over the noises; whiskers: least and most. {GYRO_ONLY} has no slow sensor."
-    return [(f"{log.name}: error of each estimator", bars, text), *shown]
+            f"sideslip angle: what a degree of sideslip is worth on the road. {HIDDEN}"),
+    ]  # fmt: skip
+    if truth is not None:
+        errors = {name: DEGREES * (beta - truth) for name, beta in result.traces.items()}
+        figure = _few(error_series(log.time, errors, f"error of the {label}"), result)
+        shown.insert(2, ("errors", figure, f"Estimate minus truth. {HIDDEN}"))
+        value, low, high = (DEGREES * np.array([result.rmse(name) for name in result.squares])).T
+        bars = bars_with_interval(list(result.squares), value, low, high, f"RMSE of the {label}")
+        text = f"Median over the noises; whiskers: least and most. {GYRO_ONLY} has no slow sensor."
+        shown.insert(0, ("error of each estimator", bars, text))
+    return [(f"{log.name}: {title}", *more) for title, *more in shown]
 
 
 def _few(figure: Any, result: Result) -> Any:

@@ -9,7 +9,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import typer
 from rich.console import Console
@@ -60,30 +60,6 @@ def bytes_of(env: DeviceVectorEnv) -> float:
     return (read + written) / env.num_envs
 
 
-class _Counted(torch.utils._python_dispatch.TorchDispatchMode):  # type: ignore[no-untyped-call]
-    """Counts the numbers that torch's operations give."""
-
-    numbers: int = 0
-
-    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        result = func(*args, **(kwargs or {}))
-        moves = func.is_view or func.__name__.partition(".")[0] in ("stack", "cat", "clone")
-        if isinstance(result, torch.Tensor) and not moves:
-            self.numbers += result.numel()
-        return result
-
-
-def operations(env_id: str, count: int = 64, **arguments: Any) -> float:
-    """Operations of an env-step of one row as the text is written: products, sums, choices."""
-    env = DeviceVectorEnv.make(env_id, count, **arguments)
-    env.reset(seed=0)
-    actions = torch.zeros(env.action_space.shape or ())
-    counted: Any = _Counted()  # type: ignore[no-untyped-call]
-    with counted:
-        env.step(actions)
-    return float(counted.numbers) / count
-
-
 def measure(env: DeviceVectorEnv, copied: float, rounds: int, steps: int) -> Measured:
     """Rounds of `steps` steps each, after one that does not count."""
     env.reset(seed=0)
@@ -100,19 +76,19 @@ def measure(env: DeviceVectorEnv, copied: float, rounds: int, steps: int) -> Mea
     )
 
 
-def table(found: Sequence[Measured], needed: float) -> str:
-    """The measurements as Markdown; needed: operations of an env-step."""
+def table(found: Sequence[Measured]) -> str:
+    """The measurements as Markdown."""
     lines = [
         "| N | env-steps/s | range | us a step of all | bytes a row, at least | of a copy's "
-        "bandwidth | operations/s |",
-        "|---|---|---|---|---|---|---|",
+        "bandwidth |",
+        "|---|---|---|---|---|---|",
     ]
     for each in found:
         share = each.rate * each.bytes_a_step / each.bandwidth
         lines.append(
             f"| {each.size} | {each.rate:.3g} | {each.least:.3g} .. {each.largest:.3g} "
             f"| {1e6 * each.size / each.rate:.4g} | {each.bytes_a_step:.0f} "
-            f"| {100.0 * share:.2g} % | {each.rate * needed:.3g} |"
+            f"| {100.0 * share:.2g} % |"
         )
     return "\n".join(lines)
 
@@ -141,7 +117,6 @@ def main(
     """
     check_writable(out)
     console, found = Console(), []
-    needed = operations(env)
     copied = 0.0
     for each in count or COUNTS:
         batch = DeviceVectorEnv.make(
@@ -155,8 +130,8 @@ def main(
         f"`{shlex.join(['python', '-m', 'sideslip.benchmarks.speed.device', *sys.argv[1:]])}`\n\n"
         f"{name_of(torch.device(device))}, torch {torch.__version__}; {env}, {dtype}, "
         f"{'compiled' if compiled else 'not compiled'}. Median and range of {rounds} rounds of "
-        f"{steps} steps, wall time. An env-step is {needed:.0f} operations. A copy on the device "
-        f"moves {copied / 1e9:.3g} GB/s.\n\n{table(found, needed)}\n"
+        f"{steps} steps, wall time. A copy on the device moves {copied / 1e9:.3g} GB/s.\n\n"
+        f"{table(found)}\n"
     )
     console.print(text, highlight=False, markup=False, soft_wrap=True)
     if out is not None:

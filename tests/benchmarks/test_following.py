@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.following import BANDWIDTHS, KEEPERS, Case, follow, keep_lane, loop_radius
+from sideslip.benchmarks.following import BANDWIDTHS, KEEPERS, follow, keep_lane, loop_radius
 from sideslip.envs import COMS
 from sideslip.envs.vehicle.linear import bicycle
 
@@ -27,7 +27,7 @@ def test_the_loop_is_stable_below_the_critical_speed_only() -> None:
 
 
 def test_an_episode_gives_its_numbers() -> None:
-    none, ours = follow(Case(0.0, 1)), follow(Case(5.0, 1))
+    none, ours = follow((0.0, 1)), follow((5.0, 1))
     assert np.isfinite(none).all() and np.isfinite(ours).all()
     assert ours[1] < 0.5 * none[1] and ours[3] == 0.0
 

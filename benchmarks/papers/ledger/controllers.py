@@ -8,19 +8,32 @@ import numpy as np
 
 from ....agents import make_agent
 from ....agents.rollout import Rollout, rollout
+from ....envs.scenarios.manoeuvres import scenario_from
+from ...harness.drives import make_env
 from ...harness.parallel import chunked
-from . import lane_change, tracking
+from . import tracking
 from .claim import Array, Example, Measured
 from .simulations import FIRST, Numbers, rms, stacked
 
 SIGNALS = ("beta", "gamma", "steer", "yaw_moment")
+CONTESTANTS: dict[str, tuple[str, str, dict[str, Any]]] = {
+    "none": ("none", "", {}),
+    "feedforward": ("feedforward", "", {}),
+    "single-rate": ("two-dof", "single-rate-kf", {"rate": "camera"}),
+    "multirate": ("two-dof", "multirate-kf", {"rate": "control"}),
+    "multirate-residual": ("two-dof", "multirate-residual-kf", {"rate": "control"}),
+}
+"""tie-vision Fig. 8: agent, the estimator it reads ("" for none) and its options, by label."""
+_NOISE = {"camera_psi": "psi_noise", "camera_y": "y_l_noise"}
 
 
 @dataclass(frozen=True)
 class Slip:
-    """Contestants of `lane_change` on the same seeds of a scenario.
+    """tie-vision's controllers on the same seeds of a lane change, each with a filter that knows
+    the camera's noise.
 
-    contestants: of `lane_change.CONTESTANTS`. options: more options of the agent, by contestant.
+    contestants: of `CONTESTANTS`, or with a remark behind a comma. options: more options of the
+    agent, by contestant.
     Numbers of each: RMS and peak of the slip, the largest change of the yaw moment in a
     millisecond, the sum of all its changes and the share of time at its limit.
     """
@@ -39,13 +52,13 @@ class Slip:
         return _measured(seeds, self.contestants, self._drive)
 
     def _drive(self, label: str, seed: int) -> tuple[Rollout, dict[str, float]]:
-        known = {contestant.label: contestant for contestant in lane_change.CONTESTANTS}
-        contestant = known[label.partition(",")[0]]
-        env = lane_change.make_env(self.scenario, contestant)
-        options: dict[str, Any] = dict(self.options.get(label, {}))
-        if contestant.rate:
-            options["rate"] = contestant.rate
-        drive = rollout(env, make_agent(contestant.agent, env, **options), seed)
+        agent, estimator, options = CONTESTANTS[label.partition(",")[0]]
+        noise = scenario_from(self.scenario).noise
+        known = {option: noise[name] for name, option in _NOISE.items() if name in noise}
+        how: dict[str, Any] = {"scenario": self.scenario, "control_period": 1}
+        env = make_env("sideslip/YawVision-v0", estimator, {"options": known}, **how)
+        more = self.options.get(label, {})
+        drive = rollout(env, make_agent(agent, env, **{**options, **more}), seed)
         base: Any = env.unwrapped
         return drive, _effort(drive["beta"], drive["yaw_moment"], base.vehicle.yaw_moment_limit)
 

@@ -12,6 +12,7 @@ from functools import reduce
 import numpy as np
 
 from ..ledger.claim import Array, Measured
+from ..ledger.simulations import Numbers, stacked
 
 STEPS = 6
 STATES, OUTPUTS = 4, 3
@@ -110,10 +111,8 @@ def compensated(d: Drive) -> dict[str, float]:
 
 def residuals(seeds: tuple[int, ...]) -> Measured:
     """Every formula's residual on each seed's system."""
-    lines = []
-    for seed in seeds:
-        drive = random_drive(seed)
-        lines.append(ideal(drive) | predicted_only(drive) | compensated(drive))
-    return Measured(
-        {(label, "residual"): np.array([line[label] for line in lines]) for label in lines[0]}
-    )
+    lines: list[Numbers] = []
+    for drive in map(random_drive, seeds):
+        found = ideal(drive) | predicted_only(drive) | compensated(drive)
+        lines.append({(label, "residual"): value for label, value in found.items()})
+    return Measured(stacked(lines))

@@ -16,7 +16,7 @@ from ..ledger.claim import Bound, Example, Measured, Part, claims_of, measured, 
 from ..ledger.controllers import Slip
 from ..ledger.plots import PaperFigure, curves, loops
 from ..ledger.simulations import Analysis
-from .margins import margins
+from .margins import gain_margin
 from .table_two import PRINTED, Found, LoopDesign, estimator_loop, plain_loop, search
 
 PAPER = "tie-vision"
@@ -49,9 +49,7 @@ def static_slip(_: tuple[int, ...]) -> Measured:
 
 def raised(design: LoopDesign) -> float:
     """By how many dB 1 ms raises the gain margin of 33 ms, the same PI on the true slip."""
-    slow, fast = (
-        margins(plain_loop(COMS, design, dt)).gain_margin[0] for dt in (CAMERA_PERIOD, TICK)
-    )
+    slow, fast = (gain_margin(plain_loop(COMS, design, dt))[0] for dt in (CAMERA_PERIOD, TICK))
     return float(fast - slow)
 
 
@@ -70,7 +68,7 @@ def table_two(_: tuple[int, ...]) -> Measured:
     shown = at_25[0] if at_25 else Found(LoopDesign(), PRINTED)
     example = _magnitudes(shown.design)
     for label, dt in ((SINGLE, CAMERA_PERIOD), (MULTI, TICK)):
-        decibels, omega = margins(estimator_loop(COMS, shown.design, dt)).gain_margin
+        decibels, omega = gain_margin(estimator_loop(COMS, shown.design, dt))
         numbers[label, "gain_margin"] = np.array([decibels])
         numbers[label, "crossover"] = np.array([round(omega / (2.0 * math.pi), 2)])
     return Measured(numbers, example)
