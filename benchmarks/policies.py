@@ -172,17 +172,11 @@ def _table(found: Enjoyed) -> Table:
 def _rows(found: Enjoyed) -> list[Row]:
     rows = []
     for name, driven in found.driven.items():
-        cell = found.cells[name]
-        common: dict[str, Any] = {
-            "suite": "enjoy",
-            "scenario": cell.scenario,
-            "estimator": cell.estimator,
-            "controller": found.policy.name if name == found.policy.name else cell.controller,
-            "n": len(found.seeds),
-            "salt": found.salt,
-            "env_version": f"{cell.env_id} {__version__}",
-            "spec": spec_of(cell),
-        }
+        cell, own = found.cells[name], name == found.policy.name
+        who = {"estimator": cell.estimator, "controller": name if own else cell.controller}
+        seeds: dict[str, Any] = {"n": len(found.seeds), "salt": found.salt, "spec": spec_of(cell)}
+        what = {"suite": "enjoy", "env_version": f"{cell.env_id} {__version__}"}
         for metric in ("cost", "rms_slip", "peak_slip", "effort", "largest_step"):
-            rows.append(Row.of(metric, interval(driven[metric]), **common))
+            columns = {"scenario": cell.scenario, **what, **who, **seeds}
+            rows.append(Row.of(metric, interval(driven[metric]), **columns))
     return rows

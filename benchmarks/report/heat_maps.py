@@ -5,15 +5,9 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from plotly import graph_objects as go
 
 from .colours import INK, line_styles
-
-try:
-    from plotly import graph_objects as go
-except ModuleNotFoundError as error:
-    raise ModuleNotFoundError(
-        "figures need plotly: pip install 'sideslip[report]'", name=error.name
-    ) from error
 
 Array = npt.NDArray[np.float64]
 
@@ -128,15 +122,7 @@ def _cars(
         i = min(k, len(X) - 1)
         c, s = np.cos(psi[i]), np.sin(psi[i])
         x, y = (_CAR * [0.5 * size[0], size[1]]).T  # half ahead and behind, half to either side
-        drawn.append(
-            go.Scatter(
-                x=X[i] + c * x - s * y,
-                y=Y[i] + s * x + c * y,
-                mode="lines",
-                fill="toself",
-                line={"color": shades[name], "width": 2},
-                showlegend=False,
-                hoverinfo="skip",
-            )
-        )
+        look = {"mode": "lines", "fill": "toself", "line": {"color": shades[name], "width": 2}}
+        outline = {"x": X[i] + c * x - s * y, "y": Y[i] + s * x + c * y}
+        drawn.append(go.Scatter(**outline, **look, showlegend=False, hoverinfo="skip"))
     return drawn

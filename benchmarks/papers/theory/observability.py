@@ -5,13 +5,12 @@ from fractions import Fraction
 
 import numpy as np
 
-from ....envs.vehicle.vehicle import COMS, Vehicle
+from ....envs.scenarios.draws import KMH
+from ....envs.vehicle import linear
+from ....envs.vehicle.vehicle import COMS
 from ..ledger.claim import Measured
 
 Matrix = list[list[Fraction]]
-SPEED = Fraction(125, 18)  # m/s, 25 km/h
-COURSE = [[1, 0, 1]]  # psi + beta
-GYRO_AND_COURSE = [[0, 1, 0], *COURSE]
 
 
 def rank(matrix: Sequence[Sequence[Fraction | int]]) -> int:
@@ -51,31 +50,6 @@ def observable(A: Matrix, C: Sequence[Sequence[Fraction | int]]) -> int:
     return rank(every)
 
 
-def bicycle(car: Vehicle, V: Fraction, states: int) -> Matrix:
-    """A of tie-vision (8) with its first states: beta, gamma, psi and y_l."""
-    m, I, l_f, l_r, C_f, C_r, l_pre = (  # noqa: E741
-        Fraction(str(value))
-        for value in (
-            car.mass,
-            car.yaw_inertia,
-            car.front_arm,
-            car.rear_arm,
-            car.front_stiffness,
-            car.rear_stiffness,
-            car.preview,
-        )
-    )
-    zero = Fraction(0)
-    moment = C_f * l_f - C_r * l_r
-    A = [
-        [-2 * (C_f + C_r) / (m * V), -1 - 2 * moment / (m * V * V), zero, zero],
-        [-2 * moment / I, -2 * (C_f * l_f**2 + C_r * l_r**2) / (I * V), zero, zero],
-        [zero, Fraction(1), zero, zero],
-        [V, l_pre, V, zero],
-    ]
-    return [row[:states] for row in A[:states]]
-
-
 def with_disturbances(A: Matrix, rows: int) -> Matrix:
     """A with a constant disturbance behind each of its first rows: dakf-stability (15)-(17)."""
     n = len(A)
@@ -85,22 +59,17 @@ def with_disturbances(A: Matrix, rows: int) -> Matrix:
     ]
 
 
-def widened(C: Sequence[Sequence[int]], n: int) -> list[list[int]]:
-    """C that does not see the disturbances behind its states."""
-    return [[*row, *[0] * (n - len(row))] for row in C]
-
-
 def coms_ranks(_: tuple[int, ...]) -> Measured:
-    """Rank of each paper's observability matrix for the COMS at 25 km/h."""
-    course, vision = bicycle(COMS, SPEED, 3), bicycle(COMS, SPEED, 4)
-    models = {
-        "dakf": (with_disturbances(course, 2), GYRO_AND_COURSE),
-        "dual-rate": (with_disturbances(course, 3), COURSE),
+    """Rank of each paper's observability matrix for the COMS at 25 km/h, taken as it is rounded."""
+    vision = [[Fraction(entry) for entry in row] for row in linear.vision(COMS, 25.0 * KMH).A]
+    course = [row[:3] for row in vision[:3]]
+    models: dict[str, tuple[Matrix, list[list[int]]]] = {
+        "dakf": (with_disturbances(course, 2), [[0, 1, 0], [1, 0, 1]]),  # gyro and course
+        "dual-rate": (with_disturbances(course, 3), [[1, 0, 1]]),
         "vision": (vision, [[0, 0, 1, 0], [0, 0, 0, 1]]),
     }
-    return Measured(
-        {
-            (name, "rank"): np.array([float(observable(A, widened(C, len(A))))])
-            for name, (A, C) in models.items()
-        }
-    )
+    ranks = {
+        name: observable(A, [row + [0] * (len(A) - len(row)) for row in C])
+        for name, (A, C) in models.items()
+    }
+    return Measured({(name, "rank"): np.array([float(each)]) for name, each in ranks.items()})

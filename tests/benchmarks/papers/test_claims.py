@@ -24,8 +24,6 @@ from sideslip.benchmarks.papers.ledger.claim import (
 from sideslip.benchmarks.papers.ledger.simulations import joined
 from sideslip.benchmarks.papers.theory import observability
 from sideslip.benchmarks.papers.tie_vision.appendix import residuals
-from sideslip.envs.vehicle.linear import vision
-from sideslip.envs.vehicle.vehicle import COMS
 
 
 def judged(*parts: tuple[Any, Any]) -> str:
@@ -118,12 +116,6 @@ def test_exact_ranks() -> None:
     assert ranks == {"dakf": 4.0, "dual-rate": 4.0, "vision": 4.0}
     singular = [[Fraction(1, 3), Fraction(2, 3)], [Fraction(1), Fraction(2)]]
     assert observability.rank(singular) == 1
-
-
-def test_exact_matrices_are_the_packages() -> None:
-    ours = observability.bicycle(COMS, observability.SPEED, 4)
-    wanted = vision(COMS, float(observability.SPEED)).A
-    np.testing.assert_allclose(np.array(ours, float), wanted, rtol=1e-14)
 
 
 def test_the_appendix_holds_as_corrected_and_fails_as_printed() -> None:
