@@ -4,12 +4,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
-from ...envs.scenarios.manoeuvres import SCENARIOS
-
 YAW = "sideslip/YawFusion-v0"
 STEERING = "sideslip/AfsYawFusion-v0"
 
-MANOEUVRES = tuple(name for name, scenario in SCENARIOS.items() if scenario.scored)
+MANOEUVRES = (
+    *("random-steering", "sine-with-dwell", "double-lane-change", "step-steer", "gust"),
+    *("low-friction", "brake-in-turn", "stiffness-step", "sensor-outage", "uneven-delay"),
+)
 
 TRUTH, REFERENCE_FILTER, REFERENCE_CONTROLLER = "truth", "exact-kf", "two-dof"
 ESTIMATORS = (

@@ -18,8 +18,16 @@ Fields = Mapping[str, Any]
 SHORTEST_GPS_PERIOD = 0.05  # s; an env keeps room for its packets
 SIDES = ("side", "wind_side")  # drawn, but no fields
 
-_CHOICES = {"steering": STEERING_KINDS, "path": PATHS, "hdop_law": HDOP_LAWS, "tyres": TYRE_LAWS}
-_FLAGS = ("mirror", "small_angle", "lags", "roll", "scored")
+TIER_NAMES = ("", "1", "2a", "2b", "2c")
+
+_CHOICES = {
+    "steering": STEERING_KINDS,
+    "path": PATHS,
+    "hdop_law": HDOP_LAWS,
+    "tyres": TYRE_LAWS,
+    "tier": TIER_NAMES,
+}
+_FLAGS = ("mirror", "small_angle", "lags", "roll")
 _NUMBERS = (
     "duration",
     "disturbance_force",

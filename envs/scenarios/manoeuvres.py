@@ -1,4 +1,4 @@
-"""The manoeuvres by name: the scored ones, drawn by the seed, here; the papers' own beside them."""
+"""The manoeuvres by name: those drawn by the seed; the tiers' and the papers' own beside them."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -8,6 +8,15 @@ from ..arguments import brief, check_choice, listed
 from .draws import KMH
 from .papers import ROAD_TESTS, SIMULATIONS
 from .scenario import Scenario
+from .tiers import (
+    BRAKE_IN_TURN,
+    DOUBLE_LANE_CHANGE,
+    SINE_WITH_DWELL,
+    SLALOM,
+    STEP,
+    TIERS,
+    random_of,
+)
 
 _DRAWN: dict[str, Any] = {
     "mirror": True,
@@ -19,67 +28,23 @@ _DRAWN: dict[str, Any] = {
 # Above 28 km/h so many of the drawn cars are close to their critical speed that those which spin
 # would decide the mean cost of a harsh manoeuvre.
 _HARSH = _DRAWN | {"speed": (18.0 * KMH, 28.0 * KMH)}
-_SCORED = _HARSH | {"scored": True}
-_RANDOM: dict[str, Any] = {
-    "steering": "random",
-    "onset": (0.0, 1.0),
-    "amplitude": (0.005, 0.015),
-    "amplitude_2": (0.005, 0.015),
-    "frequency": (0.3, 0.4),
-    "frequency_2": (0.4, 0.8),
-    "frequency_3": (0.2, 0.3),
-    "frequency_4": (0.4, 0.6),
-}
-_SLALOM: dict[str, Any] = {
-    "steering": "slalom",
-    "onset": (0.5, 1.5),
-    "amplitude": (0.04, 0.1),
-    "frequency": (0.2, 0.6),
-}
+_RANDOM = random_of(0.005, 0.015)
+_SLALOM = SLALOM | {"amplitude": (0.04, 0.1)}
 _LANE: dict[str, Any] = {"steering": "driver", "half_width": 1.75}
 _BEND: dict[str, Any] = {"curvature": (0.01, 0.03), "curve_start": 15.0, "curve_ramp": 10.0}
 
 _MANOEUVRES = (
-    Scenario(
-        name="random-steering",
-        **_RANDOM,
-        **_SCORED,
-    ),
-    Scenario(  # FMVSS 126: 0.7 Hz, and half a second at the second peak
-        name="sine-with-dwell",
-        duration=6.0,
-        steering="sine-with-dwell",
-        onset=(0.5, 1.0),
-        amplitude=(0.05, 0.12),
-        frequency=(0.6, 0.8),
-        hold=0.5,
-        **_SCORED,
-    ),
-    Scenario(  # the sections of the standard in the times they take at 25 to 32 km/h
-        name="double-lane-change",
-        duration=6.0,
-        path="iso-3888-2",
-        path_speed=(7.0, 9.0),
-        onset=(0.5, 1.0),
-        **(_LANE | {"half_width": 2.0}),
-        **_SCORED,
-    ),
-    Scenario(
-        name="step-steer",
-        duration=8.0,
-        steering="step",
-        onset=(0.5, 1.5),
-        amplitude=(0.03, 0.1),
-        hold=(1.0, 2.0),
-        **_SCORED,
-    ),
+    Scenario(name="random-steering", **_RANDOM, **_HARSH),
+    Scenario(name="sine-with-dwell", amplitude=(0.05, 0.12), **SINE_WITH_DWELL, **_HARSH),
+    Scenario(name="double-lane-change", **DOUBLE_LANE_CHANGE, **_HARSH),
+    Scenario(name="step-steer", amplitude=(0.03, 0.1), **STEP, **_HARSH),
     Scenario(
         name="gust",
         wind_force=(300.0, 500.0),
         wind_arm=(-0.1, 0.3),
         wind_start=(1.0, 3.0),
         wind_length=(1.0, 4.0),
-        **_SCORED,
+        **_HARSH,
     ),
     Scenario(
         name="low-friction",
@@ -88,43 +53,33 @@ _MANOEUVRES = (
         onset=(0.5, 1.5),
         amplitude=(0.02, 0.045),
         frequency=(0.3, 0.6),
-        **(_SCORED | {"friction": (0.27, 0.35)}),
+        **(_HARSH | {"friction": (0.27, 0.35)}),
     ),
-    Scenario(  # the motors brake; they share their torque with the yaw moment
-        name="brake-in-turn",
-        duration=6.0,
-        steering="held-step",
-        onset=(0.5, 1.0),
-        amplitude=(0.04, 0.1),
-        speed_change=-12.0 * KMH,
-        change_start=2.0,
-        change_length=2.0,
-        **_SCORED,
-    ),
+    Scenario(name="brake-in-turn", amplitude=(0.04, 0.1), **BRAKE_IN_TURN, **_HARSH),
     Scenario(
         name="stiffness-step",
         tyre_change_time=(3.0, 6.0),
         front_change=(0.7, 1.3),
         rear_change=(0.7, 1.3),
         **_RANDOM,
-        **_SCORED,
+        **_HARSH,
     ),
     Scenario(
         name="sensor-outage",
         camera_outage=(3.0, 6.0),
         gps_outage=(3.0, 6.0),
         **_SLALOM,
-        **_SCORED,
+        **_HARSH,
     ),
     Scenario(
         name="uneven-delay",
         camera_delays=(0.020, 0.015, 0.010, 0.025),  # uneven-delay, Fig. 5
         **_RANDOM,
-        **_SCORED,
+        **_HARSH,
     ),
 )
 
-# Easier ones, not scored: to begin with, and for what shall not be learned on the scored ones.
+# Easier ones, to begin with.
 _OTHERS = (
     Scenario(name="straight", **_DRAWN),
     Scenario(
@@ -135,11 +90,7 @@ _OTHERS = (
         frequency=(0.3, 0.8),
         **_DRAWN,
     ),
-    Scenario(
-        name="slalom",
-        **_SLALOM,
-        **_DRAWN,
-    ),
+    Scenario(name="slalom", **_SLALOM, **_DRAWN),
     Scenario(
         name="lane-change",
         duration=6.0,
@@ -151,7 +102,7 @@ _OTHERS = (
     ),
 )
 
-# Not scored: what they ask for is a place on the road, which the cost does not judge.
+# What these ask for is a place on the road, which the cost does not judge.
 _ROADS = (
     Scenario(  # braking as hard as the motors can: the right wheel slips
         name="split-friction",
@@ -171,7 +122,7 @@ _ROADS = (
 
 SCENARIOS: dict[str, Scenario] = {
     scenario.name: scenario
-    for scenario in (*_MANOEUVRES, *_OTHERS, *_ROADS, *SIMULATIONS, *ROAD_TESTS)
+    for scenario in (*_MANOEUVRES, *_OTHERS, *_ROADS, *TIERS, *SIMULATIONS, *ROAD_TESTS)
 }
 
 

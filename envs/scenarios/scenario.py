@@ -50,7 +50,7 @@ class Scenario:
     median of the GPS's HDOP, standard deviation of its logarithm, and the time in which that
     forgets. hdop_law of `HDOP_LAWS`: how much of the noise follows HDOP.
 
-    scored: whether it is one of the matrix's manoeuvres, which are those of a score.
+    tier: of `TIER_NAMES`, the one in whose score the scenario may stand, "" for none.
 
     Raises ValueError for a value out of place and names the field.
     """
@@ -115,7 +115,7 @@ class Scenario:
     tyres: str = "fiala"
     lags: bool = True
     roll: bool = True
-    scored: bool = False
+    tier: str = ""
     vehicle: Mapping[str, float] = field(default_factory=dict)
     nominal: Mapping[str, float] = field(default_factory=dict)
     noise: Mapping[str, float] = field(default_factory=dict)

@@ -56,7 +56,7 @@ def uncontrolled(name: str, seed: int = 0) -> tuple[StabilityEnv, Any, Any]:
 @pytest.mark.parametrize("name", TWINS)
 def test_twins_of_road_tests_drive_the_whole_plant(name: str) -> None:
     scenario = SCENARIOS[name]
-    assert not (scenario.small_angle or scenario.tyres == "linear" or scenario.scored)
+    assert not (scenario.small_angle or scenario.tyres == "linear" or scenario.tier)
     assert scenario.lags
     assert scenario.roll
     assert scenario.hdop_law == "half"

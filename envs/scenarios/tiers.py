@@ -1,0 +1,128 @@
+"""The manoeuvres of the two scored tiers: everything that decides is drawn by the seed.
+
+Tier 1 is the COMS at 18 to 28 km/h. Tier 2 is the passenger car at 60 to 80 km/h: on a dry road
+(2a), on a road of any friction (2b), and at the limit of its tyres (2c). A contest adds an id and
+a reference to a scenario; the cars are the presets, which the env names.
+"""
+
+from typing import Any
+
+from .draws import KMH
+from .scenario import Scenario
+
+_DRAWN: dict[str, Any] = {
+    "mirror": True,
+    "front_stiffness": (0.6, 1.4),
+    "rear_stiffness": (0.6, 1.4),
+    "camera_delays": (0.030,),
+    "camera_jitter": 0.010,
+}
+_COMS = _DRAWN | {"speed": (18.0 * KMH, 28.0 * KMH), "friction": (0.7, 1.0)}
+_CAR = _DRAWN | {"speed": (60.0 * KMH, 80.0 * KMH)}
+
+RANDOM: dict[str, Any] = {
+    "steering": "random",
+    "onset": (0.0, 1.0),
+    "frequency": (0.3, 0.4),
+    "frequency_2": (0.4, 0.8),
+    "frequency_3": (0.2, 0.3),
+    "frequency_4": (0.4, 0.6),
+}
+SLALOM: dict[str, Any] = {"steering": "slalom", "onset": (0.5, 1.5), "frequency": (0.2, 0.6)}
+STEP: dict[str, Any] = {
+    "duration": 8.0,
+    "steering": "step",
+    "onset": (0.5, 1.5),
+    "hold": (1.0, 2.0),
+}
+SINE_WITH_DWELL: dict[str, Any] = {  # FMVSS 126: 0.7 Hz, and half a second at the second peak
+    "duration": 6.0,
+    "steering": "sine-with-dwell",
+    "onset": (0.5, 1.0),
+    "frequency": (0.6, 0.8),
+    "hold": 0.5,
+}
+BRAKE_IN_TURN: dict[str, Any] = {  # the motors brake; they share their torque with the yaw moment
+    "duration": 6.0,
+    "steering": "held-step",
+    "onset": (0.5, 1.0),
+    "speed_change": -12.0 * KMH,
+    "change_start": 2.0,
+    "change_length": 2.0,
+}
+DOUBLE_LANE_CHANGE: dict[str, Any] = {  # a section takes the time it takes at 25 to 32 km/h
+    "duration": 6.0,
+    "steering": "driver",
+    "path": "iso-3888-2",
+    "path_speed": (7.0, 9.0),
+    "onset": (0.5, 1.0),
+    "half_width": 2.0,
+}
+_ISO_3888_1: dict[str, Any] = {
+    "duration": 9.0,
+    "steering": "driver",
+    "path": "iso-3888-1",
+    "onset": (0.5, 1.0),
+    "half_width": 5.0,
+}
+
+
+def random_of(low: float, high: float) -> dict[str, Any]:
+    """A random steering whose pairs of sines have amplitudes (rad) within this range."""
+    return RANDOM | {"amplitude": (low, high), "amplitude_2": (low, high)}
+
+
+def _turn(shape: dict[str, Any], low: float, high: float) -> dict[str, Any]:
+    return shape | {"amplitude": (low, high)}
+
+
+def _scenarios(tier: str, common: dict[str, Any], **shapes: dict[str, Any]) -> list[Scenario]:
+    """The scenarios of a tier by their names, written with underscores."""
+    return [
+        Scenario(name=name.replace("_", "-"), tier=tier, **(common | shape))
+        for name, shape in shapes.items()
+    ]
+
+
+# "gentle" and the step: what one yaw moment can hold at zero slip
+_ONE = _scenarios(
+    "1",
+    _COMS,
+    coms_random=random_of(0.005, 0.015),
+    coms_double_lane_change=DOUBLE_LANE_CHANGE,
+    coms_slalom=_turn(SLALOM, 0.04, 0.1),
+    coms_sine_with_dwell=_turn(SINE_WITH_DWELL, 0.05, 0.12),
+    coms_brake_in_turn=_turn(BRAKE_IN_TURN, 0.04, 0.1),
+    coms_gentle_slalom=_turn(SLALOM, 0.02, 0.05),
+    coms_step=_turn(STEP, 0.015, 0.05),
+)
+_TWO_A = _scenarios(
+    "2a",
+    _CAR | {"friction": (0.9, 1.0)},
+    car_random=random_of(0.002, 0.006),
+    car_slalom=_turn(SLALOM, 0.01, 0.025),
+    car_step=_turn(STEP, 0.008, 0.025),
+    car_sine_with_dwell=_turn(SINE_WITH_DWELL, 0.01, 0.03),
+    car_iso_3888_1=_ISO_3888_1 | {"path_speed": (60.0 * KMH, 80.0 * KMH)},
+)
+# the nominal friction is the middle of what may come, as a designer would take it
+_TWO_B = _scenarios(
+    "2b",
+    _CAR | {"friction": (0.3, 1.0), "nominal": {"friction": 0.65}},
+    any_friction_random=random_of(0.002, 0.006),
+    any_friction_slalom=_turn(SLALOM, 0.01, 0.025),
+    any_friction_step=_turn(STEP, 0.008, 0.025),
+    any_friction_sine_with_dwell=_turn(SINE_WITH_DWELL, 0.01, 0.03),
+    # sections as long as they are for 35 to 50 km/h: at 80 friction 0.3 holds nobody on the track
+    any_friction_iso_3888_1=_ISO_3888_1 | {"path_speed": (35.0 * KMH, 50.0 * KMH)},
+)
+_TWO_C = _scenarios(
+    "2c",
+    _CAR | {"friction": (0.6, 1.0), "nominal": {"friction": 0.8}},
+    limit_slalom=_turn(SLALOM, 0.02, 0.06) | {"speed": (75.0 * KMH, 85.0 * KMH)},
+    limit_sine_with_dwell=_turn(SINE_WITH_DWELL, 0.03, 0.08) | {"speed": (75.0 * KMH, 85.0 * KMH)},
+    limit_step=_turn(STEP, 0.02, 0.06),
+    limit_random=random_of(0.01, 0.03) | {"speed": (55.0 * KMH, 65.0 * KMH)},
+)
+
+TIERS: tuple[Scenario, ...] = (*_ONE, *_TWO_A, *_TWO_B, *_TWO_C)
