@@ -90,6 +90,15 @@ def make_agent(
     is returned. options: arguments of that controller.
     Raises ValueError for an unknown name or an observation without what the controller needs,
     TypeError for an unknown option, options beside an `Agent`, or what has no `predict`.
+
+    >>> import gymnasium as gym
+    >>> env = gym.make("sideslip/YawVision-v0")
+    >>> observation, _ = env.reset(seed=0)
+    >>> action, state = make_agent("feedforward", env).predict(observation)
+    >>> action.shape
+    (1,)
+
+    See also `Controller`, the base class of ours, and `sideslip.rollout`.
     """
     agent: Any = name
     if isinstance(name, str):

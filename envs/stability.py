@@ -235,7 +235,7 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
 
     @property
     def nominal(self) -> Vehicle:
-        """The vehicle that estimators and controllers are told."""
+        """The vehicle that estimators and controllers are designed for."""
         return self._now.nominal
 
     @property

@@ -164,7 +164,7 @@ class StabilityVectorEnv(Episodes, VectorEnv[Observations, Any, npt.NDArray[Any]
         return self.obs.copy(), rewards, terminated, truncated, infos
 
     def _finished(self) -> Infos:
-        """Reset the rows that are over; what they told last."""
+        """Reset the rows that are over; returns what they reported last."""
         final_obs, rows = np.full(self.num_envs, None), np.flatnonzero(self.over)
         for i in rows:
             final_obs[i] = self.obs[i].copy()

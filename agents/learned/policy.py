@@ -25,10 +25,10 @@ class Learned(Controller):
 
     def __init__(self, env: AnyEnv, policy: str | Path | Policy = DEFAULT) -> None:
         self.policy = policy if isinstance(policy, Policy) else load_policy(policy)
-        name, card, told = self.policy.name, self.policy.card, facts_of(env)
+        name, card, facts = self.policy.name, self.policy.card, facts_of(env)
         reads = self.policy.reads
         entries = [entry for entry, read in zip(card.observation, reads, strict=True) if read]
-        units = {entry.name: entry.unit for entry in told.layout}
+        units = {entry.name: entry.unit for entry in facts.layout}
         wrong = [
             f"{each} in {unit} (here {units[each]})"
             for each, unit in entries
@@ -36,15 +36,15 @@ class Learned(Controller):
         ]
         if wrong:
             raise ValueError(f"policy {name} was trained on {', '.join(wrong)}")
-        if told.control_period != card.control_period:
+        if facts.control_period != card.control_period:
             raise ValueError(
                 f"policy {name} was trained with a control period of {card.control_period} ticks, "
-                f"this env has {told.control_period}"
+                f"this env has {facts.control_period}"
             )
-        if told.width < self.policy.network.width:
+        if facts.width < self.policy.network.width:
             raise ValueError(
                 f"policy {name} gives {self.policy.network.width} numbers, "
-                f"the env's action has {told.width}"
+                f"the env's action has {facts.width}"
             )
         self.needs = tuple(each for each, _ in entries)
         super().__init__(env)

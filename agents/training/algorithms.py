@@ -40,7 +40,7 @@ class Algorithm:
     log_std: float = -1.0
 
     def options(self, seconds: float, num_envs: int) -> dict[str, Any]:
-        """What else the class is told, from a control period and a number of environments."""
+        """Further arguments of the class, from a control period and a number of environments."""
         rollout = num_envs * self.settings["n_steps"]
         return {
             **self.settings,

@@ -14,7 +14,7 @@ def network_from_sb3(model: Any, normaliser: Any = None) -> Network:
 
     model: PPO, A2C, SAC or TD3 with dense layers and an action within [-1, 1], with `Standardised`
     before them or nothing. normaliser: the VecNormalize of the training, or None. An entry that
-    never varied in training told the network nothing and is not read: scale 0.
+    never varied in training taught the network nothing and is not read: scale 0.
 
     Raises ValueError for a model that is none of these, or an observation of another width,
     ModuleNotFoundError without torch.

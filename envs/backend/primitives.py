@@ -118,11 +118,11 @@ def _of_choice(condition, a, b):
     return signature(kind, asked, kind, kind)
 
 
-def _converted(to: types.Type, abreast: Lanes) -> Callable[..., Any]:
+def _converted(to: types.Type, to_lanes: Lanes) -> Callable[..., Any]:
     def typing(a):
         kind = meet((a,))
         lanes = isinstance(kind, Lanes)
-        return kind and signature(abreast if lanes else to, kind)
+        return kind and signature(to_lanes if lanes else to, kind)
 
     return typing
 

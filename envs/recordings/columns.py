@@ -91,7 +91,7 @@ def parse_mapping(texts: Sequence[str]) -> dict[str, str]:
 def read_table(path: Path) -> "pd.DataFrame":
     """The file's columns as they stand there.
 
-    CSV (comma, semicolon or tab) or Parquet, told apart by content. Raises ModuleNotFoundError
+    CSV (comma, semicolon or tab) or Parquet, recognised by content. Raises ModuleNotFoundError
     without the extra, FileNotFoundError, and ValueError where the file is no table.
     """
     try:

@@ -53,6 +53,11 @@ class Scenario:
     tier: of `TIER_NAMES`, the one in whose score the scenario may stand, "" for none.
 
     Raises ValueError for a value out of place and names the field.
+
+    >>> Scenario(name="mine", steering="step", amplitude=(0.02, 0.05)).range("amplitude")
+    (0.02, 0.05)
+
+    See also `scenario_from`, which takes a mapping over a named scenario.
     """
 
     name: str

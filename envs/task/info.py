@@ -57,9 +57,9 @@ def info_of(report: Array) -> tuple[dict[str, Any], int]:
 
 
 def infos_of(reports: Array, rows: npt.NDArray[np.bool_]) -> dict[str, Any]:
-    """The infos of some rows of a batch as Gymnasium's vector environments tell them.
+    """The infos of some rows of a batch as Gymnasium's vector environments have them.
 
-    reports: (N, len(Report)). rows: (N,) whose infos are told; of the others stand zeros. Every
+    reports: (N, len(Report)). rows: (N,) that are reported; the others have zeros. Every
     key has an array (N,) and, with an underscore before it, a mask.
     """
     if rows.all():
@@ -69,9 +69,9 @@ def infos_of(reports: Array, rows: npt.NDArray[np.bool_]) -> dict[str, Any]:
         columns[:, rows] = reports[rows].T
     failure = columns[REPORT.failure].astype(np.int64)
     success = (columns[REPORT.ended] == 1.0) & (failure == RUNNING)
-    told = (*columns[: len(_NUMBERS)], failure, success)
-    masks = np.empty((len(told), len(rows)), np.bool_)
+    values = (*columns[: len(_NUMBERS)], failure, success)
+    masks = np.empty((len(values), len(rows)), np.bool_)
     masks[:] = rows
-    infos: dict[str, Any] = dict(zip(_KEYS, told, strict=True))
+    infos: dict[str, Any] = dict(zip(_KEYS, values, strict=True))
     infos.update(zip(_MASKS, masks, strict=True))
     return infos

@@ -50,6 +50,14 @@ class EstimateObservation(
     Raises TypeError if it is not the innermost wrapper, the env has no record or the estimator is
     none; ValueError for an unknown output, where names would stand twice, or for an object with a
     vehicle or options.
+
+    >>> import gymnasium as gym
+    >>> env = EstimateObservation(gym.make("sideslip/YawVision-v0"), "multirate-kf")
+    >>> [entry.name for entry in env.layout[-4:]]
+    ['beta_hat', 'gamma_hat', 'beta_std', 'gamma_std']
+
+    See also `make_estimator`, `sideslip.estimators.vector.EstimateObservation` for vector envs and
+    `register_estimator`.
     """
 
     def __init__(
