@@ -37,7 +37,7 @@ class Packet(NamedTuple):
     sensor: int = 0  # its place in `sensors.slow.SLOW`
     captured: int = 1  # tick
     arrived: int = 2  # tick
-    quality: int = 3  # 1 good; 0 do not use the course (too slow)
+    quality: int = 3  # 1 good; 0 not to be used: too slow for a course, no lane in view
     sequence: int = 4
     value: int = 5  # the first of VALUES
 

@@ -49,7 +49,7 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
     | ..._mean | | mean over the step (`fast="all"`: every sample instead of last and mean) |
     | steer, torque_left, torque_right | rad, N m | applied, in the last tick |
     | steer_command | rad | the driver's |
-    | camera_psi, camera_y_l | rad, m | newest camera sample (where the id has a camera) |
+    | camera_psi, camera_y_l | rad, m | newest camera sample of quality 1 |
     | gps_course, gps_speed, gps_X, gps_Y | rad, m/s, m | newest GPS sample |
     | gps_hdop, gps_satellites | - | its dilution of precision and satellites |
     | ..._age, ..._fresh | s, - | its age, at most 10 s; 1 if it arrived in this step |

@@ -15,7 +15,7 @@ from ..engine.layout import IN_SLOW, SLOW_WIDTH, P, Z
 from ..engine.packets import FAR, scene_of
 from ..record import PACKET, PACKET_WIDTH
 from ..sensors.link import Link, arrivals, most_under_way
-from ..sensors.slow import BLOCKS, VALUES, sample
+from ..sensors.slow import BLOCKS, SEES, VALUES, sample
 from ..ticks import NEVER
 from ..vehicle.dynamics import Motion
 
@@ -130,6 +130,8 @@ class SlowSensors:
                 slow = sensors[sensor]
                 better = due[i] & (packet[PACKET.sensor] == sensor)
                 better = better & (packet[PACKET.captured] > slow[IN_SLOW.captured])
+                if SEES[sensor]:
+                    better = better & (packet[PACKET.quality] > 0.0)
                 newest = (
                     packet[PACKET.captured],
                     *packet[PACKET.value : PACKET.value + VALUES],

@@ -24,7 +24,7 @@ from .packing import EpisodeConfig, episode_config
 
 def in_scenario(sensors: dict[str, SlowSensor], scenario: Scenario) -> dict[str, SlowSensor]:
     """The sensors with the clocks and delays of a scenario: its fields `<sensor>_period`,
-    `<sensor>_delays` and, with these, `<sensor>_jitter`, where it has them."""
+    `<sensor>_delays` and, with these, `<sensor>_jitter`, and `<sensor>_loss`, where it has them."""
     changed = {}
     for name, sensor in sensors.items():
         period, delays = (getattr(scenario, f"{name}_{key}", None) for key in ("period", "delays"))
@@ -33,6 +33,8 @@ def in_scenario(sensors: dict[str, SlowSensor], scenario: Scenario) -> dict[str,
         if delays is not None:
             jitter = getattr(scenario, f"{name}_jitter", 0.0)
             sensor = dataclasses.replace(sensor, delays=delays, jitter=jitter)
+        if loss := getattr(scenario, f"{name}_loss", 0.0):
+            sensor = dataclasses.replace(sensor, loss=loss)
         changed[name] = sensor
     return changed
 

@@ -14,6 +14,7 @@ from ..scenarios.speed import Pace
 from ..scenarios.steering import STEERING_WIDTH
 from ..scenarios.tracks import Path
 from ..scenarios.wind import Wind
+from ..sensors.camera import View
 from ..sensors.gps import Sky
 from ..sensors.link import IN_FLIGHT, Link
 from ..sensors.noise import Noise
@@ -110,6 +111,7 @@ class Params(NamedTuple):
     driver: Driver
     path: Path
     change: Change
+    sight: View  # of the camera
 
 
 class State(NamedTuple):

@@ -10,7 +10,7 @@ from ..backend.decorators import jit
 from ..backend.primitives import minimum
 from ..record import PACKET, PACKET_WIDTH
 from ..sensors.link import arrivals
-from ..sensors.slow import BLOCKS, VALUES, Scene, sample
+from ..sensors.slow import BLOCKS, SEES, VALUES, Scene, sample
 from ..ticks import NEVER
 from .layout import FLAGS, P, Z
 
@@ -67,8 +67,10 @@ def _deliver(z: Any, tick: Any, packets: Any, count: int) -> int:
             return count
         for i in range(PACKET_WIDTH):
             packets[count, i] = z[best + i]
-        newest = Z.slow[int(z[best + PACKET.sensor])]
-        if z[best + PACKET.captured] > z[newest.captured]:
+        sensor = int(z[best + PACKET.sensor])
+        newest = Z.slow[sensor]
+        nothing = SEES[sensor] and z[best + PACKET.quality] <= 0.0
+        if not nothing and z[best + PACKET.captured] > z[newest.captured]:
             z[newest.captured] = z[best + PACKET.captured]
             for i in range(VALUES):
                 z[newest.values[0] + i] = z[best + PACKET.value + i]
@@ -92,8 +94,9 @@ def due(z: Any, tick: Any) -> bool:
 @jit
 def scene_of(p: Any, motion: Any, small_angle: int, key: Any, tick: Any) -> Scene:
     """The scene that slow sensors see at a tick."""
-    road, car, noise, sky = read(p, P.road), read(p, P.car), read(p, P.noise), read(p, P.sky)
-    return Scene(motion, road, car, noise, sky, small_angle, key[0], key[1], tick)
+    road, car, noise = read(p, P.road), read(p, P.car), read(p, P.noise)
+    sky, sight = read(p, P.sky), read(p, P.sight)
+    return Scene(motion, road, car, noise, sky, sight, small_angle, key[0], key[1], tick)
 
 
 @jit

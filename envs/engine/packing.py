@@ -14,6 +14,7 @@ from ..scenarios.speed import Pace
 from ..scenarios.steering import STEERING_KINDS, STEERING_WIDTH
 from ..scenarios.tracks import path_of
 from ..scenarios.wind import Wind
+from ..sensors.camera import View
 from ..sensors.gps import HDOP_LAWS, Sky
 from ..sensors.link import Link, SlowSensor, link_of
 from ..sensors.noise import Noise
@@ -182,6 +183,7 @@ def episode_config(
         ),
         path=path_of(scenario.path, vehicle.width),
         change=Change(FOREVER, 1.0, 1.0),  # drawn
+        sight=View(scenario.camera_heading, scenario.camera_offset),
     )
     switches = Switches(
         small_angle=int(scenario.small_angle),

@@ -47,6 +47,7 @@ _NUMBERS = (
     "hdop_spread",
     "hdop_time",
     "camera_jitter",
+    "camera_loss",
     "driver_preview",
     "driver_gain",
     "driver_lag",
@@ -63,6 +64,8 @@ _POSITIVE = (
     "disturbance_time",
     "curve_ramp",
     "half_width",
+    "camera_heading",
+    "camera_offset",
     "change_length",
     "surge_frequency",
     "hdop",
@@ -137,6 +140,9 @@ def _check_numbers(fields: Fields) -> None:
     width = fields["half_width"]  # only compared with: it may be as wide as a float can be
     if not (is_finite(width) or (isinstance(width, float) and math.isfinite(width))):
         raise ValueError(f"half_width {brief(width)} is not finite")
+    for name in ("camera_heading", "camera_offset"):
+        if fields[name] != math.inf:
+            _check_number(name, fields[name])
     for name in _POSITIVE:
         if not fields[name] > 0.0:
             raise ValueError(f"{name} must be positive, got {fields[name]!r}")
@@ -197,5 +203,7 @@ def _check_sensors(fields: Fields) -> None:
         raise ValueError(f"gps_period is {SHORTEST_GPS_PERIOD} s or more, got {period!r}")
     if fields["camera_jitter"] < 0.0:
         raise ValueError(f"camera_jitter is zero or more, got {fields['camera_jitter']!r}")
+    if not 0.0 <= fields["camera_loss"] < 1.0:
+        raise ValueError(f"camera_loss is a probability below 1, got {fields['camera_loss']!r}")
     if fields["camera_jitter"] and fields["camera_delays"] is None:
         raise ValueError("camera_jitter needs camera_delays")

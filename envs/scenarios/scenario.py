@@ -1,6 +1,7 @@
 """A manoeuvre is data: named, frozen, JSON-able."""
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -46,9 +47,11 @@ class Scenario:
     axis. disturbance_*: an Ornstein-Uhlenbeck force and moment.
 
     Sensors: noise replaces the default. camera_delays: a repeating pattern that replaces the id's,
-    and camera_jitter with it; gps_period and gps_delays likewise. hdop, hdop_spread, hdop_time:
-    median of the GPS's HDOP, standard deviation of its logarithm, and the time in which that
-    forgets. hdop_law of `HDOP_LAWS`: how much of the noise follows HDOP.
+    and camera_jitter with it; gps_period and gps_delays likewise. camera_loss: the probability that
+    a frame is lost (0: the id's). camera_heading (rad, against the road) and camera_offset (m, of
+    the car from the lane's centre): beyond either no lane is in view, and a packet's quality is 0.
+    hdop, hdop_spread, hdop_time: median of the GPS's HDOP, standard deviation of its logarithm, and
+    the time in which that forgets. hdop_law of `HDOP_LAWS`: how much of the noise follows HDOP.
 
     tier: of `TIER_NAMES`, the one in whose score the scenario may stand, "" for none.
 
@@ -108,6 +111,9 @@ class Scenario:
     half_width: float = 50.0
     camera_delays: tuple[float, ...] | None = None
     camera_jitter: float = 0.0
+    camera_loss: float = 0.0
+    camera_heading: float = math.inf
+    camera_offset: float = math.inf
     camera_outage: tuple[float, float] | None = None
     gps_period: float | None = None
     gps_delays: tuple[float, ...] | None = None

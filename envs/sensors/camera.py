@@ -1,9 +1,10 @@
 """The camera: heading relative to the road and lateral offset at the preview point."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 from ..backend.decorators import jit
 from ..backend.elementary import PI, wrap
+from ..backend.primitives import absolute, select
 from ..backend.random import CHANNELS
 from ..vehicle.dynamics import curvature_at
 from .kind import Blocks, SlowKind, Value
@@ -12,7 +13,22 @@ CAMERA_KIND = SlowKind(
     "camera",
     (Value("psi", "rad", PI), Value("y_l", "m", 200.0)),
     Blocks(noise=CHANNELS.camera, link=CHANNELS.camera_link, drift=CHANNELS.camera),  # no drift
+    sees=True,
 )
+
+
+class View(NamedTuple):
+    """The camera's field of view: beyond it there is no lane in the picture."""
+
+    heading: Any  # rad, relative to the road, either side
+    offset: Any  # m, of the centre of gravity from the lane's centre, either side
+
+
+@jit
+def lane_in_view(motion: Any, sight: Any) -> Any:
+    """The quality of a picture: 1, or 0 where the lane is out of view."""
+    turned = absolute(wrap(motion.psi - motion.theta)) > sight.heading
+    return select(turned | (absolute(motion.y) > sight.offset), 0.0, 1.0)
 
 
 @jit

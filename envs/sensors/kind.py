@@ -25,3 +25,4 @@ class SlowKind(NamedTuple):
     name: str
     values: tuple[Value, ...]
     blocks: Blocks | None = None  # None: of the sensor's place in the table
+    sees: bool = False  # at quality 0 it saw nothing: the observation holds the sample before

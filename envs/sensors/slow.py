@@ -13,7 +13,7 @@ from ..backend.decorators import jit
 from ..backend.elementary import exp
 from ..backend.primitives import whole
 from ..backend.random import normals
-from .camera import CAMERA_KIND, camera_sample
+from .camera import CAMERA_KIND, camera_sample, lane_in_view
 from .gps import GPS_KIND, gps_sample, sky_deviation
 from .kind import Blocks
 from .link import SlowSensor
@@ -22,6 +22,7 @@ SLOW = (CAMERA_KIND, GPS_KIND)
 CAMERA, GPS = range(len(SLOW))
 SLOW_NAMES = tuple(kind.name for kind in SLOW)
 WIDTHS = tuple(len(kind.values) for kind in SLOW)  # values of each one's packets
+SEES = tuple(kind.sees for kind in SLOW)
 VALUES = max(WIDTHS)  # of any packet; those of a sensor with fewer are filled up with zeros
 
 _FIRST_BLOCK, _BLOCKS_EACH = 1000, 10  # of random numbers, clear of `backend.random.CHANNELS`
@@ -44,6 +45,7 @@ class Scene(NamedTuple):
     car: Any
     noise: Any
     sky: Any  # the satellites
+    sight: Any  # the camera's View
     small_angle: int
     key_low: Any
     key_high: Any
@@ -65,7 +67,8 @@ def sample(sensor: int, scene: Scene, link: Any, drift: Any) -> Sample:
     n = normals(scene.key_low, scene.key_high, when, blocks.noise)
     if sensor == CAMERA:
         psi, y_l = camera_sample(scene.motion, scene.road, scene.car.l_pre, scene.noise, n)
-        return Sample((psi, y_l, 0.0, 0.0, 0.0, 0.0), 1.0, drift)
+        quality = lane_in_view(scene.motion, scene.sight)
+        return Sample((psi, y_l, 0.0, 0.0, 0.0, 0.0), quality, drift)
     sky, car = scene.sky, scene.car
     fresh = normals(scene.key_low, scene.key_high, when, blocks.drift)
     drift = sky_deviation(drift, sky, link, scene.tick, fresh)

@@ -83,6 +83,7 @@ ARGUMENTS: list[dict[str, Any]] = [
     {"vehicle": {"base": "coms", "steering_lag": 0.0}},
     {"camera": {"phase": None, "loss": 0.3, "duplicate": 0.3, "jitter": 0.05}},
     {"gps": {"phase": None}},
+    {"scenario": {"base": "random-steering", "camera_heading": 0.03, "camera_loss": 0.2}},
     {"scenario": {"base": "sine-with-dwell", "tyres": "dugoff"}},
     {"gps": {"period": 0.1, "delays": (0.2, 0.05, 0.15, 0.1), "duplicate": 1.0}},
     {"yaw_first": False, "steering": True, "on_bad_action": "fail"},
