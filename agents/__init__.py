@@ -6,7 +6,6 @@ from typing import Any, Protocol, overload
 from ..estimators.registry import Registry
 from .controllers.base import Controller, NoControl
 from .controllers.esc import Esc
-from .controllers.informed import Informed
 from .controllers.lane_keeping import LaneKeeping
 from .controllers.lqr import Lqr
 from .controllers.model_following import ModelFollowing
@@ -29,7 +28,6 @@ AGENTS = Registry(
         "lqr": Lqr,
         "mpc": Mpc,
         "lane-keeping": LaneKeeping,
-        "informed": Informed,
         "learned": Learned,
     },
 )
@@ -41,7 +39,6 @@ __all__ = [
     "Controller",
     "Esc",
     "Feedforward",
-    "Informed",
     "LaneKeeping",
     "Learned",
     "Lqr",

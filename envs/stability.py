@@ -15,9 +15,9 @@ from .engine.config import EnvConfig
 from .engine.layout import FLAGS, PARAMS_WIDTH, STATE_WIDTH, Z
 from .engine.reset import reset_vehicle
 from .engine.step import step_vehicle
-from .engine.views import motion_in, record_in, slow_in, vehicle_in
+from .engine.views import motion_in, record_in, slow_in, true_states_in, vehicle_in
 from .engine.window import window_of
-from .record import FAST_WIDTH, PACKET_WIDTH, Record
+from .record import FAST_WIDTH, PACKET_WIDTH, Array, Record
 from .scenarios.manoeuvres import scenario_from
 from .scenarios.scenario import Scenario
 from .sensors.link import SlowSensor
@@ -232,6 +232,13 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
     def motion(self) -> Motion:
         """The true velocities, heading, place and roll now, in SI units; no sensor tells these."""
         return motion_in(self._state)
+
+    @property
+    def true_state(self) -> Array:
+        """The `TrueState` now, (len(TrueState),); no sensor tells these."""
+        rows = self._params[None], self._state[None], self._switches[None]
+        state: Array = true_states_in(*rows)[0]
+        return state
 
     @property
     def nominal(self) -> Vehicle:

@@ -8,9 +8,12 @@ import numpy as np
 import numpy.typing as npt
 
 from ...envs.backend.decorators import jit
+from ...envs.vehicle.vehicle import GRAVITY, Vehicle
 from ..env_facts import AnyEnv, facts_of
 
 Array = npt.NDArray[np.float64]
+
+FRICTION = "true_friction"  # the entry whose friction a grip limit goes by, where it is there
 
 
 class Controller(ABC):
@@ -24,17 +27,25 @@ class Controller(ABC):
     Where a needed entry is not finite the action is NaN and the memory stays as it was, so that an
     estimator that fails is seen: an env with `on_bad_action="fail"` ends the episode, others raise.
 
-    Raises ValueError when the env's observation lacks a needed entry, or where the rows of a vector
-    env have different nominal cars.
+    grip: the share of what friction lets the rear tyres transmit that the yaw moment may take, so
+    that lateral force is left to them; None: no limit but the motors'. The friction is the nominal
+    car's or, where the observation has `true_friction`, that.
+
+    Raises ValueError when the env's observation lacks a needed entry, for a grip that is not
+    positive, or where the rows of a vector env have different nominal cars.
     """
 
     needs: tuple[str, ...] = ()
     memory = 0
     _design: tuple[Any, ...] = ()  # the arguments of a compiled law behind inputs, state, action
 
-    def __init__(self, env: AnyEnv) -> None:
+    def __init__(self, env: AnyEnv, grip: float | None = None) -> None:
         facts = facts_of(env)
         names = [entry.name for entry in facts.layout]
+        self.grip = None if grip is None else positive("grip", grip)
+        self._true_friction = grip is not None and FRICTION in names
+        if self._true_friction:
+            self.needs = (*self.needs, FRICTION)
         missing = [name for name in self.needs if name not in names]
         if missing:
             raise ValueError(
@@ -43,10 +54,26 @@ class Controller(ABC):
             )
         self._columns = np.array([names.index(name) for name in self.needs], dtype=np.int64)
         self._width = len(names)
-        self.nominal = facts.nominal
+        self.nominal = self.vehicle = facts.nominal
         self.full_scale, self.authority = facts.full_scale, facts.authority
         self.control_period, self.reference = facts.control_period, facts.reference
         self.width = facts.width
+
+    vehicle: Vehicle
+    """The car that the controller is designed for."""
+
+    def _friction(self, inputs: Array) -> Array:
+        """(N,) the friction that a grip limit goes by."""
+        return inputs[:, -1] if self._true_friction else np.full(len(inputs), self.nominal.friction)
+
+    def _most(self, inputs: Array) -> Array:
+        """(N,) the largest yaw moment as a share of full scale: what `grip` leaves of it."""
+        if self.grip is None:
+            return np.ones(len(inputs))
+        car = self.vehicle
+        load = car.mass * GRAVITY * car.front_arm / (2.0 * car.wheelbase)  # N, of a rear tyre
+        per_friction = self.grip * load * car.rear_track / self.full_scale
+        return np.minimum(per_friction * self._friction(inputs), 1.0)
 
     @abstractmethod
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
@@ -93,7 +120,7 @@ class Controller(ABC):
 def _hint(missing: list[str]) -> str:
     """The wrapper whose observation has these entries."""
     if any(name.startswith("true_") for name in missing):
-        return "; build env and agent with sideslip.agents.controllers.informed.make_informed"
+        return "; wrap the env in sideslip.estimators.wrappers.truth.TruthObservation"
     if any(name.endswith("_hat") for name in missing):
         return "; wrap the env in sideslip.estimators.EstimateObservation"
     return ""

@@ -53,6 +53,7 @@ def _esc_law(
     x: Any,
     state: Any,
     action: Any,
+    most: Any,
     target: Any,
     speeds: Any,
     gains: Any,
@@ -74,7 +75,8 @@ def _esc_law(
         wanted = k_p * error + state[n, 0]
         if bounded:  # more yaw rate to the side the car slides to: beta' = ... - gamma
             wanted += stiffness * beyond(x[n, IN.beta_hat], slip)
-        N_z = min(max(wanted, -full_scale), full_scale)
+        limit = most[n] * full_scale
+        N_z = min(max(wanted, -limit), limit)
         state[n, 0] = integrated(state[n, 0], k_i * error * dt, wanted, N_z)
         if absolute(error) == 0.0:
             state[n, 0] -= state[n, 0] * dt / RELEASE
@@ -90,8 +92,8 @@ class Esc(Controller):
     Beyond +-`slip` (rad) a moment of `stiffness` (N m/rad; default: the full moment at twice the
     bound) drives beta back, where the observation has beta_hat; without, it does without.
 
-    bandwidth: rad/s, of `yaw_gains`. Memory: the integral. Raises ValueError for an option out of
-    range.
+    bandwidth: rad/s, of `yaw_gains`. grip: of `Controller`. Memory: the integral. Raises
+    ValueError for an option out of range.
     """
 
     memory = 1
@@ -103,10 +105,11 @@ class Esc(Controller):
         band: float = 0.02,
         slip: float = 0.05,
         stiffness: float | None = None,
+        grip: float | None = None,
     ) -> None:
         bounded = "beta_hat" in entries_of(env)
         self.needs = Inputs._fields if bounded else Inputs._fields[:-1]
-        super().__init__(env)
+        super().__init__(env, grip)
         bandwidth, slip = positive("bandwidth", bandwidth), positive("slip", slip)
         if not 0.0 <= band < math.inf:
             raise ValueError(f"band is zero or more, in rad/s, got {band!r}")
@@ -123,4 +126,4 @@ class Esc(Controller):
         )
 
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
-        _esc_law(inputs, state, action, *self._design)
+        _esc_law(inputs, state, action, self._most(inputs), *self._design)

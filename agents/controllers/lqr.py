@@ -11,7 +11,8 @@ from ...envs.backend.decorators import jit
 from ...envs.backend.primitives import absolute
 from ...envs.task.reference import REFERENCES
 from ...envs.ticks import TICK
-from ...envs.vehicle.vehicle import Vehicle
+from ...envs.vehicle.tyres import SLOW
+from ...envs.vehicle.vehicle import GRAVITY, Vehicle
 from ..design.gain_schedule import SPEEDS, gain_table, interpolated
 from ..design.sampled_model import Purpose
 from ..env_facts import AnyEnv
@@ -45,14 +46,18 @@ def _lqr_law(
     x: Any,
     state: Any,
     action: Any,
+    most: Any,
+    slides: Any,
     table: Any,
     axes: Any,
     scheduled: int,
     share: Any,
     authority: Any,
     slew: Any,
+    front_arm: Any,
 ) -> None:
-    """x: `Inputs`. state: rad of steering last added, where the car steers."""
+    """x: `Inputs`. state: rad of steering last added, where the car steers. most, slides: (N,),
+    of the yaw moment as a share, and rad of slip at which the front tyres only slide."""
     m, n = table.shape[3], table.shape[4] - table.shape[3]
     KS, z = np.empty((m, n + m)), np.empty(n)
     for row in range(len(x)):
@@ -66,10 +71,13 @@ def _lqr_law(
             u -= KS[0, j] * z[j]
             w -= KS[m - 1, j] * z[j]
         if m == 1:
-            action[row, 0] = u
+            action[row, 0] = _clipped(u, -most[row], most[row])
             continue
         low, high = max(state[row, 0] - slew, -authority), min(state[row, 0] + slew, authority)
-        u, w = best_within(KS[0, n], KS[0, n + 1], KS[1, n + 1], u, w, 1.0, low, high)
+        straight = z[0] + front_arm * z[1] / max(v, SLOW) - z[4]  # added, that leaves no slip
+        most_w, least_w = max(straight + slides[row], 0.0), min(straight - slides[row], 0.0)
+        low, high = _clipped(least_w, low, high), _clipped(most_w, low, high)
+        u, w = best_within(KS[0, n], KS[0, n + 1], KS[1, n + 1], u, w, most[row], low, high)
         action[row, 0], action[row, 1], state[row, 0] = u, w / authority, w
 
 
@@ -86,13 +94,12 @@ class Lqr(Controller):
     env's nominal. stiffness: two entries of the observation with the front and the rear cornering
     stiffness, on which the gains are then scheduled too, within `span` times the vehicle's, on
     `knots` knots each; the table is designed once. steer_weight: of added steering, times the
-    cost's: the rate limit, which the design does not know, punishes haste.
+    cost's: the rate limit, which the design does not know, punishes haste. grip: of `Controller`;
+    with it no steering is added that only slides the front tyres either.
 
     Raises ValueError for a missing entry or an option out of range, ModuleNotFoundError without
     python-control.
     """
-
-    more: tuple[str, ...] = ()  # entries that a subclass reads, behind `Inputs`
 
     def __init__(
         self,
@@ -103,6 +110,7 @@ class Lqr(Controller):
         span: tuple[float, float] = (0.5, 1.6),
         knots: int = 7,
         steer_weight: float = 1.0,
+        grip: float | None = None,
     ) -> None:
         if len(stiffness) not in (0, 2):
             raise ValueError(f"stiffness names two entries or none, got {list(stiffness)}")
@@ -117,9 +125,8 @@ class Lqr(Controller):
             "gamma_hat" if "gamma_hat" in names else "gyro",
             *pairs.get(kind, instead),
             *(stiffness or instead),
-            *self.more,
         )
-        super().__init__(env)
+        super().__init__(env, grip)
         car = self.nominal if vehicle is None else vehicle
         self.memory = 1 if self.width == 2 else 0
         self.purpose = Purpose(
@@ -141,8 +148,9 @@ class Lqr(Controller):
         self.table = gain_table(car, self.purpose, speeds, fronts, rears)
         self.axes = tuple(np.array(axis) for axis in (speeds, fronts or (0.0,), rears or (0.0,)))
         slew = car.steering_rate * self.control_period * TICK
-        scheduled = int(len(stiffness) == 2)
-        self._design = self.table, self.axes, scheduled, self.share, self.authority, slew
+        self.scheduled = len(stiffness) == 2
+        limits = self.authority, slew, car.front_arm
+        self._design = self.table, self.axes, int(self.scheduled), self.share, *limits
 
     def gains(self, speed: float, front: float = 0.0, rear: float = 0.0) -> Array:
         """K (m, n) at a speed in m/s, and at stiffnesses in N/rad where it is scheduled on them."""
@@ -151,7 +159,19 @@ class Lqr(Controller):
         return KS[:, : len(self.purpose.states)]
 
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
-        _lqr_law(inputs, state, action, *self._design)
+        limits = self._most(inputs), self._slides(inputs)
+        _lqr_law(inputs, state, action, *limits, *self._design)
+
+    def _slides(self, inputs: Array) -> Array:
+        """(N,) rad of slip beyond which the front tyres' force grows no more (Fiala's), infinite
+        without a grip limit."""
+        if self.grip is None:
+            return np.full(len(inputs), np.inf)
+        car = self.vehicle
+        stiffness = inputs[:, IN.front_stiffness] if self.scheduled else car.front_stiffness
+        load = car.mass * GRAVITY * car.rear_arm / (2.0 * car.wheelbase)  # N, of a front tyre
+        slides: Array = 3.0 * self._friction(inputs) * load / np.maximum(stiffness, 1.0)
+        return slides
 
 
 @jit

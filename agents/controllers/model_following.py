@@ -64,6 +64,7 @@ def _model_following_law(
     x: Any,
     state: Any,
     action: Any,
+    most: Any,
     car: Any,
     target: Any,
     kind: int,
@@ -91,7 +92,8 @@ def _model_following_law(
         )
         delta_f, N_z = delta_f + state[n, LAST.delta_f], N_z + state[n, LAST.N_z]  # (33)
         steer = min(max(delta_f, driver - authority), driver + authority)
-        moment = min(max(N_z, -full_scale), full_scale)
+        limit = most[n] * full_scale
+        moment = min(max(N_z, -limit), limit)
         moved = drift(plant, p_beta, p_gamma)
         steps = inputs_for(plant, -moved[0] * dt, -moved[1] * dt)  # I of (31), forward Euler
         state[n, LAST.delta_f] = integrated(state[n, LAST.delta_f], steps[0], delta_f, steer)
@@ -105,9 +107,9 @@ class ModelFollowing(Controller):
     """Steering and yaw moment by dakf-stability (33), for an env whose action has both.
 
     bandwidth: K_beta and K_gamma in rad/s. rejection: subtract the effect of d1_hat and d2_hat,
-    (26). The yaw rate is gamma_hat where the observation has it, else the gyro's. The references
-    are the env's; their derivatives are those of the driver's steering at the measured speed, whose
-    noise would drown a difference of references.
+    (26). grip: of `Controller`. The yaw rate is gamma_hat where the observation has it, else the
+    gyro's. The references are the env's; their derivatives are those of the driver's steering at
+    the measured speed, whose noise would drown a difference of references.
 
     Memory: `Memory`. Anti-windup is conditional integration, each input for itself: an integral
     holds while its input is at the limit (yaw moment: full scale; steering: the authority around
@@ -120,13 +122,17 @@ class ModelFollowing(Controller):
     memory = len(Memory._fields)
 
     def __init__(
-        self, env: AnyEnv, bandwidth: Sequence[float] = BANDWIDTH, rejection: bool = True
+        self,
+        env: AnyEnv,
+        bandwidth: Sequence[float] = BANDWIDTH,
+        rejection: bool = True,
+        grip: float | None = None,
     ) -> None:
         instead = {} if "gamma_hat" in entries_of(env) else {"gamma_hat": "gyro"}
         if not rejection:  # whatever stands there is multiplied by zero
             instead |= {"d1_hat": "beta_ref", "d2_hat": "gamma_ref"}
         self.needs = tuple(instead.get(name, name) for name in Inputs._fields)
-        super().__init__(env)
+        super().__init__(env, grip)
         if self.width != 2:
             raise ValueError("ModelFollowing needs an env whose action steers (steering=True)")
         K = [float(each) for each in bandwidth]
@@ -144,4 +150,4 @@ class ModelFollowing(Controller):
         )
 
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
-        _model_following_law(inputs, state, action, *self._design)
+        _model_following_law(inputs, state, action, self._most(inputs), *self._design)

@@ -47,7 +47,7 @@ class Mpc(Lqr):
     Where none is met this is the LQR. The program is that of the nearest speed of `SPEEDS`.
 
     horizon: steps of a control period, or of 10 ms where that is shorter. iterations: the solver's
-    most. disturbance_time: of `lqr`.
+    most. disturbance_time: of `lqr`. grip: of `Controller`.
 
     status: of each row of the last call, "solved", "solved inaccurate" (ten times the tolerance of
     1e-4 of full scale) or why there is no solution: then the row's action is NaN. solve_time: of
@@ -59,7 +59,12 @@ class Mpc(Lqr):
     """
 
     def __init__(
-        self, env: AnyEnv, horizon: int = 30, iterations: int = 20000, disturbance_time: float = 0.3
+        self,
+        env: AnyEnv,
+        horizon: int = 30,
+        iterations: int = 20000,
+        disturbance_time: float = 0.3,
+        grip: float | None = None,
     ) -> None:
         try:
             import osqp
@@ -70,7 +75,7 @@ class Mpc(Lqr):
         for name, value in (("horizon", horizon), ("iterations", iterations)):
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
                 raise ValueError(f"{name} is a positive whole number, got {value!r}")
-        super().__init__(env, disturbance_time=disturbance_time)
+        super().__init__(env, disturbance_time=disturbance_time, grip=grip)
         self._osqp: Any = osqp
         known = osqp.SolverStatus
         self._good = (int(known.OSQP_SOLVED), int(known.OSQP_SOLVED_INACCURATE))
@@ -118,17 +123,21 @@ class Mpc(Lqr):
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
         self.status, self.solve_time = [], []
         z = np.empty(len(self.purpose.states))
-        for x, memory, chosen in zip(inputs, state, action, strict=True):
+        rows = zip(inputs, state, action, self._most(inputs), strict=True)
+        for x, memory, chosen, most in rows:
             predicted_state(x, self.share, z)
             speed = 0.5 * (x[IN.wheel_left] + x[IN.wheel_right])
-            status, seconds = self._solve(speed, z, memory, chosen)
+            status, seconds = self._solve(speed, z, memory, chosen, float(most))
             self.status.append(status)
             self.solve_time.append(seconds)
 
-    def _solve(self, speed: float, z: Array, memory: Array, chosen: Array) -> tuple[str, float]:
+    def _solve(
+        self, speed: float, z: Array, memory: Array, chosen: Array, most: float
+    ) -> tuple[str, float]:
         """Fill the action `chosen` (m,) and the memory of a row; the solver's status and time."""
         m, count = self.width, self.horizon * self.width
         low, high = -np.ones(self._rows), np.ones(self._rows)
+        low[:count:m], high[:count:m] = -most, most
         if m > 1:
             low[count:], high[count:] = -self._change, self._change
             low[count] += memory[0]

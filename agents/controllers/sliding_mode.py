@@ -46,6 +46,7 @@ def _sliding_mode_law(
     x: Any,
     state: Any,
     action: Any,
+    most: Any,
     car: Any,
     target: Any,
     kind: int,
@@ -74,7 +75,7 @@ def _sliding_mode_law(
         N_z = -(free + reach) / plant.b22  # Rajamani 8.3: equivalent control and boundary layer
         state[n, LAST.beta_ref], state[n, LAST.gamma_ref] = beta_ref, gamma_ref
         state[n, LAST.known] = 1.0
-        action[n, 0] = min(max(N_z / full_scale, -1.0), 1.0)
+        action[n, 0] = min(max(N_z / full_scale, -most[n]), most[n])
 
 
 class SlidingMode(Controller):
@@ -84,7 +85,7 @@ class SlidingMode(Controller):
     measured speed keeps s constant, and within a boundary layer of `layer` rad/s s decays at `rate`
     rad/s (outside at rate x layer rad/s2). xi is `surface` for the `pole` in rad/s. Where the yaw
     rate is not judged, gamma_ref is the yaw rate that keeps beta_ref. Reads beta_hat, and
-    gamma_hat or else the gyro. Memory: `Memory`.
+    gamma_hat or else the gyro. grip: of `Controller`. Memory: `Memory`.
 
     Raises ValueError for an option that is not positive, or an observation without beta_hat.
     """
@@ -92,11 +93,16 @@ class SlidingMode(Controller):
     memory = len(Memory._fields)
 
     def __init__(
-        self, env: AnyEnv, pole: float = 15.0, rate: float = 40.0, layer: float = 0.2
+        self,
+        env: AnyEnv,
+        pole: float = 15.0,
+        rate: float = 40.0,
+        layer: float = 0.2,
+        grip: float | None = None,
     ) -> None:
         yaw_rate = "gamma_hat" if "gamma_hat" in entries_of(env) else "gyro"
         self.needs = (*Inputs._fields[: IN.gamma_hat], yaw_rate)
-        super().__init__(env)
+        super().__init__(env, grip)
         self.pole, self.rate = positive("pole", pole), positive("rate", rate)
         self._design = (
             nominal_car(self.nominal),
@@ -110,4 +116,4 @@ class SlidingMode(Controller):
         )
 
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
-        _sliding_mode_law(inputs, state, action, *self._design)
+        _sliding_mode_law(inputs, state, action, self._most(inputs), *self._design)

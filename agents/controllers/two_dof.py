@@ -95,6 +95,7 @@ def _two_dof_law(
     x: Any,
     state: Any,
     action: Any,
+    most: Any,
     car: Any,
     k_p: Any,
     k_i: Any,
@@ -113,7 +114,8 @@ def _two_dof_law(
         forward = _static_gain(car, maximum(v, SLOWEST)) * x[n, IN.steer_command]
         integral = state[n, LAST.integral]
         wanted = forward + _scheduled(k_p, v) * error + integral
-        N_z = min(max(wanted, -full_scale), full_scale)
+        limit = most[n] * full_scale
+        N_z = min(max(wanted, -limit), limit)
         step = _scheduled(k_i, v) * error * dt  # forward Euler
         state[n, LAST.integral] = integrated(integral, step, wanted, N_z)
         state[n, LAST.wait] = wait - 1.0
@@ -140,7 +142,8 @@ class TwoDof(Controller):
     rate: "control" updates at every decision of the env, "camera" every 33 ms (held between;
     for a control period that is no divisor of it, the next decision). gain: a factor on the PI.
     pole (rad/s), placement: of `design_pi`. sampled: place the poles of the loop as sampled at
-    that rate (`sample_pi`) instead of the continuous one's. Memory: `Memory`.
+    that rate (`sample_pi`) instead of the continuous one's. grip: of `Controller`. Memory:
+    `Memory`.
 
     Raises ValueError for an unknown rate or placement or an env whose observation lacks beta_hat.
     """
@@ -156,8 +159,9 @@ class TwoDof(Controller):
         pole: float = POLE,
         placement: str = PLACEMENTS[0],
         sampled: bool = False,
+        grip: float | None = None,
     ) -> None:
-        super().__init__(env)
+        super().__init__(env, grip)
         if rate not in ("control", "camera"):
             raise ValueError(f"rate is 'control' or 'camera', got {rate!r}")
         period = self.control_period * TICK
@@ -169,4 +173,4 @@ class TwoDof(Controller):
         self._design = car, self.k_p, self.k_i, self.full_scale, wait, dt
 
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
-        _two_dof_law(inputs, state, action, *self._design)
+        _two_dof_law(inputs, state, action, self._most(inputs), *self._design)

@@ -69,9 +69,9 @@ def make_contest(cell: Cell, cars: int) -> tuple[VectorEnv[Any, Any, Any], Any]:
     """(vector env of `cars` rows with the cell's estimator, its agent)."""
     options = cell.env_options
     if cell.controller == INFORMED:
-        from ...agents.controllers.informed import make_informed
+        from ...agents.rungs import make_rung
 
-        return make_informed(cell.env_id, num_envs=cars, **options)
+        return make_rung("oracle-parameters", cell.env_id, num_envs=cars, **options)
     env: Any = gym.make_vec(cell.env_id, num_envs=cars, **options)
     agent_options: dict[str, Any] = {}
     if cell.controller == "model-following":

@@ -20,7 +20,7 @@ from .config import EnvConfig
 from .lanes import block_of
 from .layout import FLAGS, PARAMS_WIDTH, STATE_WIDTH, P, Z
 from .packing import EpisodeConfig
-from .views import Each, record_in, slow_in, vehicle_in
+from .views import Each, record_in, slow_in, true_states_in, vehicle_in
 
 Whole = npt.NDArray[np.int64]
 T = TypeVar("T")
@@ -124,6 +124,11 @@ class Episodes:
     def motion(self) -> Array:
         """The true `Motion` of each row now, (N, len(Motion)), in SI units."""
         return np.array(self.states[:, Z.motion[0] : Z.motion[-1] + 1])
+
+    @property
+    def true_state(self) -> Array:
+        """The `TrueState` of each row now, (N, len(TrueState)); no sensor tells these."""
+        return true_states_in(self.params, self.states, self.switches)
 
     @property
     def record(self) -> Sequence[Record]:

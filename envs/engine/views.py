@@ -2,16 +2,20 @@
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import TypeVar, overload
+from typing import Any, NamedTuple, TypeVar, overload
+
+import numpy as np
 
 from ..backend.arrays import read
+from ..backend.decorators import jit
 from ..record import Array, Record
+from ..scenarios.wind import wind_at
 from ..sensors.link import SlowSensor
 from ..sensors.slow import SLOW_NAMES
 from ..ticks import TICK, ticks
-from ..vehicle.dynamics import Motion
+from ..vehicle.dynamics import Motion, gravity_at, sideslip_angle
 from ..vehicle.vehicle import Vehicle
-from .layout import P, Z
+from .layout import FLAGS, P, Z
 from .packing import EpisodeConfig
 
 T = TypeVar("T")
@@ -45,6 +49,41 @@ def slow_in(config: EpisodeConfig, state: Array) -> dict[str, SlowSensor]:
 def motion_in(state: Array) -> Motion:
     """The true velocities, heading, place and roll now, in SI units."""
     return read(state, Z.motion)
+
+
+class TrueState(NamedTuple):
+    """What an estimator of every state would tell, without its error: columns of an array."""
+
+    beta: int = 0  # rad
+    gamma: int = 1  # rad/s
+    F_d: int = 2  # N, all that pushes to the side: wind and the slope of a banked road too
+    N_d: int = 3  # N m, with the wind's
+    phi: int = 4  # rad
+    phi_dot: int = 5  # rad/s
+
+
+TRUE_STATE = TrueState()
+
+
+def true_states_in(params: Array, states: Array, switches: Any) -> Array:
+    """The `TrueState` of N episodes now, (N, len(TrueState))."""
+    out = np.empty((len(params), len(TRUE_STATE)))
+    _write_true_states(params, states, switches, out)
+    return out
+
+
+@jit
+def _write_true_states(params: Any, states: Any, switches: Any, out: Any) -> None:
+    for i in range(len(params)):
+        p, z = params[i], states[i]
+        motion, small_angle = read(z, Z.motion), switches[i, FLAGS.small_angle]
+        F_w, N_w, _ = wind_at(z[Z.clock.tick], read(p, P.wind))
+        _, across = gravity_at(motion, read(p, P.road), small_angle)
+        out[i, TRUE_STATE.beta] = sideslip_angle(motion.v_x, motion.v_y, small_angle)
+        out[i, TRUE_STATE.gamma] = motion.gamma
+        out[i, TRUE_STATE.F_d] = z[Z.drive.F_d] + F_w - p[P.car.m] * across
+        out[i, TRUE_STATE.N_d] = z[Z.drive.N_d] + N_w
+        out[i, TRUE_STATE.phi], out[i, TRUE_STATE.phi_dot] = motion.phi, motion.phi_dot
 
 
 def record_in(state: Array, rows: Array, packets: Array) -> Record:

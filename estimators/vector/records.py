@@ -141,6 +141,15 @@ def true_vehicles(base: Any, rows: Sequence[int]) -> list[Vehicle]:
     return [base.vehicle[i] for i in rows]
 
 
+def true_states(base: Any) -> Array:
+    """The `TrueState` of every row of a bare vector env now; TypeError where out of reach."""
+    if isinstance(base, SyncVectorEnv):
+        return np.array([env.unwrapped.true_state for env in base.envs])  # type: ignore[attr-defined]
+    if not hasattr(base, "true_state"):
+        raise TypeError(f"{type(base).__name__} does not offer the true states of its rows")
+    return np.asarray(base.true_state)
+
+
 def _contiguous(fast: Any, rows: Any, packets: Any, counts: Any) -> Records:
     """Arrays as compiled code takes them, copied only where they are not."""
     return Records(

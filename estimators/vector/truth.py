@@ -11,9 +11,9 @@ from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
-from ..wrappers.truth import STIFFNESSES, parameters_of, truth_entries
+from ..wrappers.truth import STIFFNESSES, parameters_of, states_of, truth_entries
 from ..wrappers.truth import TruthObservation as Single
-from .records import state_of, true_vehicles
+from .records import state_of, true_states, true_vehicles
 from .spec import vector_spec
 
 Observations = npt.NDArray[np.float32]
@@ -30,25 +30,31 @@ class TruthObservation(
     by one.
 
     Raises TypeError where the env has no layout or no vehicles, ValueError for an unknown name or
-    one that stands twice.
+    one that stands twice, and for states of rows that are reset within the step that ends their
+    episode, whose last ones are gone then.
     """
 
     def __init__(
-        self, env: VectorEnv[Any, Any, Any], parameters: Sequence[str] = STIFFNESSES
+        self,
+        env: VectorEnv[Any, Any, Any],
+        parameters: Sequence[str] = STIFFNESSES,
+        states: Sequence[str] = (),
     ) -> None:
-        RecordConstructorArgs.__init__(self, parameters=list(parameters))
+        RecordConstructorArgs.__init__(self, parameters=list(parameters), states=list(states))
         VectorWrapper.__init__(self, env)
         if not hasattr(env, "layout"):
             raise TypeError(
                 f"{type(env).__name__} has no layout; wrap it in "
                 "sideslip.estimators.vector.EstimateObservation first"
             )
-        self._parameters = tuple(parameters)
-        self.layout = truth_entries(self._parameters, env.layout)
+        self._parameters, self._states = tuple(parameters), tuple(states)
+        self.layout = truth_entries(self._parameters, self._states, env.layout)
         low, high = np.array([entry[2:] for entry in self.layout]).T.astype(np.float32)
         self.single_observation_space = gym.spaces.Box(low, high, dtype=np.float32)
         self.observation_space = batch_space(self.single_observation_space, env.num_envs)
         self._same_step = env.metadata.get("autoreset_mode") == AutoresetMode.SAME_STEP
+        if self._same_step and states:
+            raise ValueError("true states need autoreset_mode 'NextStep' or 'Disabled'")
         self._values = np.zeros((env.num_envs, len(self._parameters)), np.float32)
         self._ended = np.ones(env.num_envs, np.bool_)
 
@@ -66,7 +72,13 @@ class TruthObservation(
         obs, infos = self.env.reset(seed=seed, options=options)
         self._read(rows)
         self._ended &= ~rows
-        return np.hstack([obs, self._values]), infos
+        return self._observed(obs), infos
+
+    def _observed(self, obs: Observations) -> Observations:
+        if not self._states:
+            return np.hstack([obs, self._values])
+        true = true_states(self.unwrapped)
+        return np.hstack([obs, self._values, states_of(true, self._states)])
 
     def step(self, actions: Any) -> tuple[Observations, Any, Any, Any, dict[str, Any]]:
         """One step of all rows."""
@@ -79,7 +91,7 @@ class TruthObservation(
         else:
             self._read(self._ended)
         self._ended = ended
-        return np.hstack([obs, self._values]), rewards, terminated, truncated, infos
+        return self._observed(obs), rewards, terminated, truncated, infos
 
     def get_state(self) -> dict[str, Any]:
         """A snapshot that `set_state` continues from; TypeError where the env makes none."""

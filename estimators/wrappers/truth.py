@@ -1,6 +1,7 @@
-"""TruthObservation: parameters of the true car beside the observation."""
+"""TruthObservation: parameters and states of the true car beside the observation."""
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -9,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.utils import RecordConstructorArgs
 
+from ...envs.engine.views import TRUE_STATE
 from ...envs.task.observation import Entry
 from ...envs.vehicle.vehicle import Vehicle
 from ..estimator import Estimator
@@ -17,12 +19,23 @@ from ..protocol import ForeignEstimator
 TRUTH = "truth"  # in place of a vehicle: the one that is driven
 STIFFNESSES = ("front_stiffness", "rear_stiffness")
 LARGEST = 1e7  # of any parameter of a vehicle, SI
+_STATES = {
+    "beta": ("rad", math.pi),
+    "gamma": ("rad/s", 20.0),
+    "F_d": ("N", LARGEST),
+    "N_d": ("N m", LARGEST),
+    "phi": ("rad", math.pi),
+    "phi_dot": ("rad/s", 100.0),
+}
 
 
-def truth_entries(parameters: Sequence[str], inner: Sequence[Entry]) -> tuple[Entry, ...]:
-    """`true_<parameter>` of each parameter of a `Vehicle`, after the entries of an observation.
+def truth_entries(
+    parameters: Sequence[str], states: Sequence[str], inner: Sequence[Entry]
+) -> tuple[Entry, ...]:
+    """`true_<parameter>` of each parameter of a `Vehicle` and `<state>_hat` of each state of a
+    `TrueState`, after the entries of an observation.
 
-    Raises ValueError for an unknown parameter, or where a name would stand twice.
+    Raises ValueError for an unknown parameter or state, or where a name would stand twice.
     """
     fields = {each.name: each.metadata.get("unit") for each in dataclasses.fields(Vehicle)}
     entries = []
@@ -32,6 +45,11 @@ def truth_entries(parameters: Sequence[str], inner: Sequence[Entry]) -> tuple[En
             known = ", ".join(key for key, value in fields.items() if value is not None)
             raise ValueError(f"a vehicle has no parameter {name!r}; it has: {known}")
         entries.append(Entry(f"true_{name}", unit, -LARGEST, LARGEST))
+    for name in states:
+        if name not in _STATES:
+            raise ValueError(f"there is no true state {name!r}; there is: {', '.join(_STATES)}")
+        unit, most = _STATES[name]
+        entries.append(Entry(f"{name}_hat", unit, -most, most))
     names = [entry.name for entry in (*inner, *entries)]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
@@ -42,6 +60,14 @@ def truth_entries(parameters: Sequence[str], inner: Sequence[Entry]) -> tuple[En
 def parameters_of(vehicle: Vehicle, parameters: Sequence[str]) -> npt.NDArray[np.float32]:
     """The values of some parameters, (len(parameters),)."""
     return np.array([getattr(vehicle, name) for name in parameters], np.float32)
+
+
+def states_of(true_state: Any, states: Sequence[str]) -> npt.NDArray[np.float32]:
+    """Some states of an array (..., len(TrueState)), within their bounds, (..., len(states))."""
+    most = np.array([_STATES[name][1] for name in states])
+    columns = [getattr(TRUE_STATE, name) for name in states]
+    chosen: npt.NDArray[np.float32] = true_state[..., columns].clip(-most, most).astype(np.float32)
+    return chosen
 
 
 def as_built(estimator: Estimator | ForeignEstimator, built: Vehicle, vehicle: Vehicle) -> Vehicle:
@@ -69,20 +95,27 @@ def set_stiffness(estimator: Estimator | ForeignEstimator, vehicle: Vehicle) -> 
 class TruthObservation(
     gym.Wrapper[npt.NDArray[np.float32], Any, npt.NDArray[np.float32], Any], RecordConstructorArgs
 ):
-    """Appends parameters of the car that is driven, as they are at the reset.
+    """Appends parameters of the car that is driven, as they are at the reset, and true states.
 
-    No sensor measures these: it makes the informed controller, with which others are compared, and
-    stands outside of any `EstimateObservation`.
+    No sensor measures these: it makes the rungs with which others are compared (`agents.rungs`),
+    and stands outside of any `EstimateObservation`.
 
-    parameters: names of `Vehicle`'s, appended as `true_<name>` in their units. `layout` describes
+    parameters: names of `Vehicle`'s, appended as `true_<name>` in their units. states: names of
+    `TrueState`'s, appended as `<name>_hat` as if by an estimator without error. `layout` describes
     the whole observation. Raises ValueError for an unknown name or one that stands twice.
     """
 
-    def __init__(self, env: gym.Env[Any, Any], parameters: Sequence[str] = STIFFNESSES) -> None:
-        RecordConstructorArgs.__init__(self, parameters=list(parameters))
+    def __init__(
+        self,
+        env: gym.Env[Any, Any],
+        parameters: Sequence[str] = STIFFNESSES,
+        states: Sequence[str] = (),
+    ) -> None:
+        RecordConstructorArgs.__init__(self, parameters=list(parameters), states=list(states))
         gym.Wrapper.__init__(self, env)
-        self._parameters = tuple(parameters)
-        self.layout = truth_entries(self._parameters, env.get_wrapper_attr("layout"))
+        self._parameters, self._states = tuple(parameters), tuple(states)
+        inner = env.get_wrapper_attr("layout")
+        self.layout = truth_entries(self._parameters, self._states, inner)
         low, high = np.array([entry[2:] for entry in self.layout]).T.astype(np.float32)
         self.observation_space = gym.spaces.Box(low, high, dtype=np.float32)
         self._values = np.zeros(len(self._parameters), np.float32)
@@ -94,12 +127,18 @@ class TruthObservation(
         obs, info = self.env.reset(seed=seed, options=options)
         base: Any = self.unwrapped
         self._values = parameters_of(base.vehicle, self._parameters)
-        return np.concatenate([obs, self._values]), info
+        return self._observed(obs), info
+
+    def _observed(self, obs: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+        if not self._states:
+            return np.concatenate([obs, self._values])
+        base: Any = self.unwrapped
+        return np.concatenate([obs, self._values, states_of(base.true_state, self._states)])
 
     def step(self, action: Any) -> tuple[npt.NDArray[np.float32], Any, bool, bool, dict[str, Any]]:
         """One env-step."""
         obs, reward, terminated, truncated, info = self.env.step(action)
-        return np.concatenate([obs, self._values]), reward, terminated, truncated, info
+        return self._observed(obs), reward, terminated, truncated, info
 
     def get_state(self) -> dict[str, Any]:
         """A snapshot of the env and the parameters that `set_state` continues from."""

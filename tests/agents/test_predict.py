@@ -10,11 +10,11 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 import sideslip
 from sideslip.agents import AGENTS, make_agent
-from sideslip.agents.controllers.informed import PARAMETERS
 from sideslip.estimators import EstimateObservation
 from sideslip.estimators.wrappers.truth import TruthObservation
 from tests.envs.helpers import bits
 
+PARAMETERS = ["front_stiffness", "rear_stiffness", "friction"]
 STATES = ["beta", "gamma", "d1", "d2"]
 
 

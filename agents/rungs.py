@@ -1,0 +1,119 @@
+"""The rungs of the ladder: reference controllers that are given more and more of the truth.
+
+Every contestant is scored between `nominal`, a well-designed LQG that knows the nominal car alone,
+and the better of the two that know state, disturbances and car: "Cost and score" of
+docs/ARCHITECTURE.md.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium as gym
+
+from ..envs.arguments import check_choice
+from ..envs.scenarios.scenario import Scenario
+from ..envs.sensors.gps import HDOP_LAWS
+from ..estimators.vector import estimate as vector
+from ..estimators.vector.truth import TruthObservation as VectorTruthObservation
+from ..estimators.wrappers.estimate import EstimateObservation
+from ..estimators.wrappers.truth import STIFFNESSES, TRUTH, TruthObservation
+from .controllers.base import FRICTION, Controller
+from .controllers.lqr import Lqr
+
+NOMINAL, PARAMETERS, STATE_LQR = "nominal", "oracle-parameters", "oracle-state-lqr"
+RUNGS = (NOMINAL, PARAMETERS, STATE_LQR)
+"""From the bottom up; `oracle-parameters` knows car, friction, noise and biases."""
+
+FILTER = "exact-kf"
+OUTPUTS = ("beta", "gamma", "F_d", "N_d")
+GRIP = 0.7  # share of the rear tyres' grip for the yaw moment; 0.71 of it is left across
+STEER_WEIGHT = 100.0  # of added steering, which `lqr`'s design does not know the rate limit of
+_NOISE = {
+    "gyro": "gyro_noise",
+    "accel": "accel_y_noise",
+    "camera_psi": "psi_noise",
+    "camera_y": "y_l_noise",
+}
+
+
+def levels_of(scenario: Scenario) -> dict[str, Any]:
+    """Options of `exact-kf`: the noise and the disturbances of a scenario.
+
+    The course's noise follows the HDOP that comes with each packet, as far as the scenario's does.
+    The accelerometer is read where the body rolls, as the filter then believes.
+    """
+    noise = dict(scenario.noise)
+    share = HDOP_LAWS[scenario.hdop_law]
+    options = {
+        "force_sd": scenario.disturbance_force,
+        "moment_sd": scenario.disturbance_moment,
+        "disturbance_time": scenario.disturbance_time,
+        "hdop_table": [(1.0, 1.0), (101.0, 1.0 + 100.0 * share)],
+    }
+    if scenario.roll:
+        options["fast"] = ["gyro", "accel_y"]
+    return options | {option: noise[key] for key, option in _NOISE.items() if key in noise}
+
+
+def without_biases(scenario: Scenario) -> Scenario:
+    """The scenario as a filter meets it that knows the sensors' biases and takes them away."""
+    noise = {key: value for key, value in scenario.noise.items() if not key.endswith("_bias")}
+    return scenario.replace(noise=noise)
+
+
+def make_rung(
+    name: str,
+    env_id: str,
+    num_envs: int | None = None,
+    vector_kwargs: Mapping[str, Any] | None = None,
+    options: Mapping[str, Mapping[str, Any]] | None = None,
+    **env_kwargs: Any,
+) -> tuple[Any, Controller]:
+    """(env, agent): a rung of `RUNGS` and the env whose observation it needs.
+
+    num_envs: a vector env of so many rows, whose own arguments are vector_kwargs; None: a single
+    one. options: {"filter": of `exact-kf`, "controller": of the agent}, over the defaults: all of
+    the id's slow sensors, `levels_of` the scenario, a grip limit. env_kwargs:
+    of the env (scenario, vehicle, ...). Of the true car, stiffness and friction may differ between
+    episodes; the rest is the env's.
+
+    Raises ValueError for another name, TypeError for other options, and what `gym.make`, the filter
+    and the agent raise.
+    """
+    check_choice("rung", name, RUNGS)
+    chosen: dict[str, Mapping[str, Any]] = {"filter": {}, "controller": {}} | dict(options or {})
+    if len(chosen) != 2:
+        raise TypeError(f"options of a rung are 'filter' and 'controller', got {sorted(chosen)}")
+    alone: Any = gym.make(env_id, **env_kwargs)
+    if name == PARAMETERS:
+        unbiased = without_biases(alone.unwrapped.scenario)
+        env_kwargs |= {"scenario": unbiased.to_dict()}
+        alone = gym.make(env_id, **env_kwargs)
+    base: Any = alone.unwrapped
+    env = alone
+    if num_envs is not None:
+        env = gym.make_vec(env_id, num_envs=num_envs, **dict(vector_kwargs or {}), **env_kwargs)
+    if name in (NOMINAL, PARAMETERS):
+        vehicle = TRUTH if name == PARAMETERS else None
+        env = _filtered(env, base, vehicle, chosen["filter"])
+    if name != NOMINAL:
+        told = VectorTruthObservation if num_envs is not None else TruthObservation
+        states = () if name == PARAMETERS else OUTPUTS
+        parameters = (*STIFFNESSES, FRICTION.removeprefix("true_"))
+        env = told(env, parameters, states)
+    settings: dict[str, Any] = {"disturbance_time": base.scenario.disturbance_time, "grip": GRIP}
+    if base.action_space.shape == (2,):
+        settings["steer_weight"] = STEER_WEIGHT
+    if name != NOMINAL:
+        settings |= {"vehicle": base.vehicle, "stiffness": [f"true_{each}" for each in STIFFNESSES]}
+    return env, Lqr(env, **settings | dict(chosen["controller"]))
+
+
+def _filtered(env: Any, base: Any, vehicle: str | None, options: Mapping[str, Any]) -> Any:
+    """The env with `exact-kf` on all of its slow sensors."""
+    levels = levels_of(base.scenario) | {"slow": list(base.slow_sensors)}
+    if "gps" not in base.slow_sensors:
+        del levels["hdop_table"]
+    wrapper = EstimateObservation if isinstance(env, gym.Env) else vector.EstimateObservation
+    settings = levels | dict(options)
+    return wrapper(env, FILTER, outputs=OUTPUTS, std=False, vehicle=vehicle, options=settings)
