@@ -82,8 +82,9 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
     All JSON-able. sensors: "vision", "vision-uneven", "gps" or "fusion" (camera and GPS). scenario:
     a name or a mapping. vehicle: the true one; nominal: that of estimators and controllers
     (default: vehicle). control_period: ticks of 1 ms. reference: "zero-slip", "model" (its steady
-    state) or "limited" (by friction). fast: "summary" or "all". slow, by name ("camera", "gps"):
-    fields of `SlowSensor` that replace the id's. yaw_first: yaw moment before acceleration where
+    state), "limited" (by friction) or "lagged" (so limited, understeering, through a lag of 0.1 s).
+    fast: "summary" or "all". slow, by name ("camera", "gps"): fields of `SlowSensor` that replace
+    the id's. yaw_first: yaw moment before acceleration where
     both pass the motors' limit. steering: the action may steer too.
     """
 

@@ -26,8 +26,8 @@ Array = npt.NDArray[np.float64]
 
 
 class Known(NamedTuple):
-    """Inputs and parameters of one step of the plan that no action changes; `command` and `weight`
-    are of the step's start."""
+    """Inputs and parameters of one step of the plan that no action changes, or hardly
+    (`beta_ref`, `gamma_ref`); `command` and `weight` are of the step's start."""
 
     steer_start: Any  # rad, front steering angle without the added one
     steer_middle: Any
@@ -43,6 +43,8 @@ class Known(NamedTuple):
     speed: Any  # m/s, the driver's set point
     ahead: Any  # m/s2, the driver's acceleration, fed forward
     weight: Any  # s for which the cost rate at the start counts
+    beta_ref: Any  # rad, of a reference with a memory; of the step's start
+    gamma_ref: Any  # rad/s
 
 
 class State(NamedTuple):
@@ -124,14 +126,14 @@ def forecast_of(base: Any, steps: int = 1, actions: Array | None = None) -> Fore
     ticks = fixed.periods * n
     if actions is None:
         actions = np.zeros((fixed.periods, fixed.width))
-    drive, driver = _driven(base, snapshot, actions, n)
+    drive, driver, refs = _driven(base, snapshot, actions, n)
     programme = read(p, P.programme)
     every = range(ticks + 1)
     if fixed.kind.follows:
         command = driver
     else:
         command = np.array([steering_at(float(k), programme) for k in every])
-    known = _known(p, fixed, drive, command)
+    known = _known(p, fixed, drive, command, refs)
     return Forecast(fixed, known, start, command[:-1].reshape(-1, n))
 
 
@@ -163,8 +165,9 @@ def _fixed(base: Any, p: Array, switches: Any, ticks: int, steps: int) -> Fixed:
     )
 
 
-def _driven(base: Any, snapshot: Any, actions: Array, n: int) -> tuple[Array, Array]:
-    """(K n + 1, len(Drive)) and the driver's angle (K n + 1,): the env's own ticks under actions.
+def _driven(base: Any, snapshot: Any, actions: Array, n: int) -> tuple[Array, Array, Array]:
+    """(K n + 1, len(Drive)), the driver's angle (K n + 1,) and the references (K n + 1, 2): the
+    env's own ticks under actions.
 
     Disturbances, and a programme's front wheels without the added angle, do not depend on them.
     """
@@ -182,14 +185,16 @@ def _driven(base: Any, snapshot: Any, actions: Array, n: int) -> tuple[Array, Ar
     taken = np.repeat(np.vstack([actions, actions[-1:]]).astype(np.float32), n, axis=0)
     ticks = n * len(actions)
     drive, driver = np.empty((ticks + 1, len(Drive._fields))), np.empty(ticks + 1)
+    refs = np.empty((ticks + 1, 2))
     for tick in range(ticks + 1):
         drive[tick] = read(z, Z.drive)
-        driver[tick] = z[Z.driver]
+        driver[tick], refs[tick] = z[Z.driver], read(z, Z.refs)
         step_vehicle(*row, taken[tick], 1, bounds, window)
-    return np.nan_to_num(drive), np.nan_to_num(driver)  # a car thrown about may leave the numbers
+    # a car thrown about may leave the numbers
+    return np.nan_to_num(drive), np.nan_to_num(driver), np.nan_to_num(refs)
 
 
-def _known(p: Array, fixed: Fixed, drive: Array, command: Array) -> Array:
+def _known(p: Array, fixed: Fixed, drive: Array, command: Array, refs: Array) -> Array:
     """(len(Known), steps of the plan + 1)."""
     q, last = fixed.ticks, len(command) - 1
     at = np.arange(0, last, q)
@@ -224,10 +229,12 @@ def _known(p: Array, fixed: Fixed, drive: Array, command: Array) -> Array:
         *(np.full(len(at), value) for value in (car.mu, car.mu_r)),
         *pace.T,
         _weights(at, fixed),
+        *refs[at].T,
     )
     known = np.array(Known._make(table))
-    end = known[:, -1:].copy()  # of the episode's end only command and weight count
+    end = known[:, -1:].copy()  # of the episode's end only command, references and weight count
     end[Known._fields.index("command")] = command[last]
+    end[Known._fields.index("beta_ref") :, 0] = refs[last]
     end[Known._fields.index("weight")] = (
         0.5 * (q + 1) * TICK if last == fixed.task.duration else 0.0
     )

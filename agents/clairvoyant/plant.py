@@ -8,7 +8,7 @@ from ...envs.backend.on_casadi import SYMBOLS, symbolic
 from ...envs.backend.rebuild import plain
 from ...envs.engine.tick import load_at, torques
 from ...envs.task.cost import cost_rate
-from ...envs.task.reference import reference
+from ...envs.task.reference import LAGGED, reference
 from ...envs.ticks import TICK
 from ...envs.vehicle.actuators import lagged, yaw_moment
 from ...envs.vehicle.dynamics import Motion, Push, rk4, sideslip_angle
@@ -52,7 +52,9 @@ def node_cost(fixed: Fixed, x: State, known: Known) -> Any:
     """Cost of the motion at a step's start, without the cap, for the seconds it stands for."""
     kind = fixed.kind
     beta = _slip(x.v_x, x.v_y, kind.small_angle)
-    beta_ref, gamma_ref = _reference(known.command, x.v_x, fixed.target, kind.reference)
+    beta_ref, gamma_ref = known.beta_ref, known.gamma_ref
+    if kind.reference != LAGGED:
+        beta_ref, gamma_ref = _reference(known.command, x.v_x, fixed.target, kind.reference)
     e_beta, e_gamma = beta - beta_ref, x.gamma - gamma_ref
     return known.weight * _uncapped(e_beta, e_gamma, 0.0, 0.0, kind.reference)
 

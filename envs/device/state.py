@@ -17,7 +17,7 @@ from .packets import read_packed, write_packed
 from .step import State
 
 Tensor = torch.Tensor
-_MOTION, _DRIVE = (slice(part[0], part[-1] + 1) for part in (Z.motion, Z.drive))
+_MOTION, _DRIVE, _REFS = (slice(part[0], part[-1] + 1) for part in (Z.motion, Z.drive, Z.refs))
 
 
 def device_of(device: Any) -> torch.device:
@@ -101,6 +101,7 @@ def state_of(
         whole[_MOTION],
         whole[_DRIVE],
         whole[Z.driver],
+        whole[_REFS],
         whole[Z.clock.tick],
         whole[Z.clock.failure],
         *slow_state,
@@ -119,6 +120,7 @@ def write_states(state: State, states: Array) -> None:
     whole[_MOTION] = here.motion
     whole[_DRIVE] = here.drive
     whole[Z.driver] = here.driver
+    whole[_REFS] = here.refs
     whole[Z.clock.tick] = here.tick
     whole[Z.clock.failure] = here.failure
     write_packed(here.slow_state, whole)

@@ -24,6 +24,7 @@ class State(NamedTuple):
     motion: Tensor  # (len(Motion), N)
     drive: Tensor  # (len(Drive), N)
     driver: Tensor  # (N,)
+    refs: Tensor  # (2, N)
     tick: Tensor
     failure: Tensor
     slow: Tensor  # the fields of `SlowState`
@@ -89,7 +90,7 @@ class Step:
         shares = self._clip(torch.where(finite[:, None], actions, 0.0), -1.0, 1.0)
         turn = shares[:, 1] if actions.shape[1] > 1 else torch.zeros_like(state.tick)
         running = finite & ~state.over
-        start = start_of(state.motion, state.drive, state.driver, state.tick, running)
+        start = start_of(state.motion, state.drive, state.driver, state.refs, state.tick, running)
         now, rows, track = self._ticks.drive_on(p, keys, start, shares[:, 0], turn, self._n)
         refused = ~finite & ~state.over
         after: State
@@ -125,6 +126,7 @@ class Step:
             torch.stack(now.motion),
             torch.stack(now.drive),
             now.driver,
+            torch.stack(now.refs),
             now.tick,
             failure,
             *slow_state,

@@ -42,6 +42,7 @@ class Now(NamedTuple):
     motion: Numbers
     drive: Numbers
     driver: Tensor
+    refs: Numbers
     tick: Tensor
     failure: Tensor  # codes as floats
     cost: Tensor
@@ -86,7 +87,8 @@ class Ticks:
         task = fixed.task
         car = self._changed(fixed.car, fixed.change, now.tick > fixed.change.tick)
         # the load at the tick's start is computed anew where `anywhere` holds, and here it does
-        before = Moving(Motion(*now.motion), Drive(*now.drive), None, now.driver, car)
+        motion, drive = Motion(*now.motion), Drive(*now.drive)
+        before = Moving(motion, drive, None, now.driver, car, now.refs)
         after, seen = self._advance(
             fixed,
             share * task.yaw_scale,
@@ -111,6 +113,7 @@ class Ticks:
             chosen(fit, after.motion, now.motion),
             chosen(alive, after.drive, now.drive),
             pick(alive, after.driver, now.driver),
+            chosen(alive, refs, now.refs),
             tick,
             pick(alive, failure, now.failure),
             now.cost + pick(alive, seen.cost * TICK, 0.0),
@@ -135,7 +138,9 @@ class Ticks:
         return now, torch.stack(rows), torch.stack(track)
 
 
-def start_of(motion: Tensor, drive: Tensor, driver: Tensor, tick: Tensor, alive: Tensor) -> Now:
+def start_of(
+    motion: Tensor, drive: Tensor, driver: Tensor, refs: Tensor, tick: Tensor, alive: Tensor
+) -> Now:
     """Where rows are at the start of an env-step."""
     zeros = tick.new_zeros((2 + len(Shown._fields) + FAST_WIDTH, len(tick)))
     failure, cost, *others = zeros.unbind(0)
@@ -146,6 +151,7 @@ def start_of(motion: Tensor, drive: Tensor, driver: Tensor, tick: Tensor, alive:
         motion.unbind(0),
         drive.unbind(0),
         driver,
+        refs.unbind(0),
         tick,
         failure,
         cost,

@@ -11,12 +11,13 @@ import numpy as np
 from ..arguments import brief, check_choice, is_finite, listed, mapping_of, number_of
 from ..record import Array
 from ..scenarios.checks import SHORTEST_GPS_PERIOD
+from ..scenarios.draws import range_of
 from ..scenarios.manoeuvres import scenario_from
 from ..scenarios.scenario import Scenario
 from ..sensors.link import IN_FLIGHT, SlowSensor
 from ..sensors.slow import SENSOR_SETS, with_changes
 from ..task.observation import Entry, observation_layout
-from ..ticks import ticks
+from ..ticks import TICK, ticks
 from ..vehicle.dynamics import Motion
 from ..vehicle.vehicle import Vehicle, vehicle_from
 from .packing import EpisodeConfig, episode_config
@@ -24,7 +25,9 @@ from .packing import EpisodeConfig, episode_config
 
 def in_scenario(sensors: dict[str, SlowSensor], scenario: Scenario) -> dict[str, SlowSensor]:
     """The sensors with the clocks and delays of a scenario: its fields `<sensor>_period`,
-    `<sensor>_delays` and, with these, `<sensor>_jitter`, and `<sensor>_loss`, where it has them."""
+    `<sensor>_delays` and, with these, `<sensor>_jitter`, and `<sensor>_loss`, where it has them. A
+    drawn `<sensor>_latency` is described by the worst case: the least of it as a delay, the rest
+    as jitter."""
     changed = {}
     for name, sensor in sensors.items():
         period, delays = (getattr(scenario, f"{name}_{key}", None) for key in ("period", "delays"))
@@ -35,6 +38,13 @@ def in_scenario(sensors: dict[str, SlowSensor], scenario: Scenario) -> dict[str,
             sensor = dataclasses.replace(sensor, delays=delays, jitter=jitter)
         if loss := getattr(scenario, f"{name}_loss", 0.0):
             sensor = dataclasses.replace(sensor, loss=loss)
+        low, high = (ticks(end) for end in range_of(getattr(scenario, f"{name}_latency", 0.0)))
+        if high > 0.0:
+            sensor = dataclasses.replace(
+                sensor,
+                delays=tuple(delay + low * TICK for delay in sensor.delays),
+                jitter=sensor.jitter + (high - low) * TICK,
+            )
         changed[name] = sensor
     return changed
 

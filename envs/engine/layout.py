@@ -121,6 +121,7 @@ class State(NamedTuple):
     motion: Motion
     drive: Drive
     clock: Clock
+    refs: Annotated[tuple[Any, ...], 2]  # rad, rad/s, the references of beta and gamma
     slow: Annotated[tuple[Slow, ...], len(SLOW)]
     queue: Annotated[Any, len(SLOW) * IN_FLIGHT * PACKET_WIDTH]  # packets, columns as in `Packet`
     driver: Any  # rad, the driver's steering command

@@ -70,6 +70,8 @@ def car_of(vehicle: Vehicle) -> Car:
         ahead=vehicle.antenna_ahead,
         left=vehicle.antenna_left,
         mu_r=vehicle.friction,
+        P=vehicle.motor_power,
+        h_x=vehicle.transfer_height,
     )
 
 
@@ -96,12 +98,12 @@ def _link_in(scenario: Scenario, name: str, sensor: SlowSensor | None) -> Link:
 
 
 def _road_of(scenario: Scenario) -> Road:
-    """Curvature, bank and grade of the road."""
+    """The road but for its curvature and bank, which are drawn."""
     return Road(
-        curvature=0.0,  # drawn
+        curvature=0.0,
         start=scenario.curve_start,
         ramp=scenario.curve_ramp,
-        across=GRAVITY * math.sin(scenario.bank),
+        across=0.0,
         along=GRAVITY * math.sin(scenario.grade),
     )
 

@@ -4,16 +4,17 @@ from typing import Any
 
 from ..backend.arrays import read, write
 from ..backend.decorators import apart, copied, jit
+from ..backend.elementary import sincos
 from ..backend.primitives import select
 from ..backend.random import CHANNELS, normals
 from ..record import FAST
-from ..scenarios.draws import DRAWS_WIDTH, realise
+from ..scenarios.draws import DRAWS, DRAWS_WIDTH, realise
 from ..scenarios.driver import wanted_angle
 from ..scenarios.steering import DRIVER, steering_at, write_steering
 from ..scenarios.tracks import laid
 from ..sensors.inertial import Chance, fast_row
 from ..sensors.link import clock_phase
-from ..sensors.slow import first_drift
+from ..sensors.slow import GPS, first_drift
 from ..task.info import REPORT
 from ..task.reference import reference
 from ..ticks import FOREVER, NEVER, whole_ticks
@@ -40,11 +41,38 @@ def _write_surroundings(p: Any, d: Any, s: Any, v_x: Any) -> None:
     p[P.wind.start] = whole_ticks(d.wind_start)
     p[P.wind.end] = p[P.wind.start] + whole_ticks(d.wind_length)
     p[P.road.curvature] = select(mirrored, 0.0 - d.curvature, d.curvature)
-    p[P.road.across] = select(mirrored, 0.0 - p[P.road.across], p[P.road.across])
+    across = GRAVITY * sincos(d.bank)[0]
+    p[P.road.across] = select(mirrored, 0.0 - across, across)
     scaled = d.path_speed > 0.0
     scale = select(scaled, d.speed, 1.0) / select(scaled, d.path_speed, 1.0)
     path = laid(read(p, P.path), s + d.onset * v_x, scale, select(mirrored, -1.0, 1.0))
     write(p, path, P.path)
+
+
+@jit
+def _write_sensors(p: Any, d: Any, low: Any, high: Any) -> None:
+    """Biases, and the GPS's latency, which was packed as the worst case of low and high."""
+    p[P.noise.gyro_bias] = p[P.noise.gyro_bias] + d.gyro_bias
+    p[P.noise.accel_y_bias] = p[P.noise.accel_y_bias] + d.accel_y_bias
+    link, least = P.slow[GPS], whole_ticks(low[DRAWS.gps_latency])
+    late = whole_ticks(d.gps_latency) - least
+    for i in (link.delay_0, link.delay_1, link.delay_2, link.delay_3):
+        p[i] = p[i] + late
+    p[link.jitter] = p[link.jitter] - (whole_ticks(high[DRAWS.gps_latency]) - least)
+
+
+@jit
+def _write_motion(z: Any, d: Any, start: Any, small_angle: int) -> None:
+    """The motion at the start: as drawn, but for the numbers that are there in `start`."""
+    mirrored = d.side < 0.5
+    beta = select(mirrored, 0.0 - d.initial_beta, d.initial_beta)
+    sine, cosine = sincos(beta)
+    slope = beta if small_angle else sine / cosine
+    z[Z.motion.v_x], z[Z.motion.v_y] = d.speed, d.speed * slope
+    z[Z.motion.gamma] = select(mirrored, 0.0 - d.initial_gamma, d.initial_gamma)
+    for i in range(len(Z.motion)):
+        if start[i] == start[i]:
+            z[Z.motion[i]] = start[i]
 
 
 @apart
@@ -64,10 +92,9 @@ def reset_vehicle(start: Start, key_low: int, key_high: int, bounds: Any, row: R
     p[P.pace.speed] = d.speed
     for i in range(STATE_WIDTH):
         z[i] = 0.0
-    z[Z.motion.v_x] = d.speed
-    for i in range(len(Z.motion)):
-        if start.motion[i] == start.motion[i]:
-            z[Z.motion[i]] = start.motion[i]
+    small_angle = switches[FLAGS.small_angle]
+    _write_motion(z, d, start.motion, small_angle)
+    _write_sensors(p, d, start.low, start.high)
     motion = read(z, Z.motion)
     _write_surroundings(p, d, motion.s, motion.v_x)
     n = normals(key_low, key_high, 0, CHANNELS.initial)
@@ -88,7 +115,6 @@ def reset_vehicle(start: Start, key_low: int, key_high: int, bounds: Any, row: R
         z[at.next_capture] = select(link.period > 0.0, phase, NEVER)
         z[at.captured] = NEVER
         z[at.drift] = first_drift(sensor, read(p, P.sky), key_low, key_high)
-    small_angle = switches[FLAGS.small_angle]
     beta = sideslip_angle(motion.v_x, motion.v_y, small_angle)
     fast = normals(key_low, key_high, 0, CHANNELS.inertial)
     wheels = normals(key_low, key_high, 0, CHANNELS.wheels)
@@ -100,6 +126,7 @@ def reset_vehicle(start: Start, key_low: int, key_high: int, bounds: Any, row: R
     count = sense_slow(row, motion, 0.0, 0)
     v = 0.5 * (rows[0, FAST.wheel_left] + rows[0, FAST.wheel_right])
     refs = reference(steer, v, target, switches[FLAGS.reference])
+    write(z, refs, Z.refs)
     shown = 1
     if switches[FLAGS.all_samples]:  # tick 0 stands for all samples of a step
         for j in range(1, len(rows)):

@@ -83,7 +83,8 @@ def drive_on(
     fixed = fixed_of(p)
     motion, drive, tick = read(z, Z.motion), read(z, Z.drive), at(z, Z.clock.tick)
     car = changed(fixed.car, fixed.change, tick > fixed.change.tick)
-    now = Moving(motion, drive, standing_load(drive, car, kind), at(z, Z.driver), car)
+    load, refs = standing_load(drive, car, kind), read(z, Z.refs)
+    now = Moving(motion, drive, load, at(z, Z.driver), car, refs)
     task = fixed.task
     N_z, added = share * task.yaw_scale, turn * task.authority
     cost = 0.0 * N_z
@@ -124,6 +125,7 @@ def write_end(
     """Write the end of an env-step into z, but for the motion, and into its report."""
     write(z, now.drive, Z.drive)
     put(z, now.driver, Z.driver)
+    write(z, refs, Z.refs)
     put(z, tick, Z.clock.tick)
     failure = failure_of(seen)
     put(z, failure, Z.clock.failure)

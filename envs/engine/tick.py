@@ -16,9 +16,16 @@ from ..scenarios.wind import wind_at
 from ..sensors.inertial import Chance, fast_row, specific_force
 from ..task.cost import cost_rate
 from ..task.failures import NOT_FINITE, OFF_ROAD, RUNNING, SPIN
-from ..task.reference import reference
+from ..task.reference import followed, reference
 from ..ticks import TICK
-from ..vehicle.actuators import distribute, lagged, slewed, within_stop, yaw_moment
+from ..vehicle.actuators import (
+    distribute,
+    lagged,
+    slewed,
+    torque_limit,
+    within_stop,
+    yaw_moment,
+)
 from ..vehicle.dynamics import Car, Push, rk4, sideslip_angle
 from ..vehicle.tyres import Inputs, load_of
 from .layout import Drive
@@ -64,6 +71,7 @@ class Moving(NamedTuple):
     start: Any  # the Load at the tick's start
     driver: Any  # rad, the driver's steering command
     car: Any  # with its tyres as they are now
+    refs: Any  # rad, rad/s, the references of beta and gamma
 
 
 class Acted(NamedTuple):
@@ -132,9 +140,10 @@ def torques(
     N_z: Any, tick: Any, v_x: Any, integral: Any, pace: Any, car: Any, yaw_first: Any
 ) -> Any:
     """(T_l, T_r, a_x, integral): torques in N m for a yaw moment and the driver's acceleration."""
-    limit = 2.0 * car.T_max / (car.m * car.r)
+    most = torque_limit(v_x, car)
+    limit = 2.0 * most / (car.m * car.r)
     a_x, integral = acceleration_command(tick, v_x, integral, pace, limit)
-    T_l, T_r = distribute(N_z, a_x, car, yaw_first)
+    T_l, T_r = distribute(N_z, a_x, car, yaw_first, most)
     return T_l, T_r, a_x, integral
 
 
@@ -145,7 +154,7 @@ def _at_change(fixed: Fixed, now: Moving, tick: Any, kind: Kind) -> Moving:
     if anywhere(here):
         car = changed(car, fixed.change, here)
         start = standing_load(now.drive, car, kind)
-    return Moving(now.motion, now.drive, start, now.driver, car)
+    return Moving(now.motion, now.drive, start, now.driver, car, now.refs)
 
 
 @inlined
@@ -206,11 +215,19 @@ def _loads(fixed: Fixed, control: Control, now: Moving, kind: Kind) -> Any:
 
 @inlined
 def sense(
-    fixed: Fixed, motion: Any, accel: Any, acted: Acted, ahead: Any, chance: Chance, kind: Kind
+    fixed: Fixed,
+    motion: Any,
+    accel: Any,
+    acted: Acted,
+    before: Any,
+    ahead: Any,
+    chance: Chance,
+    kind: Kind,
 ) -> tuple[Any, Seen]:
     """(the driver's command, what is Seen) at the end of a tick that led to a motion.
 
-    accel: (a_x, a_y) in m/s2, specific forces. The others are as in `advance`.
+    accel: (a_x, a_y) in m/s2, specific forces. before: the references at the tick's start. The
+    others are as in `advance`.
     """
     task = fixed.task
     row = fast_row(motion, accel, acted, fixed.car.d_f, fixed.noise, chance)
@@ -224,7 +241,8 @@ def sense(
     else:
         driver = ahead
         aside = motion.y - 0.0
-    refs = reference(driver, v, fixed.target, kind.reference)
+    steady = reference(driver, v, fixed.target, kind.reference)
+    refs = followed(before, steady, fixed.target, kind.reference)
     e_beta, e_gamma = beta - refs[0], motion.gamma - refs[1]
     size = motion.v_x * motion.v_x + motion.v_y * motion.v_y + motion.gamma * motion.gamma
     finite = size + motion.psi + motion.Y + motion.phi  # squares: the references take them too
@@ -266,8 +284,8 @@ def advance(
     before, car, road = now.motion, now.car, fixed.road
     motion = rk4(before, loads, control.push, car, road, TICK, small_angle, law, roll)
     accel = specific_force(before, motion, road, small_angle, roll)
-    driver, seen = sense(fixed, motion, accel, control.acted, ahead, chance, kind)
-    return Moving(motion, control.drive, loads[2], driver, car), seen
+    driver, seen = sense(fixed, motion, accel, control.acted, now.refs, ahead, chance, kind)
+    return Moving(motion, control.drive, loads[2], driver, car, seen.refs), seen
 
 
 @jit

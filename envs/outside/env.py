@@ -113,7 +113,8 @@ class OutsideEnv(StabilityEnv):
     def _drive_on(self, fixed: Fixed, kind: Kind, share: float, turn: float) -> int:
         """`step.drive_on` whose motion is the outside plant's; returns the ticks done."""
         z, plant, task = self._state, self.plant, fixed.task
-        now = Moving(read(z, Z.motion), read(z, Z.drive), None, float(z[Z.driver]), fixed.car)
+        motion, drive, refs = read(z, Z.motion), read(z, Z.drive), read(z, Z.refs)
+        now = Moving(motion, drive, None, float(z[Z.driver]), fixed.car, refs)
         tick, cost, done, over = float(z[Z.clock.tick]), 0.0, 0, False
         N_z, added = share * task.yaw_scale, turn * task.authority
         while not over:
@@ -127,9 +128,9 @@ class OutsideEnv(StabilityEnv):
             if plant.finite:
                 motion, force = plant.motion, plant.specific_force
             ahead = at(self._window, WINDOW.ahead, done)
-            driver, seen = _sense(fixed, motion, force, acted, ahead, chance, kind)
+            driver, seen = _sense(fixed, motion, force, acted, now.refs, ahead, chance, kind)
             seen = seen._replace(lost=not plant.finite)
-            now = Moving(motion, control.drive, None, driver, now.car)
+            now = Moving(motion, control.drive, None, driver, now.car, seen.refs)
             write(self.rows[done], seen.row, FAST)
             write(self._window, motion, WINDOW.track, done)
             tick, cost, done = tick + 1.0, cost + seen.cost * TICK, done + 1

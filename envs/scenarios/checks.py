@@ -15,6 +15,7 @@ from .tracks import PATHS
 
 Fields = Mapping[str, Any]
 
+MOST_SLIP = 1.5  # rad: a start beyond it has no speed along the car
 SHORTEST_GPS_PERIOD = 0.05  # s; an env keeps room for its packets
 SIDES = ("side", "wind_side")  # drawn, but no fields
 
@@ -41,7 +42,6 @@ _NUMBERS = (
     "surge",
     "surge_frequency",
     "wind_height",
-    "bank",
     "grade",
     "hdop",
     "hdop_spread",
@@ -185,8 +185,11 @@ def _check_motion(fields: Fields) -> None:
     if fields["path_speed"] is not None and slowest <= 0.0:
         raise ValueError("path_speed needs a speed above zero")
     bank, grade = fields["bank"], fields["grade"]
-    if max(abs(bank), abs(grade)) > 0.5:
+    if max(map(abs, (*range_of(bank), grade))) > 0.5:
         raise ValueError(f"bank and grade are up to 0.5 rad, got {bank!r}, {grade!r}")
+    beta = fields["initial_beta"]
+    if max(map(abs, range_of(beta))) > MOST_SLIP:
+        raise ValueError(f"initial_beta is up to {MOST_SLIP} rad, got {beta!r}")
 
 
 def _check_sensors(fields: Fields) -> None:
@@ -201,6 +204,8 @@ def _check_sensors(fields: Fields) -> None:
     period = fields["gps_period"]
     if period is not None and not period >= SHORTEST_GPS_PERIOD:
         raise ValueError(f"gps_period is {SHORTEST_GPS_PERIOD} s or more, got {period!r}")
+    if range_of(fields["gps_latency"])[0] < 0.0:
+        raise ValueError(f"gps_latency is zero or more, got {fields['gps_latency']!r}")
     if fields["camera_jitter"] < 0.0:
         raise ValueError(f"camera_jitter is zero or more, got {fields['camera_jitter']!r}")
     if not 0.0 <= fields["camera_loss"] < 1.0:

@@ -37,6 +37,12 @@ class Draws(NamedTuple):
     tyre_change_time: Any  # s; 0 never
     front_change: Any  # factors on the stiffness from then on
     rear_change: Any
+    gyro_bias: Any  # rad/s
+    accel_y_bias: Any  # m/s2
+    gps_latency: Any  # s, on top of the GPS's delays
+    bank: Any  # rad
+    initial_beta: Any  # rad, where the episode begins
+    initial_gamma: Any  # rad/s
 
 
 DRAWS, DRAWS_WIDTH = offsets(Draws)

@@ -19,8 +19,9 @@ class Scenario:
 
     Steering is a kind of `STEERING_KINDS`, built from onset, amplitude, frequency (random: two
     pairs of sines; sweep: to frequency_2) and hold (of a step, a dwell, a ramp or a sweep, or from
-    one lane change to the next). mirror: the seed draws the side of steering, track, bend, bank
-    and friction_right, and that of the wind.
+    one lane change to the next). mirror: the seed draws the side of steering, track, bend, bank,
+    friction_right and start, and that of the wind. initial_beta, initial_gamma: sideslip angle in
+    rad and yaw rate in rad/s that the car starts with.
 
     The steering "driver" keeps to a path of `PATHS` (`driver.py`): the road's centre line, or a
     track that begins where the car is at the onset at the speed it starts with, for the vehicle's
@@ -46,12 +47,15 @@ class Scenario:
     wind_*: a side wind, wind_arm ahead of the centre of gravity and wind_height above the roll
     axis. disturbance_*: an Ornstein-Uhlenbeck force and moment.
 
-    Sensors: noise replaces the default. camera_delays: a repeating pattern that replaces the id's,
-    and camera_jitter with it; gps_period and gps_delays likewise. camera_loss: the probability that
-    a frame is lost (0: the id's). camera_heading (rad, against the road) and camera_offset (m, of
-    the car from the lane's centre): beyond either no lane is in view, and a packet's quality is 0.
-    hdop, hdop_spread, hdop_time: median of the GPS's HDOP, standard deviation of its logarithm, and
-    the time in which that forgets. hdop_law of `HDOP_LAWS`: how much of the noise follows HDOP.
+    Sensors: noise replaces the default; gyro_bias (rad/s) and accel_y_bias (m/s2) add to its
+    biases. camera_delays: a repeating pattern that replaces the id's, and camera_jitter with it;
+    gps_period and gps_delays likewise. camera_loss: the probability that a frame is lost (0: the
+    id's). camera_heading (rad, against the road) and camera_offset (m, of the car from the lane's
+    centre): beyond either no lane is in view, and a packet's quality is 0. gps_latency: s by which
+    all GPS packets of the episode arrive later, their stamps being true; `slow_sensors` describes
+    its range as a delay and a jitter. hdop, hdop_spread, hdop_time: median of the GPS's HDOP,
+    standard deviation of its logarithm, and the time in which that forgets. hdop_law of
+    `HDOP_LAWS`: how much of the noise follows HDOP.
 
     tier: of `TIER_NAMES`, the one in whose score the scenario may stand, "" for none.
 
@@ -81,6 +85,8 @@ class Scenario:
     driver_gain: float = 1.0
     driver_lag: float = 0.1
     driver_rate: float = 0.8
+    initial_beta: Range = 0.0
+    initial_gamma: Range = 0.0
     speed: Range = 25.0 * KMH
     acceleration: float | None = None
     speed_change: float = 0.0
@@ -106,7 +112,7 @@ class Scenario:
     curvature: Range = 0.0
     curve_start: float = 20.0
     curve_ramp: float = 20.0
-    bank: float = 0.0
+    bank: Range = 0.0
     grade: float = 0.0
     half_width: float = 50.0
     camera_delays: tuple[float, ...] | None = None
@@ -118,6 +124,9 @@ class Scenario:
     gps_period: float | None = None
     gps_delays: tuple[float, ...] | None = None
     gps_outage: tuple[float, float] | None = None
+    gps_latency: Range = 0.0
+    gyro_bias: Range = 0.0
+    accel_y_bias: Range = 0.0
     hdop: float = 1.4
     hdop_spread: float = 0.5
     hdop_time: float = 20.0

@@ -4,7 +4,8 @@ import math
 from typing import Any, NamedTuple
 
 from ..backend.decorators import jit
-from ..backend.primitives import absolute, maximum, minimum
+from ..backend.primitives import absolute, anywhere, maximum, minimum, select
+from .tyres import SLOW
 
 
 class Lag(NamedTuple):
@@ -31,16 +32,27 @@ def lagged(command: Any, value: Any, rest: Any) -> Any:
 
 
 @jit
-def distribute(N_z: Any, a_x: Any, car: Any, yaw_first: Any) -> Any:
+def torque_limit(v_x: Any, car: Any) -> Any:
+    """N m that a motor can give at a speed, driving or braking: T_max, and P / |omega| of a wheel
+    that rolls at v_x."""
+    most = car.T_max
+    if anywhere(car.P > 0.0):
+        at_speed = car.P * car.r / maximum(absolute(v_x), SLOW)
+        most = select(car.P > 0.0, minimum(most, at_speed), most)
+    return most
+
+
+@jit
+def distribute(N_z: Any, a_x: Any, car: Any, yaw_first: Any, most: Any) -> Any:
     """(T_l, T_r) in N m for a yaw moment and an acceleration: tie-vision (3) in ISO axes.
 
-    A positive yaw moment drives the right wheel. Where both together pass T_max, the yaw moment
-    keeps its share if `yaw_first` is 1, the acceleration if it is 0.
+    A positive yaw moment drives the right wheel. Where both together pass `most`, what a motor
+    gives, the yaw moment keeps its share if `yaw_first` is 1, the acceleration if it is 0.
     """
-    turn = minimum(maximum(car.r * N_z / car.d_r, 0.0 - car.T_max), car.T_max)
-    drive = minimum(maximum(0.5 * car.m * car.r * a_x, 0.0 - car.T_max), car.T_max)
-    room_drive = car.T_max - absolute(turn)
-    room_turn = car.T_max - absolute(drive)
+    turn = minimum(maximum(car.r * N_z / car.d_r, 0.0 - most), most)
+    drive = minimum(maximum(0.5 * car.m * car.r * a_x, 0.0 - most), most)
+    room_drive = most - absolute(turn)
+    room_turn = most - absolute(drive)
     drive_kept = minimum(maximum(drive, 0.0 - room_drive), room_drive)
     turn_kept = minimum(maximum(turn, 0.0 - room_turn), room_turn)
     drive = yaw_first * drive_kept + (1.0 - yaw_first) * drive

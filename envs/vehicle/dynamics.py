@@ -43,6 +43,8 @@ class Car(NamedTuple):
     ahead: Any  # m, the GPS antenna from the centre of gravity
     left: Any  # m
     mu_r: Any  # under the right wheels
+    P: Any  # W, of one motor; 0: no limit
+    h_x: Any  # m, at which drive force moves load between the axles
 
 
 class Motion(NamedTuple):

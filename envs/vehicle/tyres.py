@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from ..backend.decorators import inlined, jit
 from ..backend.elementary import atan, sincos
-from ..backend.primitives import absolute, maximum, minimum, sqrt
+from ..backend.primitives import absolute, anywhere, maximum, minimum, sqrt
 from .vehicle import GRAVITY
 
 TYRE_LAWS = ("linear", "fiala", "dugoff")
@@ -43,7 +43,7 @@ class Load(NamedTuple):
     slope_f: Any  # C / 3 F_max of the same tyres, 1/tan
     slope_l: Any
     slope_r: Any
-    rear_l: Any  # N, capacity of the left and the right rear tyre in all directions, standing
+    rear_l: Any  # N, capacity of the left and the right rear tyre in all directions, without roll
     rear_r: Any
     F_l: Any  # N, drive force that the left and the right motor command
     F_r: Any
@@ -64,11 +64,24 @@ def shifts(small_angle: int, law: int, roll: int) -> int:
 
 
 @jit
+def _axle_shift(F_l: Any, F_r: Any, rear_l: Any, rear_r: Any, weight: Any, car: Any) -> Any:
+    """N by which each rear wheel's load grows, and each front one's falls: F_x h / 2 l.
+
+    F_x is what the standing tyres let the motors bring to the road, so that it does not depend on
+    its own effect. Nine tenths of an axle's standing load is the most that moves.
+    """
+    F_x = minimum(maximum(F_l, 0.0 - rear_l), rear_l) + minimum(maximum(F_r, 0.0 - rear_r), rear_r)
+    shift = F_x * car.h_x * (0.5 / (car.l_f + car.l_r))
+    return minimum(maximum(shift, -0.9 * weight * car.l_f), 0.9 * weight * car.l_r)
+
+
+@jit
 def load_of(inputs: Any, car: Any, small_angle: int, shifting: int = 0) -> Any:
     """The Load of the Inputs of one instant.
 
     The road may grip less on one side: each rear tyre has its own friction, which limits its
-    motor's force; the front tyres share the mean. shifting: of `shifts`; with 1 the rear tyres'
+    motor's force; the front tyres share the mean. Drive force moves load between the axles, but
+    not on the small-angle plant. shifting: of `shifts`; with 1 the rear tyres'
     limits and slopes, drive force and moment are those of the inputs without any friction.
     """
     weight = car.m * GRAVITY / (2.0 * (car.l_f + car.l_r))
@@ -76,6 +89,10 @@ def load_of(inputs: Any, car: Any, small_angle: int, shifting: int = 0) -> Any:
     rear_l, rear_r = car.mu * weight * car.l_f, car.mu_r * weight * car.l_f
     asked_l, asked_r = inputs.T_l * (1.0 / car.r), inputs.T_r * (1.0 / car.r)
     F_l, F_r = asked_l, asked_r
+    if not small_angle and anywhere(car.h_x > 0.0):
+        shift = _axle_shift(F_l, F_r, rear_l, rear_r, weight, car)
+        front = front - 0.5 * (car.mu + car.mu_r) * shift
+        rear_l, rear_r = rear_l + car.mu * shift, rear_r + car.mu_r * shift
     s, c = sincos(inputs.delta_f)
     left, right = rear_l, rear_r
     if not small_angle and not shifting:

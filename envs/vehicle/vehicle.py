@@ -18,7 +18,7 @@ def _unit(unit: str, text: str, default: float | None = None) -> Any:
     return field(default=default, metadata=metadata)
 
 
-_MAY_BE_ZERO = ("motor_lag", "steering_lag")
+_MAY_BE_ZERO = ("motor_lag", "steering_lag", "motor_power", "transfer_height")
 _OF_ANY_SIGN = ("antenna_ahead", "antenna_left")
 _SMALLEST = 1.0 / LARGEST  # what is below is taken for zero: it is divided by
 
@@ -30,8 +30,8 @@ class Vehicle:
     Cornering stiffness is per tyre, as in the papers (an axle has 2 C). Letters of the papers
     stand in the descriptions: `Vehicle.__dataclass_fields__[name].metadata` has text and unit.
 
-    Raises ValueError on a value that is not finite or not positive (lags may be zero, the
-    antenna's place may be negative).
+    Raises ValueError on a value that is not finite or not positive (lags, motor_power and
+    transfer_height may be zero, the antenna's place may be negative).
     """
 
     name: str = "vehicle"
@@ -61,6 +61,8 @@ class Vehicle:
     roll_damping: float = _unit("N m s/rad", "C_x, of the suspension")
     antenna_ahead: float = _unit("m", "GPS antenna ahead of the centre of gravity", 0.0)
     antenna_left: float = _unit("m", "GPS antenna left of the centre of gravity", 0.0)
+    motor_power: float = _unit("W", "limit of one motor, driving and braking; 0: none", 0.0)
+    transfer_height: float = _unit("m", "at which drive force moves load between the axles", 0.0)
 
     def __post_init__(self) -> None:
         for entry in dataclasses.fields(self):

@@ -22,6 +22,7 @@ from gymnasium.vector import AutoresetMode
 
 import sideslip
 from sideslip.envs import SCENARIOS
+from sideslip.envs.scenarios.tiers import TIERS
 from sideslip.estimators import FILTERS, EstimateObservation, make_estimator
 from sideslip.estimators.vector import EstimateObservation as VectorEstimate
 
@@ -139,7 +140,7 @@ def cases() -> Iterator[tuple[str, Callable[[], str]]]:
         yield f"{short} lqr on exact-kf", partial(_estimated, name, "exact-kf", "lqr")
         for mode in (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP):
             yield f"{short} 24 cars {mode.value}", partial(batch, name, mode)
-    for scenario in sorted(each.name for each in SCENARIOS.values() if not each.tier):
+    for scenario in sorted(SCENARIOS.keys() - {each.name for each in TIERS}):
         drive = partial(_bare, IDS[0], 300, scenario=scenario)
         yield f"scenario {scenario}", drive
     for scenario in ("sine-with-dwell", "double-lane-change", "low-friction", "stiffness-step"):

@@ -69,8 +69,15 @@ def test_a_symbolic_tick_is_the_envs(scenario: str, small_angle: bool, lags: boo
         {"base": "random-steering", "friction_right": 0.3, "friction": 0.8},
         {"base": "double-lane-change", "onset": 0.05},
         {"base": "random-steering", "friction": 0.3, "tyres": "dugoff"},
+        {"base": "coms-brake-in-turn", "change_start": 0.05, "friction": 0.4},
     ],
-    ids=["changing tyres", "split friction", "driver", "Dugoff tyres"],
+    ids=[
+        "changing tyres",
+        "split friction",
+        "driver",
+        "Dugoff tyres",
+        "motor power, load transfer",
+    ],
 )
 def test_a_symbolic_tick_is_the_envs_where_the_road_the_tyres_or_the_driver_act(
     changes: dict[str, Any],
@@ -103,6 +110,21 @@ def test_the_forecast_is_what_the_car_meets() -> None:
         force = z[Z.drive.F_d] + wind_at(float(k), wind)[0]
         assert forecast.known[Known._fields.index("F_d"), k] == force
         env.step(np.array([0.7], np.float32))
+
+
+def test_a_lagged_reference_is_the_envs() -> None:
+    """It hangs on the measured speed alone, which other actions change by little."""
+    env = gymnasium.make(
+        ID, scenario={"base": "coms-slalom", "duration": 3.0}, control_period=1, reference="lagged"
+    )
+    env.reset(seed=5)
+    names = ("beta_ref", "gamma_ref")
+    forecast = forecast_of(env.unwrapped, 1, np.zeros((3000, 1)))
+    known = forecast.known[[Known._fields.index(name) for name in names]]
+    assert np.ptp(known, axis=1).min() > 0.002
+    for k in range(1, 3000):
+        *_, info = env.step(np.full(1, 0.1, np.float32))
+        assert [info[name] for name in names] == pytest.approx(known[:, k].tolist(), abs=2e-3)
 
 
 @pytest.mark.long

@@ -134,6 +134,8 @@ KINDS: list[dict[str, Any]] = [
     {"base": "step-steer", "small_angle": True, "tyres": "linear"},
     {"base": "random-steering", "bank": 0.05, "grade": -0.03},
     {"base": "random-steering", "tyres": "dugoff"},
+    {"base": "coms-brake-in-turn", "change_start": 0.05},
+    {"base": "recovery", "vehicle": {"motor_power": 500.0}},
 ]
 
 

@@ -72,6 +72,8 @@ def test_every_drawn_scenario_draws_what_a_table_of_actions_would_need(name: str
         "split-friction": {"friction_right"},
         "curved-road": {"curvature"},
         "curved-road-driver": {"curvature"},
+        "recovery": {"gyro_bias", "accel_y_bias", "gps_latency", "bank"}
+        | {"initial_beta", "initial_gamma"},
     }[name]
     assert drawn == expected
 
@@ -214,6 +216,13 @@ def test_round_trip_through_json(name: str) -> None:
         ({"camera_heading": 0.0}, "camera_heading must be positive, got 0.0"),
         ({"camera_offset": math.nan}, "camera_offset nan is not finite"),
         ({"bank": 1.0}, "bank and grade are up to 0.5 rad, got 1.0, 0.0"),
+        ({"bank": (-0.6, 0.1)}, r"bank and grade are up to 0.5 rad, got \(-0.6, 0.1\), 0.0"),
+        ({"bank": math.nan}, "bank nan is not finite"),
+        ({"initial_beta": (0.0, 1.6)}, r"initial_beta is up to 1.5 rad, got \(0.0, 1.6\)"),
+        ({"initial_gamma": math.inf}, "initial_gamma inf is not finite"),
+        ({"gyro_bias": (0.1, -0.1)}, r"gyro_bias \(0.1, -0.1\) is not finite, or its ends are"),
+        ({"accel_y_bias": math.nan}, "accel_y_bias nan is not finite"),
+        ({"gps_latency": (-0.1, 0.1)}, r"gps_latency is zero or more, got \(-0.1, 0.1\)"),
         ({"grade": math.nan}, "grade nan is not finite"),
         ({"wind_height": math.inf}, "wind_height inf is not finite"),
         ({"speed": 5.0, "speed_change": -6.0}, "speed must not be negative"),

@@ -92,6 +92,12 @@ ARGUMENTS: list[dict[str, Any]] = [
     {"camera": {"phase": None, "loss": 0.3, "duplicate": 0.3}, "gps": {"phase": None}},
     {"scenario": {"base": "straight", "half_width": 0.01, "wind_force": 600.0}},
     {"scenario": {"base": "tie-vision-fig7", "duration": 0.2}, "yaw_first": False},
+    {"scenario": {"base": "coms-slalom", "duration": 0.7}, "reference": "lagged"},
+    {
+        "scenario": {"base": "recovery", "duration": 0.7},
+        "reference": "lagged",
+        "gps": {"phase": None},
+    },
 ]
 
 

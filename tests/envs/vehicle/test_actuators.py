@@ -37,11 +37,11 @@ def test_within_the_limits_it_is_the_papers_law(N_z: float, a_x: float) -> None:
     for yaw_first in (0.0, 1.0):
         # the same operations in another order, on numbers up to 100 N m
         expected = pytest.approx(tie_vision_3(a_x, -N_z), abs=1e-13)
-        assert distribute(N_z, a_x, CAR, yaw_first) == expected
+        assert distribute(N_z, a_x, CAR, yaw_first, CAR.T_max) == expected
 
 
 def test_a_positive_moment_drives_the_right_wheel_and_turns_left() -> None:
-    T_l, T_r = distribute(100.0, 0.0, CAR, 1.0)
+    T_l, T_r = distribute(100.0, 0.0, CAR, 1.0, CAR.T_max)
     assert T_r > 0.0 > T_l
     assert T_l == -T_r
     env = StabilityEnv(scenario=LINEAR)
@@ -51,13 +51,13 @@ def test_a_positive_moment_drives_the_right_wheel_and_turns_left() -> None:
 
 @given(moments, accelerations, st.sampled_from([0.0, 1.0]))
 def test_no_motor_passes_its_limit(N_z: float, a_x: float, yaw_first: float) -> None:
-    for torque in distribute(N_z, a_x, CAR, yaw_first):
+    for torque in distribute(N_z, a_x, CAR, yaw_first, CAR.T_max):
         assert abs(torque) <= T_MAX * (1.0 + 2e-16)  # the sum of two parts rounds
 
 
 @given(moments, accelerations)
 def test_yaw_moment_keeps_its_share_first(N_z: float, a_x: float) -> None:
-    T_l, T_r = distribute(N_z, a_x, CAR, 1.0)
+    T_l, T_r = distribute(N_z, a_x, CAR, 1.0, CAR.T_max)
     most = T_MAX * d_r / r
     kept = min(max(N_z, -most), most)
     assert yaw_moment(T_l, T_r, CAR) == pytest.approx(kept, abs=1e-12)  # roundings of 370 N m
@@ -68,7 +68,7 @@ def test_yaw_moment_keeps_its_share_first(N_z: float, a_x: float) -> None:
 
 @given(moments, accelerations)
 def test_or_acceleration_keeps_its_share(N_z: float, a_x: float) -> None:
-    T_l, T_r = distribute(N_z, a_x, CAR, 0.0)
+    T_l, T_r = distribute(N_z, a_x, CAR, 0.0, CAR.T_max)
     drive = min(max(m * r * a_x / 2.0, -T_MAX), T_MAX)
     assert 0.5 * (T_l + T_r) == pytest.approx(drive, abs=1e-13)
     room = (T_MAX - abs(drive)) * d_r / r
@@ -92,7 +92,7 @@ def test_the_env_hands_the_priority_on(yaw_first: bool, share: float) -> None:
 
 def test_yaw_moment_limit_is_that_of_two_full_motors() -> None:
     assert COMS.yaw_moment_limit == pytest.approx(372.7, abs=0.05)  # printed to 0.1
-    T_l, T_r = distribute(COMS.yaw_moment_limit, 0.0, CAR, 1.0)
+    T_l, T_r = distribute(COMS.yaw_moment_limit, 0.0, CAR, 1.0, CAR.T_max)
     assert (T_l, T_r) == pytest.approx((-100.0, 100.0), rel=1e-15)
     for vehicle in (COMS, PASSENGER_CAR):
         T_max = vehicle.motor_torque

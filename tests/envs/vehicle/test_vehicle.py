@@ -13,7 +13,7 @@ from sideslip.envs.vehicle.vehicle import vehicle_from_file_values
 pytestmark = pytest.mark.plain
 
 NUMBERS = [entry.name for entry in dataclasses.fields(Vehicle) if entry.name != "name"]
-LAGS = ("motor_lag", "steering_lag")
+MAY_BE_ZERO = ("motor_lag", "steering_lag", "motor_power", "transfer_height")
 PLACES = ("antenna_ahead", "antenna_left")
 
 
@@ -57,8 +57,8 @@ def test_values_that_cannot_be_are_refused_by_name(name: str, value: float) -> N
 
 
 @pytest.mark.parametrize("name", NUMBERS)
-def test_zero_is_for_lags_and_places_only(name: str) -> None:
-    if name in LAGS + PLACES:
+def test_zero_is_for_some_only(name: str) -> None:
+    if name in MAY_BE_ZERO + PLACES:
         assert getattr(COMS.replace(**{name: 0.0}), name) == 0.0
     else:
         with pytest.raises(ValueError, match=name):
