@@ -14,6 +14,11 @@ from .output import print_suite
 
 tune_app = typer.Typer(no_args_is_help=True)
 Texts = list[str] | None
+Storage = Annotated[
+    str | None, typer.Option(help="RDB URL or SQLite file; default: sideslip-tune.db here.")
+]
+Jobs = Annotated[int | None, typer.Option("--jobs", "-j", min=1, help="Processes.")]
+Seed = Annotated[int, typer.Option(help="Of the sampler; another on each machine of a study.")]
 
 
 @tune_app.callback()
@@ -62,13 +67,9 @@ def tune_estimator(
     seeds: Annotated[int, typer.Option(help="Training drives.")] = 12,
     test_seeds: Annotated[int, typer.Option(help="Test drives.")] = 20,
     sampler: Annotated[str, typer.Option(help="cma (CMA-ES) or tpe.")] = "cma",
-    seed: Annotated[
-        int, typer.Option(help="Of the sampler; another on each machine of a shared study.")
-    ] = 0,
-    storage: Annotated[
-        str | None, typer.Option(help="RDB URL or SQLite file; default: sideslip-tune.db here.")
-    ] = None,
-    jobs: Annotated[int | None, typer.Option("--jobs", "-j", min=1, help="Processes.")] = None,
+    seed: Seed = 0,
+    storage: Storage = None,
+    jobs: Jobs = None,
     out: Annotated[Path | None, typer.Option(help="Write the entry to a tunings file.")] = None,
     write: Annotated[bool, typer.Option("--write", help="Make it the shipped tuning.")] = False,
     note: Annotated[str, typer.Option(help="A note for the entry.")] = "",
@@ -116,3 +117,51 @@ def tune_estimator(
     for path in files:
         update(path, made)
         console.print(f"tuning: {path}", highlight=False, soft_wrap=True)
+
+
+@tune_app.command("controller")
+def tune_controller(
+    name: Annotated[str, typer.Argument(help="A contestant of the matrix, or a rung.")],
+    kind: Annotated[
+        list[str] | None, typer.Option("--class", help="Of contests; default: all. Repeatable.")
+    ] = None,
+    trials: Annotated[int, typer.Option(help="Of a study, the finished ones included.")] = 60,
+    seeds: Annotated[int, typer.Option(help="Tuning seeds a contest.")] = 16,
+    seed: Seed = 0,
+    storage: Storage = None,
+    jobs: Jobs = None,
+    out: Annotated[Path | None, typer.Option(help="Write the options to this TOML file.")] = None,
+    log: Annotated[Path | None, typer.Option(help="A folder for every study's log.")] = None,
+    write: Annotated[bool, typer.Option("--write", help="Into the package: both.")] = False,
+) -> None:
+    """Find a contestant's weights, bandwidths, levels and grip over the contests of a class.
+
+    A stopped search goes on where it was when the same command runs again. A class whose contests
+    the contestant cannot drive is named and left out.
+    """
+    from ...agents.tuned import FILE
+    from ..tuning import controllers
+    from ..tuning.contests import contests_of, tuning_seeds
+    from ..tuning.file import put_tuned
+    from ..tuning.spaces import KINDS
+    from ..tuning.task import STORAGE
+
+    check_writable(out)
+    console, tables, logs = Console(), [out, FILE] if write else [out], [log]
+    if write:
+        logs.append(controllers.LOGS)
+    for each in kind or KINDS:
+        task = controllers.contestant(name, each, contests_of(each), tuning_seeds(seeds))
+        try:
+            found = controllers.tune(task, trials, storage or STORAGE, seed, jobs, console)
+        except ValueError as error:
+            if kind:
+                raise
+            console.print(f"{name} in {each} was left out: {error}", highlight=False)
+            continue
+        print_suite(console, controllers.suite_of(task, found))
+        for path in filter(None, tables):
+            put_tuned(path, each, name, found["options"])
+        for folder in filter(None, logs):
+            folder.mkdir(parents=True, exist_ok=True)
+            controllers.write_log(folder / f"{each}.{name}.json", found)

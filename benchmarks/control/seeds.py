@@ -9,7 +9,7 @@ from ... import __version__
 from ...agents.learned.files import ENDING
 
 _PACKAGE = Path(__file__).resolve().parents[2]
-_CONTESTANTS = {"estimators": (".py", ".toml"), "agents": (".py", ENDING)}
+_CONTESTANTS = {"estimators": (".py", ".toml"), "agents": (".py", ".toml", ENDING)}
 _LENGTH = 16
 
 

@@ -1,1 +1,1 @@
-"""The search for a filter's noise levels with Optuna."""
+"""The search with Optuna for a filter's noise levels and for a contestant's options."""

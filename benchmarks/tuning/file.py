@@ -5,6 +5,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from ...agents.tuned import Options, read_tuned
 from ...estimators.design.tunings import read_tunings
 from ..harness.results import write_text
 
@@ -48,3 +49,26 @@ def _text(entry: dict[str, Any]) -> str:
 
 def _numbers(pairs: Iterable[tuple[str, float]]) -> str:
     return "{ " + ", ".join(f"{name} = {float(value)!r}" for name, value in pairs) + " }"
+
+
+_TUNED = """\
+# Options of contestants as [class.name.part]; found by `sideslip tune controller NAME`.
+"""
+
+
+def put_tuned(path: str | Path, kind: str, name: str, options: Options) -> None:
+    """Replace or add a contestant's options in a file that `agents.tuned` reads."""
+    target = Path(path)
+    read_tuned.cache_clear()
+    classes = read_tuned(target) if target.exists() else {}
+    classes = classes | {kind: classes.get(kind, {}) | {name: options}}
+    tables = [
+        f"[{each}.{who}.{part}]\n"
+        + "".join(f"{option} = {json.dumps(value)}\n" for option, value in held.items())
+        for each, names in sorted(classes.items())
+        for who, parts in sorted(names.items())
+        for part, held in parts.items()
+        if held
+    ]
+    write_text(target, _TUNED + "\n" + "\n".join(tables))
+    read_tuned.cache_clear()

@@ -9,9 +9,9 @@ import functools
 import math
 import tempfile
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import joblib
 from rich.console import Console
@@ -36,6 +36,16 @@ BATCH = 8  # trials asked for before any result is in: the same search for every
 DIGITS = 3  # of what is found
 
 
+class Question(Protocol):
+    """What a study is about: its name, and the (low, high) of each number by name."""
+
+    @property
+    def study(self) -> str: ...  # noqa: D102
+
+    @property
+    def search(self) -> Mapping[str, tuple[float, float]]: ...  # noqa: D102
+
+
 @functools.lru_cache(maxsize=1)
 def _loaded(path: str) -> Any:
     return joblib.load(path)
@@ -50,7 +60,7 @@ def score(path: str, task: Task, found: dict[str, float]) -> float:
 
 
 def open_study(
-    task: Task, storage: str = STORAGE, sampler: str = SAMPLERS[0], seed: int = 0
+    task: Question, storage: str = STORAGE, sampler: str = SAMPLERS[0], seed: int = 0
 ) -> "optuna.Study":
     """The task's study, made if it is not there.
 
@@ -85,32 +95,62 @@ def search(
 
     Raises ValueError for a storage that fails and where no trial gave a stable filter.
     """
-    ranges = task.search.items()
-    space: dict[str, optuna.distributions.BaseDistribution] = {
-        name: optuna.distributions.FloatDistribution(*limits, log=True) for name, limits in ranges
-    }
-    with _quiet(), _storage_errors(study.study_name), tempfile.TemporaryDirectory() as folder:
-        done = _finished(study, task)
+    with tempfile.TemporaryDirectory() as folder:
         path = str(Path(folder) / "drives")
         joblib.dump(list(drives), path)
-        with progress(console) as bar, joblib.Parallel(n_jobs=min(jobs or cores(), BATCH)) as pool:
-            shown = bar.add_task(_best_text(study), total=trials, completed=len(done))
-            while len(done) < trials:
-                batch = [study.ask(space) for _ in range(min(BATCH, trials - len(done)))]
-                values = pool(joblib.delayed(score)(path, task, trial.params) for trial in batch)
-                for trial, value in zip(batch, values, strict=True):
-                    study.tell(trial, value)
-                done = _finished(study, task)
-                bar.update(shown, completed=len(done), description=_best_text(study))
+        with joblib.Parallel(n_jobs=min(jobs or cores(), BATCH)) as pool:
+
+            def judge(batch: Sequence[dict[str, float]]) -> list[tuple[float, int]]:
+                values = pool(joblib.delayed(score)(path, task, numbers) for numbers in batch)
+                return [(value, len(drives)) for value in values]
+
+            search_on(study, task, trials, judge, len(drives), console)
+    with _storage_errors(study.study_name):
         best = study.best_trial
     if best.value is None or not math.isfinite(best.value):
         squares(task, drives, best.params)  # the estimator's own words, if it has any
-        raise ValueError(f"none of {len(done)} trials of {task.estimator} gave finite estimates")
+        raise ValueError(f"none of {trials} trials of {task.estimator} gave finite estimates")
     return {name: float(f"{v:.{DIGITS}g}") for name, v in best.params.items()}
 
 
-def _finished(study: "optuna.Study", task: Task) -> list[FrozenTrial]:
-    done = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
+def search_on(
+    study: "optuna.Study",
+    task: Question,
+    trials: int,
+    judge: Callable[[Sequence[dict[str, float]]], Sequence[tuple[float, int]]],
+    whole: int,
+    console: Console | None = None,
+) -> None:
+    """Ask for batches until the study has so many trials, those it holds included.
+
+    judge: from the numbers of a batch to (value, drives it is the mean of) of each. A trial that
+    drove fewer than `whole` counts as pruned; its user attributes have both.
+    """
+    space: dict[str, optuna.distributions.BaseDistribution] = {
+        name: optuna.distributions.FloatDistribution(*limits, log=True)
+        for name, limits in task.search.items()
+    }
+    with _quiet(), _storage_errors(study.study_name), progress(console) as bar:
+        done = _finished(study, task)
+        shown = bar.add_task(_best_text(study), total=trials, completed=len(done))
+        while len(done) < trials:
+            batch = [study.ask(space) for _ in range(min(BATCH, trials - len(done)))]
+            judged = judge([trial.params for trial in batch])
+            for trial, (value, count) in zip(batch, judged, strict=True):
+                trial.set_user_attr("seeds", count)
+                trial.set_user_attr("objective", value)
+                if count < whole:
+                    trial.report(value, count)
+                    study.tell(trial, state=TrialState.PRUNED)
+                else:
+                    study.tell(trial, value)
+            done = _finished(study, task)
+            bar.update(shown, completed=len(done), description=_best_text(study))
+
+
+def _finished(study: "optuna.Study", task: Question) -> list[FrozenTrial]:
+    states = (TrialState.COMPLETE, TrialState.PRUNED)
+    done = study.get_trials(deepcopy=False, states=states)
     if len(study.directions) != 1 or any(set(t.params) != set(task.search) for t in done):
         raise ValueError(f"the study {study.study_name!r} holds something else; delete it")
     return done
@@ -156,6 +196,6 @@ def _storage_errors(storage: str, *others: type[Exception]) -> Iterator[None]:
 
 def _best_text(study: "optuna.Study") -> str:
     try:
-        return f"best RMSE {study.best_value:.4g}"
+        return f"best {study.best_value:.4g}"
     except ValueError:
         return "search"

@@ -1,0 +1,40 @@
+"""Tuned options of the contestants, by the class of contests that they drive: `tuned.toml`.
+
+`sideslip tune controller` finds them. A class is a car with what acts on it and what judges it,
+such as "coms-model" or "car-steering".
+"""
+
+import tomllib
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+FILE = Path(__file__).with_name("tuned.toml")
+PARTS = ("filter", "controller")
+
+Options = dict[str, dict[str, Any]]
+"""Options of the filter and of the controller, by `PARTS`."""
+
+
+@cache
+def read_tuned(path: Path = FILE) -> dict[str, dict[str, Options]]:
+    """The options of a file by class and contestant.
+
+    Raises FileNotFoundError, and ValueError, with the path, for a file that holds something else.
+    """
+    try:
+        classes: Any = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path} is no TOML: {error}") from None
+    for kind, names in classes.items():
+        for name, parts in names.items() if isinstance(names, dict) else [("", names)]:
+            whole = isinstance(parts, dict) and parts.keys() <= set(PARTS)
+            if not (whole and all(isinstance(each, dict) for each in parts.values())):
+                raise ValueError(f"{path}: {kind}.{name} is no table of {' and '.join(PARTS)}")
+    return dict(classes)
+
+
+def tuned(contest_class: str, name: str) -> Options:
+    """{"filter": options, "controller": options} of a contestant; empty where none was tuned."""
+    found = read_tuned().get(contest_class, {}).get(name, {})
+    return {part: dict(found.get(part, {})) for part in PARTS}

@@ -1,0 +1,195 @@
+"""Question: which options make a contestant of the matrix cheapest, over a class's contests?
+
+Every contestant gets the same number of trials on the same tuning seeds. What is made small is the
+mean of log(J / J_nominal) over contests and seeds, J_nominal that of the untuned `nominal`, clipped
+to +-3; a failure counts log 20.
+"""
+
+import hashlib
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any
+
+import joblib
+import numpy as np
+from rich.console import Console
+
+from ... import __version__
+from ...agents.rungs import NOMINAL
+from ...agents.tuned import Options
+from ...envs.backend.cache import source_stamp
+from ..harness.parallel import cores
+from ..harness.results import Suite, Table, write_text
+from .contests import Array, Contest, drive
+from .spaces import SLOW, Number, options_of, space
+from .task import STORAGE
+
+TRIALS = 60
+LOGS = Path(__file__).with_name("logs")
+"""The studies whose options the package ships."""
+FAILED = math.log(20.0)
+STAGES = (4, 8)
+"""Seeds after which the better half of a slow contestant's trials goes on."""
+_FLOOR, _CLIP = 0.001, 3.0
+
+
+@dataclass(frozen=True)
+class Contestant:
+    """What is searched: a contestant's numbers, over a class's contests, on tuning seeds."""
+
+    name: str
+    kind: str
+    contests: tuple[Contest, ...]
+    seeds: tuple[int, ...]
+    numbers: tuple[Number, ...]
+
+    @property
+    def study(self) -> str:
+        """The study's name: the same for the same question asked of the same sources."""
+        stamp = f"{json.dumps(asdict(self), default=str)} {source_stamp('agents')} {__version__}"
+        digest = hashlib.sha256(stamp.encode()).hexdigest()[:12]
+        return f"{self.name} in {self.kind} {digest}"
+
+    @property
+    def search(self) -> dict[str, tuple[float, float]]:
+        """(low, high) by name."""
+        return {each.name: (each.low, each.high) for each in self.numbers}
+
+    @property
+    def start(self) -> dict[str, float]:
+        """Where the search starts."""
+        return {each.name: each.start for each in self.numbers}
+
+    def options(self, found: dict[str, float]) -> Options:
+        """The options with some numbers, which have three digits."""
+        return options_of(self.numbers, {name: float(f"{v:.3g}") for name, v in found.items()})
+
+
+def contestant(
+    name: str, kind: str, contests: Sequence[Contest], seeds: Sequence[int]
+) -> Contestant:
+    """The question; ValueError for an unknown name or class, no contests and no seeds."""
+    numbers = space(name, kind)
+    if not contests or not seeds:
+        raise ValueError(f"{kind}: {len(contests)} contests, {len(seeds)} seeds; both are needed")
+    return Contestant(name, kind, tuple(contests), tuple(seeds), numbers)
+
+
+@lru_cache(maxsize=64)
+def _nominal(contest: Contest, seeds: tuple[int, ...]) -> Array:
+    return drive(contest, NOMINAL, {}, seeds)[0]
+
+
+def objective(task: Contestant, found: dict[str, float], count: int) -> float:
+    """The mean over contests and the first seeds, infinite where nothing can be designed."""
+    options, seeds, logs = task.options(found), task.seeds[:count], []
+    for contest in task.contests:
+        try:
+            costs, failed = drive(contest, task.name, options, seeds)
+        except (ValueError, ArithmeticError, np.linalg.LinAlgError):
+            return math.inf
+        own = np.log((costs + _FLOOR) / (_nominal(contest, seeds) + _FLOOR))
+        logs.append(np.where(failed, FAILED, np.clip(own, -_CLIP, _CLIP)))
+    value = float(np.mean(logs))
+    return value if math.isfinite(value) else math.inf
+
+
+def judge(
+    task: Contestant, pool: Any, batch: Sequence[dict[str, float]]
+) -> list[tuple[float, int]]:
+    """(objective, seeds driven) of each of a batch's trials.
+
+    Of a slow contestant's the worse half is left after each of `STAGES` (successive halving).
+    """
+    stages = [each for each in STAGES if task.name in SLOW and each < len(task.seeds)]
+    judged, going = [(math.inf, 0)] * len(batch), list(range(len(batch)))
+    for count in (*stages, len(task.seeds)):
+        values = pool(joblib.delayed(objective)(task, batch[i], count) for i in going)
+        for i, value in zip(going, values, strict=True):
+            judged[i] = value, count
+        going = sorted(going, key=lambda i: judged[i])[: (len(going) + 1) // 2]
+    return judged
+
+
+def tune(
+    task: Contestant,
+    trials: int = TRIALS,
+    storage: str = STORAGE,
+    seed: int = 0,
+    jobs: int | None = None,
+    console: Console | None = None,
+) -> dict[str, Any]:
+    """Search; the study as a mapping of JSON types: every trial and the best of those that drove
+    all seeds.
+
+    A stopped search goes on where it was. Raises ValueError for a contestant that cannot drive the
+    contests, no trials, a storage that fails, and where no trial is finite.
+    """
+    from .study import open_study, search_on
+
+    if trials < 1:
+        raise ValueError(f"trials must be at least 1, got {trials}")
+    for contest in task.contests:  # what cannot be driven at all; kernels are compiled once
+        drive(contest, task.name, task.options(task.start), task.seeds[:1])
+    study = open_study(task, storage, "tpe", seed)
+    if not study.trials:
+        study.enqueue_trial(task.start)
+    with joblib.Parallel(n_jobs=jobs or cores()) as pool:
+        search_on(study, task, trials, partial(judge, task, pool), len(task.seeds), console)
+    return log_of(task, study.trials)
+
+
+def log_of(task: Contestant, trials: Sequence[Any]) -> dict[str, Any]:
+    """The log of a study; trials: Optuna's."""
+    rows: list[dict[str, Any]] = []
+    for each in trials:
+        if "seeds" in each.user_attrs:  # the others were stopped
+            found = {name: float(f"{value:.3g}") for name, value in each.params.items()}
+            value, count = each.user_attrs["objective"], each.user_attrs["seeds"]
+            known = round(value, 5) if math.isfinite(value) else None
+            rows.append({"numbers": found, "seeds": count, "objective": known})
+    whole = [r for r in rows if r["seeds"] == len(task.seeds) and r["objective"] is not None]
+    if not whole:
+        raise ValueError(f"none of {len(rows)} trials of {task.name} could be driven: {task.kind}")
+    best = min(whole, key=lambda row: float(row["objective"]))
+    return {
+        "contestant": task.name,
+        "class": task.kind,
+        "env_version": __version__,
+        "contests": [each.name for each in task.contests],
+        "seeds": list(task.seeds),
+        "start": rows[0]["objective"],
+        "best": best,
+        "options": task.options(best["numbers"]),
+        "trials": rows,
+    }
+
+
+def write_log(path: Path, log: dict[str, Any]) -> None:
+    """A log as JSON, a trial a line."""
+    lines = ",\n  ".join(json.dumps(trial) for trial in log["trials"])
+    head = json.dumps({key: value for key, value in log.items() if key != "trials"}, indent=1)
+    write_text(path, f'{head[:-2]},\n "trials": [\n  {lines}\n ]\n}}\n')
+
+
+def suite_of(task: Contestant, log: dict[str, Any]) -> Suite:
+    """What a study found, as a table; a number at the end of its range is marked."""
+    best, cells = log["best"], []
+    for number in task.numbers:
+        value = best["numbers"][number.name]
+        edge = min(value / number.low, number.high / value) < 1.25
+        limits = f"{number.low:g} .. {number.high:g}"
+        cells.append([number.name, f"{value:g}", limits, "at its end" if edge else ""])
+    start = math.inf if log["start"] is None else math.exp(log["start"])
+    text = (
+        f"{len(log['trials'])} trials over {len(task.contests)} contests of {task.kind} on "
+        f"{len(task.seeds)} tuning seeds each: cost {100.0 * math.exp(best['objective']):.1f} % of "
+        f"the untuned nominal's (geometric mean, a failure counts 20), {100.0 * start:.1f} % at "
+        "the start."
+    )
+    table = Table("Found", ("option", "value", "range", ""), cells, keyed=False)
+    return Suite("tune", f"Tuning {task.name} in {task.kind}", text, tables=[table])

@@ -1,0 +1,201 @@
+"""The search for a contestant's options: a bad start is left, failures cost, it may be stopped."""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("optuna")
+
+from sideslip.agents.tuned import FILE, read_tuned, tuned
+from sideslip.benchmarks.tuning import controllers, spaces
+from sideslip.benchmarks.tuning.contests import Contest, contests_of, drive, tuning_seeds
+from sideslip.benchmarks.tuning.controllers import Contestant, objective, tune
+from sideslip.benchmarks.tuning.file import put_tuned
+from sideslip.benchmarks.tuning.spaces import KINDS, SPACES, Number, options_of
+from tests.benchmarks.conftest import Run
+
+YAW = "sideslip/YawFusion-v0"
+SHORT = Contest(YAW, {"scenario": {"base": "slalom", "duration": 1.5}}, "short")
+SEEDS = tuple(tuning_seeds(2))
+
+
+def task(*numbers: Number, name: str = "two-dof", seeds: tuple[int, ...] = SEEDS) -> Contestant:
+    return Contestant(name, "coms-model", (SHORT,), seeds, numbers)
+
+
+def storage(folder: Path) -> str:
+    return f"sqlite:///{folder}/study.db"
+
+
+def test_a_planted_bad_weight_is_found_and_left(tmp_path: Path) -> None:
+    """A PI a hundred times too strong swings from limit to limit: the search leaves it."""
+    planted = task(Number("gain", 100.0, 0.1, 200.0))
+    log = tune(planted, 12, storage(tmp_path), jobs=1)
+    assert len(log["trials"]) == 12
+    assert log["trials"][0]["numbers"] == {"gain": 100.0}  # the start is the first trial
+    assert log["start"] == log["trials"][0]["objective"]
+    assert log["best"]["objective"] < log["start"] - 0.5
+    assert log["best"]["numbers"]["gain"] < 30.0
+    best = log["options"]["controller"]
+    assert objective(planted, best, 2) == pytest.approx(log["best"]["objective"], abs=1e-4)
+    assert "cost" in controllers.suite_of(planted, log).text
+
+
+def test_the_objective_is_the_mean_log_of_paired_costs() -> None:
+    gain = task(Number("gain", 1.0, 0.1, 10.0))
+    costs, _ = drive(SHORT, "two-dof", {"controller": {"gain": 3.0}}, SEEDS)
+    nominal, _ = drive(SHORT, "nominal", {}, SEEDS)
+    wanted = np.clip(np.log((costs + 1e-3) / (nominal + 1e-3)), -3.0, 3.0).mean()
+    assert objective(gain, {"gain": 3.0}, 2) == pytest.approx(wanted, rel=1e-12)
+
+
+def test_a_failure_costs_twenty_times_nominal(monkeypatch: pytest.MonkeyPatch) -> None:
+    fates = {"two-dof": (np.array([0.5, 900.0]), np.array([False, True]))}
+    monkeypatch.setattr(
+        controllers, "drive", lambda c, name, *_: fates.get(name, (np.ones(2), np.zeros(2)))
+    )
+    controllers._nominal.cache_clear()
+    found = objective(task(Number("gain", 1.0, 0.1, 10.0)), {"gain": 1.0}, 2)
+    controllers._nominal.cache_clear()
+    assert found == pytest.approx(0.5 * (math.log(0.501 / 1.001) + math.log(20.0)))
+
+
+def test_what_cannot_be_designed_is_infinitely_dear(monkeypatch: pytest.MonkeyPatch) -> None:
+    bad = task(Number("pole", 1.0, 0.1, 10.0))
+    assert objective(bad, {"pole": -1.0}, 2) == math.inf
+
+
+def test_of_a_slow_contestant_the_worse_half_stops_early(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    asked: list[int] = []
+
+    def fake(task: Contestant, found: dict[str, float], count: int) -> float:
+        asked.append(count)
+        return abs(math.log(found["grip"] / 0.5))
+
+    monkeypatch.setattr(controllers, "objective", fake)
+    monkeypatch.setattr(controllers, "drive", lambda *_: None)
+    slow = task(Number("grip", 0.9, 0.3, 1.0), name="mpc", seeds=tuple(tuning_seeds(16)))
+    log = tune(slow, 16, storage(tmp_path), jobs=1)
+    counted = [asked.count(count) for count in (4, 8, 16)]
+    assert counted == [16, 8, 4]
+    assert [row["seeds"] for row in log["trials"]].count(16) == 4
+    assert log["best"]["seeds"] == 16
+    least = min(log["trials"], key=lambda row: row["objective"])
+    assert log["best"]["numbers"] == least["numbers"]  # the best trial is never stopped
+
+
+def test_a_stopped_search_goes_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    calls: list[float] = []
+
+    def fake(task: Contestant, found: dict[str, float], count: int) -> float:
+        if len(calls) == 11:
+            raise KeyboardInterrupt
+        calls.append(found["gain"])
+        return found["gain"]
+
+    monkeypatch.setattr(controllers, "objective", fake)
+    once = task(Number("gain", 1.0, 0.1, 10.0))
+    with pytest.raises(KeyboardInterrupt):
+        tune(once, 16, storage(tmp_path), jobs=1)
+    before, calls[:] = calls[:8], []  # a whole batch
+    log = tune(once, 16, storage(tmp_path), jobs=1)
+    assert len(calls) == 8
+    driven = [row["numbers"]["gain"] for row in log["trials"]]
+    assert driven == [float(f"{each:.3g}") for each in before + calls]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_class_has_contests_and_every_start_lies_within(kind: str) -> None:
+    assert len(contests_of(kind)) >= 5
+    for name in SPACES:
+        numbers = spaces.space(name, kind)
+        assert all(0.0 < each.low <= each.start <= each.high for each in numbers)
+        steers = any(each.steering for each in numbers)
+        assert not (steers and kind not in spaces.STEERING)
+
+
+def test_numbers_become_options() -> None:
+    both = Number("disturbance_time", 0.3, 0.1, 1.0, ("filter", "controller"))
+    numbers = (
+        Number("bandwidth.0", 5.0, 1.0, 9.0),
+        Number("bandwidth.1", 5.0, 1.0, 9.0),
+        Number("horizon", 30, 10, 60, whole=True),
+        both,
+    )
+    found = {"bandwidth.0": 2.0, "bandwidth.1": 3.0, "horizon": 20.4, "disturbance_time": 0.2}
+    assert options_of(numbers, found) == {
+        "filter": {"disturbance_time": 0.2},
+        "controller": {"bandwidth": [2.0, 3.0], "horizon": 20, "disturbance_time": 0.2},
+    }
+
+
+def test_options_are_written_beside_others_and_read(tmp_path: Path) -> None:
+    path = tmp_path / "tuned.toml"
+    options: dict[str, Any] = {"filter": {"force_sd": 1e-05}, "controller": {"bandwidth": [1, 2]}}
+    put_tuned(path, "car-yaw", "lqr", options)
+    put_tuned(path, "car-yaw", "model-following", {"filter": {}, "controller": {"grip": 0.5}})
+    put_tuned(path, "car-yaw", "lqr", options | {"filter": {"force_sd": 2.5}})
+    assert read_tuned(path)["car-yaw"] == {
+        "lqr": {"filter": {"force_sd": 2.5}, "controller": {"bandwidth": [1, 2]}},
+        "model-following": {"controller": {"grip": 0.5}},
+    }
+    for text in ("[", "a = 1", "[a.b]\nc = 1", "[a.b.filters]\nc = 1"):
+        bad = tmp_path / f"{len(text)}.toml"
+        bad.write_text(text)
+        with pytest.raises(ValueError, match=rf"{len(text)}\.toml"):
+            read_tuned(bad)
+
+
+def test_defaults_stand_where_nothing_was_tuned() -> None:
+    assert tuned("coms-model", "nobody") == {"filter": {}, "controller": {}}
+    for kind, names in read_tuned(FILE).items():
+        for name, parts in names.items():
+            log = json.loads((controllers.LOGS / f"{kind}.{name}.json").read_text())
+            assert (log["class"], log["contestant"]) == (kind, name)
+            assert {part: held for part, held in log["options"].items() if held} == parts
+            whole = [row for row in log["trials"] if row["seeds"] == len(log["seeds"])]
+            known = [row["objective"] for row in whole if row["objective"] is not None]
+            assert log["best"]["objective"] == min(known) <= (log["start"] or math.inf)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("kalman",), "unknown controller 'kalman'; known: two-dof, "),
+        (("lqr", "--class", "moon"), "unknown class 'moon'; known: coms-model, "),
+        (("lqr", "--class", "coms-model", "--trials", 0), "trials must be at least 1, got 0"),
+        (("lqr", "--class", "coms-model", "--seeds", 0), "0 seeds; both are needed"),
+        (("model-following", "--class", "car-yaw"), "needs an env whose action steers"),
+        (("lqr", "--out", "nowhere/tuned.toml"), "nowhere/tuned.toml"),
+    ],
+)
+def test_a_mistake_is_one_line_that_names_it(
+    run: Run,
+    arguments: tuple[Any, ...],
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    status, _, err = run("tune", "controller", *arguments)
+    assert status == 2 and message in " ".join(err.split())
+
+
+def test_the_command_writes_options_and_log(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sideslip.benchmarks.tuning.contests.contests_of", lambda _: (SHORT,))
+    few = ("--class", "coms-model", "--trials", 2, "--seeds", 1, "--jobs", 1)
+    status, out, _ = run("tune", "controller", "two-dof", *few, "--out", "t.toml", "--log", "logs")
+    assert status == 0 and "untuned nominal" in " ".join(out.split())
+    log = json.loads(Path("logs/coms-model.two-dof.json").read_text())
+    assert len(log["trials"]) == 2 and log["seeds"] == tuning_seeds(1)
+    held = {part: options for part, options in log["options"].items() if options}
+    assert read_tuned(Path("t.toml"))["coms-model"]["two-dof"] == held
