@@ -7,8 +7,8 @@ from typing import Any
 from ..envs.backend.files import whole
 from .control.cells import REFERENCE_FILTER, YAW
 from .harness.metrics import METRICS
-from .harness.results import Row, Suite
-from .report.colours import INK, colour
+from .harness.results import Row, ShareMap, Suite
+from .report.colours import INK, SHARE_SCALE, colour
 
 
 def write_picture(path: str | Path, suites: Sequence[Suite]) -> None:
@@ -33,10 +33,17 @@ def write_picture(path: str | Path, suites: Sequence[Suite]) -> None:
         )
     ]
     panels = [panel for panel in panels if panel[1]]
-    if not panels:
-        raise ValueError("nothing to draw: the picture needs the suites estimation or control")
-    figure = Figure(figsize=(4.0 * len(panels), 2.6), layout="constrained")
-    axes = figure.subplots(1, len(panels), squeeze=False)[0]
+    maps = [each for suite in suites for each in suite.maps]
+    if not (panels or maps):
+        raise ValueError(
+            "nothing to draw: the picture needs the suites estimation, control or recovery"
+        )
+    wide = max([4.0 * len(panels), *(2.4 * len(each.shares) for each in maps)])
+    figure = Figure(figsize=(wide, 2.6 * (bool(panels) + len(maps))), layout="constrained")
+    strips = figure.subfigures(bool(panels) + len(maps), 1, squeeze=False)[:, 0]
+    for strip, each in zip(strips[bool(panels) :], maps, strict=True):
+        _maps(strip, each)
+    axes = strips[0].subplots(1, len(panels), squeeze=False)[0] if panels else []
     for axis, (title, mine, label) in zip(axes, panels, strict=True):
         _bars(axis, mine, title, label)
         over = {r.estimator: r.value for r in rows
@@ -53,6 +60,24 @@ def _shown(row: Row) -> bool:
     """Whether a row stands in the picture: of the scores those on the best filter, yaw moment."""
     best = row.env_version.startswith(YAW) and row.estimator in ("", REFERENCE_FILTER)
     return row.metric != "score" or best
+
+
+def _maps(strip: Any, shown: ShareMap) -> None:
+    """Shares over two axes in a row, a panel a name, with the line at one half."""
+    from matplotlib.colors import LinearSegmentedColormap
+
+    scale = LinearSegmentedColormap.from_list("share", SHARE_SCALE)
+    strip.suptitle(shown.title, fontsize=9)
+    axes = strip.subplots(1, len(shown.shares), squeeze=False, sharey=True)[0]
+    for axis, (name, share) in zip(axes, shown.shares.items(), strict=True):
+        image = axis.pcolormesh(shown.x, shown.y, share, cmap=scale, vmin=0.0, vmax=1.0)
+        if share.min() < 0.5 < share.max():
+            axis.contour(shown.x, shown.y, share, [0.5], colors=INK, linewidths=1.0)
+        axis.set_title(name, fontsize=8)
+        axis.set_xlabel(shown.x_label, fontsize=7)
+        axis.tick_params(labelsize=7)
+    axes[0].set_ylabel(shown.y_label, fontsize=7)
+    strip.colorbar(image, ax=axes).ax.tick_params(labelsize=7)
 
 
 def _limit(axis: Any, value: float) -> None:

@@ -50,6 +50,7 @@ SUITES: dict[str, tuple[str, _Run]] = {
     "control": (".control.suite", _control),
     "papers": (".papers.suite", _seeds),
     "following": (".following", _following),
+    "recovery": (".recovery", lambda suite, r: suite.run(r.quick, r.jobs, r.console)),
     "procedures": (".procedures.suite", lambda suite, r: suite.run(r.quick, r.jobs, r.console)),
     "speed": (".speed.suite", lambda suite, r: suite.run(r.quick, r.console)),
 }

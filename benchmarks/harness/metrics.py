@@ -132,8 +132,8 @@ _OTHERS = {
     "Hz": "hertz",
     "rad s2/m": "understeer_gradient",
     "-": "rmse_over_bound score iqm cost_over_informed probability_of_improvement spin_rate "
-    "departure_rate not_finite_rate bad_action_rate ratio difference residual rank share "
-    "spectral_radius count amplitude overshoot",
+    "departure_rate saved_rate not_finite_rate bad_action_rate ratio difference residual rank "
+    "share spectral_radius count amplitude overshoot",
 }
 METRICS = {metric.name: metric.unit for metric in EPISODE} | {
     name: unit for unit, names in _OTHERS.items() for name in names.split()

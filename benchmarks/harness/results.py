@@ -3,13 +3,14 @@
 import json
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, get_origin
 
 from ...envs.arguments import brief, check_choice, is_finite, listed
 from ...envs.backend.files import whole, write_whole
+from ...envs.record import Array
 from .explorer import Explorer
 from .metrics import METRICS
 from .stats import Estimate
@@ -72,13 +73,25 @@ class Table:
     keyed: bool = True
 
 
+@dataclass(frozen=True)
+class ShareMap:
+    """Shares between 0 and 1 over two axes: shares by name, each (y, x)."""
+
+    title: str
+    x: Array
+    y: Array
+    shares: Mapping[str, Array]
+    x_label: str
+    y_label: str
+
+
 @dataclass
 class Suite:
     """The result of a benchmark module: rows for machines, tables and figures for people.
 
     figures: (title, plotly figure, a sentence on what to see). Empty where the extra `report` is
-    not installed or pictures were not asked for. explorers: figures with menus. files: what the
-    report offers to save, (file name, media type, text).
+    not installed or pictures were not asked for. explorers: figures with menus. maps: for the
+    summary's PNG. files: what the report offers to save, (file name, media type, text).
     """
 
     name: str
@@ -88,6 +101,7 @@ class Suite:
     tables: list[Table] = field(default_factory=list)
     figures: list[tuple[str, Any, str]] = field(default_factory=list)
     explorers: list[Explorer] = field(default_factory=list)
+    maps: list[ShareMap] = field(default_factory=list)
     files: list[tuple[str, str, str]] = field(default_factory=list)
 
 

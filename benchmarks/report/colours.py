@@ -9,6 +9,9 @@ INK = "#000000"
 GREY = "#7F7F7F"
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 
+SHARE_SCALE = ((0.0, "#D55E00"), (0.5, "#F0E442"), (1.0, "#0072B2"))
+"""From bad to good, safe for the colour-blind."""
+
 _NAMES = {
     INK: "truth, true, reference, bound, ideal",
     GREY: "none, measured, bicycle-kf, gyro-only, without control",

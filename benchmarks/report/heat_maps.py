@@ -6,14 +6,16 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from plotly import graph_objects as go
+from plotly.subplots import make_subplots
 
-from .colours import INK, line_styles
+from ..harness.results import ShareMap
+from .colours import INK, SHARE_SCALE, line_styles
 
 Array = npt.NDArray[np.float64]
 
 _FRAMES = 120
 _WINDOW = (36.0, 11.0)  # m, what is seen of a run in motion
-_GOOD_TO_BAD = ((0.0, "#0072B2"), (0.5, "#F0E442"), (1.0, "#D55E00"))  # safe for the colour-blind
+_GOOD_TO_BAD = [(1.0 - at, shade) for at, shade in SHARE_SCALE][::-1]
 _CAR = np.array([[1.0, 0.5], [1.0, -0.5], [-1.0, -0.5], [-1.0, 0.5], [1.0, 0.5]])
 
 
@@ -48,6 +50,32 @@ def heat_map(
     figure.update_xaxes(side="top", tickangle=-35, showgrid=False, ticks="", automargin=True)
     figure.update_yaxes(autorange="reversed", showgrid=False, ticks="", automargin=True)
     figure.update_layout(height=170 + 22 * len(names), hovermode="closest", showlegend=False)
+    return figure
+
+
+def share_maps(shown: ShareMap) -> Any:
+    """Shares over two axes, a panel a name, with the line at one half."""
+    across = min(3, len(shown.shares))
+    down = -(-len(shown.shares) // across)
+    names = list(shown.shares)
+    gaps = {"horizontal_spacing": 0.06, "vertical_spacing": 0.28 / down}
+    figure = make_subplots(down, across, subplot_titles=names, shared_yaxes=True, **gaps)
+    for i, (name, share) in enumerate(shown.shares.items()):
+        place = {"row": i // across + 1, "col": i % across + 1}
+        hover = f"{name}<br>%{{x:.1f}}, %{{y:.1f}}: %{{z:.2f}}<extra></extra>"
+        axes: dict[str, Any] = {"x": shown.x, "y": shown.y, "z": share}
+        figure.add_trace(go.Heatmap(**axes, coloraxis="coloraxis", hovertemplate=hover), **place)
+        half = {"start": 0.5, "end": 0.5, "size": 1.0, "coloring": "none"}
+        line = {"color": INK, "width": 1.5}
+        figure.add_trace(
+            go.Contour(**axes, contours=half, line=line, showscale=False, hoverinfo="skip"), **place
+        )
+        figure.update_xaxes(title_text=shown.x_label, **place)
+        if place["col"] == 1:
+            figure.update_yaxes(title_text=shown.y_label, **place)
+    scale = [list(each) for each in SHARE_SCALE]
+    bar = {"colorscale": scale, "cmin": 0.0, "cmax": 1.0, "colorbar": {"title": {"text": "share"}}}
+    figure.update_layout(height=120 + 230 * down, coloraxis=bar, showlegend=False)
     return figure
 
 

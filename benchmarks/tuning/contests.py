@@ -37,7 +37,7 @@ def drive(
 
     options: over the defaults. Raises what the env, the filter and the controller raise.
     """
-    env, agent = _cars(contest, name, options, len(seeds))
+    env, agent = cars_of(contest, name, options, len(seeds))
     costs, failed = np.zeros(len(seeds)), np.zeros(len(seeds), np.bool_)
     for step in steps_of(env, agent, list(seeds)):
         costs -= np.where(step.running, step.reward, 0.0)
@@ -46,7 +46,8 @@ def drive(
     return costs, failed
 
 
-def _cars(contest: Contest, name: str, options: Options, count: int) -> tuple[Any, Any]:
+def cars_of(contest: Contest, name: str, options: Options, count: int) -> tuple[Any, Any]:
+    """(vector env of so many rows, agent): a rung, or an agent on `exact-kf` with all sensors."""
     kwargs: dict[str, Any] = {"on_bad_action": "fail", **contest.env_options}
     if name in RUNGS:
         return make_rung(name, contest.env_id, count, options=options, **kwargs)

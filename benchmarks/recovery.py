@@ -1,0 +1,139 @@
+"""Question: from which sideslip angle and yaw rate does a controller still save the car?
+
+Cars start straight ahead but sliding and turning, nobody steers, and the seed draws tyres and
+friction. A car is saved that does not fail and ends with a sideslip angle below `CAUGHT`.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from .. import __version__
+from ..agents.rollout import steps_of
+from ..agents.tuned import tuned
+from ..envs.record import Array
+from ..envs.scenarios.draws import KMH
+from .harness.parallel import run_cases
+from .harness.results import Row, ShareMap, Suite, Table
+from .harness.stats import interval
+from .tuning.contests import Contest, cars_of
+
+NAME = "recovery"
+ENV_ID = "sideslip/YawFusion-v0"
+CONTROLLERS = ("none", "two-dof", "esc", "sliding-mode", "lqr", "nominal", "oracle-state-lqr")
+CAUGHT = 0.05  # rad
+SEEDS, QUICK_SEEDS = 16, 4
+POINTS, QUICK_POINTS = (13, 11), (5, 5)  # of the grid: sideslip angles, yaw rates
+MOST = (0.45, 1.0)  # rad and rad/s, where the grid ends
+FIRST_SEED = 2**28
+
+_COMMON = {"base": "recovery", "initial_beta": 0.0, "initial_gamma": 0.0, "half_width": 1e6}
+CARS: dict[str, tuple[Contest, str]] = {
+    f"{car} at {kmh:g} km/h": (
+        Contest(
+            ENV_ID,
+            {
+                "vehicle": car,
+                "reference": reference,
+                "scenario": _COMMON | {"speed": kmh * KMH, "friction": friction},
+            },
+            car,
+        ),
+        kind,
+    )
+    for car, kmh, reference, friction, kind in (
+        ("passenger-car", 80.0, "limited", (0.6, 0.9), "car-yaw"),
+        ("coms", 40.0, "model", (0.7, 1.0), "coms-model"),
+    )
+}
+"""The contest of each car, and the class whose tuned options are used."""
+
+_TEXT = (
+    "The share of cars that are saved over the sideslip angle and yaw rate they start with: no "
+    f"failure within 5 s, and below {CAUGHT} rad at the end. Nobody steers; the yaw moment alone "
+    "acts. The seed draws tyres and friction. Filters start at zero, as after a cold start: they "
+    "have to find the slide first; oracle-state-lqr knows it. The clairvoyant's basin is not "
+    "shown: a plan of one start takes minutes."
+)
+
+
+@dataclass(frozen=True)
+class Case:
+    """A controller on a car of `CARS`, over a grid of so many points, on so many seeds."""
+
+    car: str
+    controller: str
+    points: tuple[int, int]
+    seeds: int
+
+
+def grid(points: tuple[int, int]) -> tuple[Array, Array]:
+    """Sideslip angles (rad) and yaw rates (rad/s) of the starts."""
+    beta, gamma = (np.linspace(-most, most, n) for most, n in zip(MOST, points, strict=True))
+    return beta, gamma
+
+
+def saved(case: Case) -> Array:
+    """(yaw rates, sideslip angles, seeds) 1 where the car was saved."""
+    contest, kind = CARS[case.car]
+    beta, gamma = grid(case.points)
+    starts = [(g, b) for g in gamma for b in beta]
+    scenario: Mapping[str, Any] = contest.env_options["scenario"]
+    v_x, each = scenario["speed"], range(case.seeds)
+    states = [{"v_y": v_x * math.tan(b), "gamma": g} for g, b in starts for _ in each]
+    seeds = [FIRST_SEED + i for i in each] * len(starts)
+    options = tuned(kind, case.controller)
+    env, agent = cars_of(contest, case.controller, options, len(states))
+    lost, last = np.zeros(len(states), np.bool_), np.zeros(len(states))
+    for step in steps_of(env, agent, seeds, {"state": states}):
+        lost |= step.running & (step.info["failure"] != 0)
+        last = np.where(step.running, step.info["beta"], last)
+    env.close()
+    shape = (len(gamma), len(beta), case.seeds)
+    return (~lost & (np.abs(last) < CAUGHT)).astype(float).reshape(shape)
+
+
+def run(quick: bool = False, jobs: int | None = None, console: Console | None = None) -> Suite:
+    """The maps of every controller on both cars; quick: a coarse grid and few seeds."""
+    points, seeds = (QUICK_POINTS, QUICK_SEEDS) if quick else (POINTS, SEEDS)
+    cases = [Case(car, name, points, seeds) for car in CARS for name in CONTROLLERS]
+    found = dict(zip(cases, run_cases(saved, cases, NAME, jobs, console), strict=True))
+    suite = Suite(NAME, "From where the car is still saved", _TEXT)
+    beta, gamma = (np.degrees(axis) for axis in grid(points))
+    for car in CARS:
+        mine = {case.controller: each for case, each in found.items() if case.car == car}
+        _tabled(suite, car, mine)
+        shares = {name: each.mean(axis=2) for name, each in mine.items()}
+        labels = ("sideslip angle / deg", "yaw rate / (deg/s)")
+        suite.maps.append(ShareMap(f"{car}: share of cars saved", beta, gamma, shares, *labels))
+    try:
+        from .report.heat_maps import share_maps
+    except ModuleNotFoundError:
+        return suite
+    text = "Colour: the share of seeds on which the car is saved; the line is at one half."
+    suite.figures = [(each.title, share_maps(each), text) for each in suite.maps]
+    return suite
+
+
+def _tabled(suite: Suite, car: str, mine: Mapping[str, Array]) -> None:
+    """A table and rows of a car; the seeds are what varies, the starts are the same for all."""
+    cells = []
+    shares = {name: each.mean(axis=(0, 1)) for name, each in mine.items()}
+    for name, share in shares.items():
+        number, more = interval(share), interval(share - shares["none"])
+        cells.append([name, *number.text(1e2, ".1f"), *more.text(1e2, ".1f")])
+        where = {"scenario": car, "controller": name, "n": len(share)}
+        common = {"suite": NAME, "salt": "fixed", "env_version": f"{ENV_ID} {__version__}"}
+        suite.rows.append(Row.of("saved_rate", number, **where, **common))
+    header = ("controller", "saved / %", "95 % interval", "above none / %", "95 % interval")
+    starts = next(iter(mine.values())).shape
+    note = (
+        f"Of {starts[0] * starts[1]} starts up to {np.degrees(MOST[0]):.0f} deg and "
+        f"{np.degrees(MOST[1]):.0f} deg/s, {starts[2]} seeds each; intervals over the seeds, "
+        "paired against none."
+    )
+    suite.tables.append(Table(car, header, cells, note))

@@ -1,0 +1,81 @@
+"""From where a car is saved: what is mapped, in which units, and that feedback saves more."""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sideslip.benchmarks import recovery
+from sideslip.benchmarks.picture import write_picture
+from sideslip.benchmarks.recovery import CARS, Case, grid, saved
+from sideslip.benchmarks.report.html import write_report
+
+CAR, COMS = CARS
+
+
+def test_feedback_saves_cars_that_nothing_saves() -> None:
+    """The uncontrolled COMS above its critical slip is lost in places where lqr catches it."""
+    points = (5, 5)
+    for car in CARS:
+        none, lqr = (saved(Case(car, name, points, 3)) for name in ("none", "lqr"))
+        assert none.shape == lqr.shape == (5, 5, 3)
+        assert none.mean() < lqr.mean(), car
+        assert (lqr[2, 2] == 1.0).all() and (none[2, 2] == 1.0).all()  # straight ahead, at rest
+
+
+def test_a_slide_that_turns_further_out_is_lost_and_one_that_turns_back_is_saved() -> None:
+    """beta' = ... - gamma: a yaw rate against the slip's sign makes it grow."""
+    found = saved(Case(CAR, "none", (3, 3), 4))
+    assert found[0, 2].max() == found[2, 0].max() == 0.0
+    assert found[2, 2].mean() > 0.0 and found[0, 0].mean() > 0.0
+
+
+def test_starts_are_what_the_axes_say(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[Any] = []
+
+    def steps(env: Any, agent: Any, seeds: list[int], options: dict[str, Any]) -> Any:
+        info = env.reset(seed=seeds, options=options)[1]
+        seen.extend([seeds, info["beta"], info["gamma"]])
+        return iter(())
+
+    monkeypatch.setattr(recovery, "steps_of", steps)
+    saved(Case(COMS, "none", (3, 2), 2))
+    seeds, beta, gamma = seen
+    assert seeds == [recovery.FIRST_SEED, recovery.FIRST_SEED + 1] * 6
+    betas, gammas = grid((3, 2))
+    np.testing.assert_allclose(beta.reshape(2, 3, 2)[1, :, 0], betas, atol=1e-9)
+    np.testing.assert_allclose(gamma.reshape(2, 3, 2)[:, 1, 1], gammas, atol=1e-9)
+
+
+def test_table_rows_maps_and_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recovery, "QUICK_POINTS", (3, 3))
+    monkeypatch.setattr(recovery, "QUICK_SEEDS", 2)
+    monkeypatch.setattr(recovery, "CONTROLLERS", ("none", "lqr"))
+    suite = recovery.run(quick=True, jobs=1)
+    assert [table.title for table in suite.tables] == list(CARS)
+    shares = {(row.scenario, row.controller): row for row in suite.rows}
+    assert set(shares) == {(car, name) for car in CARS for name in ("none", "lqr")}
+    assert all(0.0 <= row.low <= row.value <= row.high <= 1.0 for row in suite.rows)
+    for each in suite.maps:
+        assert "deg" in each.x_label and "deg/s" in each.y_label
+        assert each.x[-1] == pytest.approx(np.degrees(recovery.MOST[0]))
+        assert {share.shape for share in each.shares.values()} == {(3, 3)}
+    pytest.importorskip("matplotlib")
+    write_picture(tmp_path / "maps.png", [suite])
+    assert (tmp_path / "maps.png").read_bytes()[:4] == b"\x89PNG"
+    pytest.importorskip("plotly")
+    assert len(suite.figures) == len(CARS)
+    write_report(tmp_path / "report.html", [suite], "sideslip bench recovery", {})
+    assert "share of cars saved" in (tmp_path / "report.html").read_text()
+
+
+def test_without_plotly_the_tables_are_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "plotly", None)
+    monkeypatch.delitem(sys.modules, "sideslip.benchmarks.report.heat_maps", raising=False)
+    monkeypatch.setattr(recovery, "QUICK_POINTS", (1, 1))
+    monkeypatch.setattr(recovery, "QUICK_SEEDS", 1)
+    monkeypatch.setattr(recovery, "CONTROLLERS", ("none",))
+    suite = recovery.run(quick=True, jobs=1)
+    assert suite.figures == [] and len(suite.tables) == len(suite.maps) == 2
