@@ -18,7 +18,7 @@ import numpy.typing as npt
 from ...envs.record import PACKET_WIDTH
 from ...envs.sensors.slow import SLOW_NAMES
 
-CORE = 9  # states of a model
+CORE = 10  # states of a model
 INPUTS = 4  # that drive it
 FASTS = 3  # measurements of a fast row
 SLOW = len(SLOW_NAMES)  # sensors

@@ -53,7 +53,8 @@ def _write_accel(f: Memory, V: Any) -> None:
     for j in range(f.dense):
         row[j] = V * f.A[0, j]
     row[GAMMA] = V * (f.A[0, GAMMA] + 1.0)
-    row[f.dense] = V * f.B[0, INPUTS]
+    if f.pushed[0] >= 0:  # what comes first behind is no bias
+        row[f.dense] = V * f.B[0, INPUTS]
     if f.rolling > 0:
         row[f.rolling] += GRAVITY
     f.D_fast[f.accel_row, 0] = V * f.B[0, 0]

@@ -42,7 +42,7 @@ def assemble(
         own = slice(first, first + n)
         noise = config.noise, config.noise_over_speed
         write_model(f, model, vehicle, step, *noise, config.Q[own, own])
-        f.decay[f.dense : n - model.bias] *= math.exp(-config.leak * f.stride * dt)
+        f.decay[f.dense : n - len(model.biases)] *= math.exp(-config.leak * f.stride * dt)
         f.prior[:n, :n] = np.diag([config.prior[state] ** 2 for state in model.names])
         place_clones(f, config)
         f.measured, f.speed = int(speed is None), speed or 0.0
@@ -154,7 +154,7 @@ def _periodic(f: Memory, config: FilterConfig, random: bool) -> bool:
                 f"{config.sensors}"
             )
         return True
-    elif any(model.bias for model in config.models):
+    elif any(model.biases for model in config.models):
         impossible = "a constant bias has no settled gain"
     elif several or (random and not blind):
         impossible = "two slow sensors" if several else "random delay"

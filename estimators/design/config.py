@@ -17,7 +17,7 @@ from . import dual_rate
 from .checks import check_covariance
 from .kalman import INVERSES
 from .measurements import COURSE_SPEED, MEASUREMENTS
-from .models import DISTURBANCES, INERTIAL, MODELS, STATES, Model, bicycle_model
+from .models import BIASES, DISTURBANCES, INERTIAL, MODELS, STATES, Model, bicycle_model
 from .options import Options
 from .tunings import TUNINGS
 
@@ -64,6 +64,7 @@ class FilterConfig:
         gyro its body rolls: states phi and phi_rate.
     bias_sd: of the same ones, rad/s: above 0 (default) a state `bias`, a constant drawn with this
         deviation that the gyro measures on top of the yaw rate; with q_bias it walks.
+    accel_bias_sd: m/s2, likewise a state `accel_bias` of the lateral accelerometer.
     q_beta, q_gamma, ...: process noise of a state per second, (unit)^2/s; or Q, (n, n) or (n,)
         (default: of `tunings.toml`).
     gyro_noise (rad/s), psi_noise (rad), y_l_noise (m), course_noise (rad at every speed; default
@@ -119,8 +120,8 @@ def configure(
     read = Options(name, options)
     used = _slow_sensors(row, sensors, read)
     rules = _rules(row, used, read)
-    fast, bias_sd = _inertial(row, read)
-    models = _models(row, used, rules["delay"], fast, bias_sd > 0.0, read)
+    fast, biases = _inertial(row, read)
+    models = _models(row, used, rules["delay"], fast, tuple(biases), read)
     states = [state for model in models for state in model.names]
     if rules["poles"] and len(rules["poles"]) != len(states):
         raise read.wrong("poles", f"are one for each of {', '.join(states)}", rules["poles"])
@@ -139,7 +140,7 @@ def configure(
         satellites=read.number("satellites", SATELLITES),
         gate=_gate(read),
         adapt=read.number("adapt", 0.0, "is a share from 0 to 1", lambda v: 0.0 <= v < 1.0),
-        prior=_prior(states, noise, bias_sd, read),
+        prior=_prior(states, noise, biases, read),
         allow_unstable=bool(read.value("allow_unstable", False)),
     )
     read.done()
@@ -205,11 +206,17 @@ def _rules(row: Filter, used: Sequence[str], read: Options) -> dict[str, Any]:
     }
 
 
-def _inertial(row: Filter, read: Options) -> tuple[tuple[str, ...], float]:
-    """The fast sensors, and the standard deviation of the gyro's bias."""
+def _inertial(row: Filter, read: Options) -> tuple[tuple[str, ...], dict[str, float]]:
+    """The fast sensors, and the standard deviations of their biases by state."""
     if row.model != "bicycle" or row.gains != "covariance" or row.second:
-        return row.fast, 0.0
-    return read.some_of("fast", row.fast, INERTIAL), read.not_negative("bias_sd", "rad/s")
+        return row.fast, {}
+    fast = read.some_of("fast", row.fast, INERTIAL)
+    biases = {name: read.not_negative(f"{name}_sd", STATES[name].unit) for name in BIASES}
+    biases = {name: sd for name, sd in biases.items() if sd > 0.0}
+    for name in biases:
+        if BIASES[name] not in fast:
+            raise ValueError(f"{read.name}: {name}_sd needs {BIASES[name]} among fast, got {fast}")
+    return fast, biases
 
 
 def _models(
@@ -217,7 +224,7 @@ def _models(
     used: tuple[str, ...],
     delay: str,
     fast: tuple[str, ...],
-    bias: bool,
+    biases: tuple[str, ...],
     read: Options,
 ) -> tuple[Model, ...]:
     """The model of each layer."""
@@ -225,7 +232,7 @@ def _models(
         return (MODELS[row.model],)
     disturbances = read.one_of("disturbances", row.disturbances, DISTURBANCES)
     late, rolls = delay in ("literal", "lag"), fast != row.fast
-    first = bicycle_model(used, fast, disturbances, late, rolls, bias)
+    first = bicycle_model(used, fast, disturbances, late, rolls, biases)
     return (first, MODELS[row.second]) if row.second else (first,)
 
 
@@ -255,12 +262,11 @@ def _noise(forces: bool, read: Options) -> tuple[dict[str, float], dict[str, flo
 
 
 def _prior(
-    states: Sequence[str], noise: Mapping[str, float], bias_sd: float, read: Options
+    states: Sequence[str], noise: Mapping[str, float], biases: Mapping[str, float], read: Options
 ) -> dict[str, float]:
     """Standard deviations of all states at the start."""
-    found = {state: STATES[state].prior for state in states}
-    if "bias" in found:
-        found["bias"] = bias_sd
+    found: dict[str, float] = {state: STATES[state].prior for state in states}
+    found |= biases
     if "force" in noise:
         found |= {"F_d": noise["force"], "N_d": noise["moment"]}
     prior = read.value("prior", {})

@@ -51,6 +51,7 @@ STATES = {
     "F_d": State("N", 0.0, 1e5),
     "N_d": State("N m", 100.0, 1e5),
     "bias": State("rad/s", 0.0, 10.0),
+    "accel_bias": State("m/s2", 0.0, 50.0),
 }
 """All states of all models, by name."""
 FOREIGN_STATE = State("-", 0.0, 1e6)
@@ -63,8 +64,8 @@ class Model:
 
     kind: of `transition`. states: those that follow the model. disturbances: name of each state
     behind them and the state that it pushes, or, for "forces", an Ornstein-Uhlenbeck force and
-    moment. late: the states that lag behind the camera's (tie-vision (12)). bias: the last state is
-    a constant that the gyro measures on top. inputs, fast: names of `signals`.
+    moment. late: the states that lag behind the camera's (tie-vision (12)). biases: the last
+    states, of `BIASES`. inputs, fast: names of `signals`.
     """
 
     kind: int
@@ -74,18 +75,20 @@ class Model:
     disturbances: tuple[tuple[str, str], ...] = ()
     forces: bool = False
     late: tuple[str, ...] = ()
-    bias: bool = False
+    biases: tuple[str, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of all states."""
         behind = ("F_d", "N_d") if self.forces else tuple(name for name, _ in self.disturbances)
-        return self.states + self.late + behind + ("bias",) * self.bias
+        return self.states + self.late + behind + self.biases
 
 
 ORDER = ("beta", "gamma", "psi", "y_l")
 BODY = ("phi", "phi_rate")  # of a bicycle whose accelerometer or roll rate is measured
 INERTIAL = ("gyro", "accel_y", "roll_rate")  # the fast sensors of a bicycle, in their order
+BIASES = {"bias": "gyro", "accel_bias": "accel_y"}
+"""States that are constants, each measured on top by a fast sensor."""
 WALK = (("d1", "beta"), ("d2", "gamma"))  # dakf-stability (8)-(9), (14)
 WALK_ALL = (*WALK, ("d3", "psi"))  # dual-rate (4): one for every state of (37)
 DISTURBANCES = ("none", "walk", "walk-all", "forces")
@@ -136,19 +139,19 @@ def bicycle_model(
     disturbances: str,
     late: bool,
     body: bool = False,
-    bias: bool = False,
+    biases: tuple[str, ...] = (),
 ) -> Model:
     """The bicycle with what these slow sensors need.
 
     disturbances: of `DISTURBANCES`; "walk" has d_1 and d_2, "walk-all" every state's. late: the
-    camera measures states that lag (tie-vision (12)-(13)). body: it rolls. bias: of the gyro.
+    camera measures states that lag (tie-vision (12)-(13)). body: it rolls. biases: of `BIASES`.
     """
     walks = {"walk": WALK, "walk-all": WALK_ALL}.get(disturbances, ())
     states = states_for(sensors)
     lagging = tuple(_LATE[s] for s in states if s in _LATE) if late and "camera" in sensors else ()
     walks = tuple((name, state) for name, state in walks if state in states)
     forces, states = disturbances == "forces", states + BODY * body
-    return Model(LATERAL, states, ("steer", "N_z"), fast, walks, forces, lagging, bias)
+    return Model(LATERAL, states, ("steer", "N_z"), fast, walks, forces, lagging, biases)
 
 
 def write_model(
@@ -171,8 +174,7 @@ def write_model(
     f.forces = int(model.forces)
     for j, (_, pushed) in enumerate(model.disturbances):
         f.pushed[j] = names.index(pushed)
-    if model.bias:
-        f.pushed[n - 1 - dense] = -1
+    f.pushed[n - len(model.biases) - dense : n - dense] = -1
     f.rolling = names.index("phi") if model.kind == LATERAL and "phi" in names else 0
     f.car[:] = [getattr(vehicle, name) for name in Car._fields]
     body = roll(vehicle)
@@ -204,8 +206,8 @@ def _write_signals(f: Memory, model: Model, vehicle: Vehicle, noise: Mapping[str
         f.r_fast[i] = noise[name] ** 2
         if name in state_of:
             f.C_fast[i, names.index(state_of[name])] = 1.0
-    if model.bias:
-        f.C_fast[model.fast.index("gyro"), names.index("bias")] = 1.0
+    for bias in model.biases:
+        f.C_fast[model.fast.index(BIASES[bias]), names.index(bias)] = 1.0
     if model.kind == LATERAL and "accel_y" in model.fast:
         f.accel_row = model.fast.index("accel_y")
     if model.kind == FORCES:  # m a_y = F_yf + F_yr

@@ -37,7 +37,7 @@ def continuous(behind: Any, V: float, rolls: bool) -> Any:
         if name in ("F_d", "N_d"):
             to, push = (0, 1.0 / (COMS.mass * V)) if name == "F_d" else (1, 1.0 / COMS.yaw_inertia)
             rows[to, j] = push
-        elif name != "bias":
+        elif name not in ("bias", "accel_bias"):
             rows[PUSHED[name], j] = 1.0
     S = COMS.sprung_mass * COMS.roll_arm
     phi, phi_rate = np.eye(rows.shape[1])[4:6]
@@ -136,8 +136,9 @@ class Posterior:
                 through[:] = [models[speed][3] for speed in V]
             else:
                 rows[:, names.index({"gyro": "gamma", "roll_rate": "phi_rate"}[name])] = 1.0
-            if name == "gyro" and "bias" in names:
-                rows[:, -1] = 1.0
+            bias = {"gyro": "bias", "accel_y": "accel_bias"}.get(name)
+            if bias in names:
+                rows[:, names.index(bias)] = 1.0
             known = np.einsum("kn,kn->k", rows, self.mean) + np.einsum("ki,ki->k", through, acted)
             M.append(np.einsum("kn,knm->km", rows, self.T) / FAST_SD[name])
             b.append((record.fast[:, getattr(FAST, name)] - known) / FAST_SD[name])

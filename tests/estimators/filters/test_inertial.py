@@ -103,6 +103,17 @@ def test_the_accelerometer_halves_the_error_of_beta(scenario: str) -> None:
     assert errors[1] < 0.5 * errors[0], errors
 
 
+def test_an_accelerometers_bias_is_no_sideslip_to_the_filter_that_has_a_state_for_it() -> None:
+    """A bias of 0.3 m/s2 costs a filter that believes its accelerometer most of its accuracy."""
+    scenario = {"base": "random-steering", "duration": 6.0, "noise": {"accel_y_bias": 0.3}}
+    errors = []
+    for more in ({}, {"accel_bias_sd": 0.3}):
+        options: Any = {"slow": ["camera", "gps"], "fast": ["gyro", "accel_y"], **more}
+        beta, found = drive(scenario, 24, 600, "exact-kf", **options)
+        errors.append(np.median(np.sqrt(np.mean((found - beta)[200:] ** 2, 0))))
+    assert errors[1] < 0.5 * errors[0], errors
+
+
 def test_all_states_are_outputs_and_a_row_has_the_bits_of_a_single_env() -> None:
     one = EstimateObservation(gym.make(FUSION), "exact-kf", outputs=STATES, options=ALL)
     many = vector.EstimateObservation(
@@ -135,6 +146,7 @@ def test_a_constant_bias_is_seen_and_no_warning_is_about_it(recwarn: Any) -> Non
         ("exact-kf", {"fast": ["gyro", "lidar"]}, ValueError, "got .*'lidar'"),
         ("exact-kf", {"fast": ["gyro", "gyro"]}, ValueError, "fast is"),
         ("exact-kf", {"bias_sd": -1.0}, ValueError, "bias_sd is in rad/s and not negative"),
+        ("exact-kf", {"accel_bias_sd": 0.1}, ValueError, "accel_bias_sd needs accel_y among fast"),
         ("exact-kf", {"bias_sd": 0.1, "gains": "periodic"}, ValueError, "no settled gain"),
         ("multirate-kf", {"fast": INERTIAL}, TypeError, "no option 'fast'"),
     ],
