@@ -29,6 +29,7 @@ class Fast(NamedTuple):
     torque_right: int = 8  # N m, applied
     steer_command: int = 9  # rad, the driver's
     accel_command: int = 10  # m/s2, the driver's
+    curvature: int = 11  # 1/m, the road's at the car, as a lane's polynomial or a map has it
 
 
 class Packet(NamedTuple):
@@ -45,6 +46,7 @@ class Packet(NamedTuple):
 FAST, PACKET = Fast(), Packet()
 FAST_UNITS = (
     "rad/s", "m/s2", "m/s2", "rad/s", "m/s", "m/s", "rad", "N m", "N m", "rad", "m/s2",
+    "1/m",
 )  # fmt: skip
 FAST_WIDTH = len(FAST)
 PACKET_WIDTH = PACKET.value + VALUES

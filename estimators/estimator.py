@@ -70,7 +70,8 @@ class Estimator:
         """The fast columns that a record must have."""
         read = {int(c) for f in self.filters for c in f.u_column[: f.inputs, 0]}
         read |= {int(c) for f in self.filters for c in f.y_column[: f.fasts, 0]}
-        read -= {FAST.torque_left, FAST.torque_right}  # a log without them had no yaw moment
+        # a log without them had no yaw moment and a straight road
+        read -= {FAST.torque_left, FAST.torque_right, FAST.curvature}
         if any(f.kind in (KINEMATIC, VELOCITY_ROLL) for f in self.filters):
             read.add(FAST.gyro)
         if self._f.measured and (self._f.kind == LATERAL or self._f.speed_state >= 0):

@@ -13,7 +13,8 @@ from ...envs.engine.layout import Drive, P, Task, Z
 from ...envs.engine.step import kind_of, step_vehicle
 from ...envs.engine.tick import Kind
 from ...envs.engine.window import window_of
-from ...envs.scenarios.speed import Pace, acceleration_command
+from ...envs.scenarios.roads import NOMINAL_PATH, Lead, laid_by
+from ...envs.scenarios.speed import Pace, acceleration_command, wanted_motion
 from ...envs.scenarios.steering import steering_at
 from ...envs.scenarios.wind import wind_at
 from ...envs.task.info import REPORT
@@ -42,6 +43,7 @@ class Known(NamedTuple):
     mu_r: Any
     speed: Any  # m/s, the driver's set point
     ahead: Any  # m/s2, the driver's acceleration, fed forward
+    turn: Any  # rad/s, of a road that is laid tick by tick
     weight: Any  # s for which the cost rate at the start counts
     beta_ref: Any  # rad, of a reference with a memory; of the step's start
     gamma_ref: Any  # rad/s
@@ -228,6 +230,7 @@ def _known(p: Array, fixed: Fixed, drive: Array, command: Array, refs: Array) ->
         *tyres,
         *(np.full(len(at), value) for value in (car.mu, car.mu_r)),
         *pace.T,
+        _turns(p, fixed.kind, command[:last]).reshape(-1, q).mean(axis=1),
         _weights(at, fixed),
         *refs[at].T,
     )
@@ -239,6 +242,17 @@ def _known(p: Array, fixed: Fixed, drive: Array, command: Array, refs: Array) ->
         0.5 * (q + 1) * TICK if last == fixed.task.duration else 0.0
     )
     return np.hstack([known, end])
+
+
+def _turns(p: Array, kind: Kind, command: Array) -> Array:
+    """(ticks,) rad/s, by how much the road turns in each tick, where a nominal car lays it."""
+    turns, lead = np.zeros(len(command)), Lead(0.0, 0.0)
+    if kind.road == NOMINAL_PATH:
+        pace, leader = read(p, P.pace), read(p, P.leader)
+        wanted, laid = plain(wanted_motion), plain(laid_by)
+        for tick, steer in enumerate(command):
+            turns[tick], lead = laid(lead, steer, wanted(float(tick), pace)[0], leader)
+    return turns
 
 
 def _set_point(tick: float, pace: Pace) -> tuple[float, float]:

@@ -7,6 +7,7 @@ import casadi as ca
 from ...envs.backend.on_casadi import SYMBOLS, symbolic
 from ...envs.backend.rebuild import plain
 from ...envs.engine.tick import load_at, torques
+from ...envs.scenarios.roads import NOMINAL_PATH
 from ...envs.task.cost import cost_rate
 from ...envs.task.reference import LAGGED, reference
 from ...envs.ticks import TICK
@@ -74,7 +75,9 @@ def advance(fixed: Fixed, x: State, action: Any, known: Known) -> Step:
     moved = slewing - x.slewing if fixed.width > 1 else 0.0
     # the angle moves at its full rate and then rests: its mean over the step
     extra = slewing - moved * ca.fabs(moved) / (2.0 * q * task.slew)
-    motor, steering = fixed.motor, fixed.steering
+    motor, steering, road = fixed.motor, fixed.steering, fixed.road
+    if kind.road == NOMINAL_PATH:
+        road = road._replace(turn=known.turn)
     loads = tuple(
         _load_at(angle + _lagged(extra, x.added, rest), T_l, T_r, x, motor_rest, car, kind)
         for angle, rest, motor_rest in (
@@ -88,7 +91,7 @@ def advance(fixed: Fixed, x: State, action: Any, known: Known) -> Step:
         loads,
         Push(known.F_d, known.N_d, known.N_x),
         car,
-        fixed.road,
+        road,
         q * TICK,
         kind.small_angle,
         kind.law,

@@ -17,7 +17,9 @@ from .packets import read_packed, write_packed
 from .step import State
 
 Tensor = torch.Tensor
-_MOTION, _DRIVE, _REFS = (slice(part[0], part[-1] + 1) for part in (Z.motion, Z.drive, Z.refs))
+_MOTION, _DRIVE, _REFS, _LEAD = (
+    slice(part[0], part[-1] + 1) for part in (Z.motion, Z.drive, Z.refs, Z.lead)
+)
 
 
 def device_of(device: Any) -> torch.device:
@@ -102,6 +104,7 @@ def state_of(
         whole[_DRIVE],
         whole[Z.driver],
         whole[_REFS],
+        whole[_LEAD],
         whole[Z.clock.tick],
         whole[Z.clock.failure],
         *slow_state,
@@ -121,6 +124,7 @@ def write_states(state: State, states: Array) -> None:
     whole[_DRIVE] = here.drive
     whole[Z.driver] = here.driver
     whole[_REFS] = here.refs
+    whole[_LEAD] = here.lead
     whole[Z.clock.tick] = here.tick
     whole[Z.clock.failure] = here.failure
     write_packed(here.slow_state, whole)

@@ -25,6 +25,7 @@ class State(NamedTuple):
     drive: Tensor  # (len(Drive), N)
     driver: Tensor  # (N,)
     refs: Tensor  # (2, N)
+    lead: Tensor  # (len(Lead), N)
     tick: Tensor
     failure: Tensor
     slow: Tensor  # the fields of `SlowState`
@@ -90,7 +91,8 @@ class Step:
         shares = self._clip(torch.where(finite[:, None], actions, 0.0), -1.0, 1.0)
         turn = shares[:, 1] if actions.shape[1] > 1 else torch.zeros_like(state.tick)
         running = finite & ~state.over
-        start = start_of(state.motion, state.drive, state.driver, state.refs, state.tick, running)
+        where = state.motion, state.drive, state.driver, state.refs, state.lead, state.tick
+        start = start_of(*where, running)
         now, rows, track = self._ticks.drive_on(p, keys, start, shares[:, 0], turn, self._n)
         refused = ~finite & ~state.over
         after: State
@@ -127,6 +129,7 @@ class Step:
             torch.stack(now.drive),
             now.driver,
             torch.stack(now.refs),
+            torch.stack(now.lead),
             now.tick,
             failure,
             *slow_state,

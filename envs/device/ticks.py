@@ -13,11 +13,12 @@ from ..backend.primitives import select
 from ..backend.random import CHANNELS, normals
 from ..engine.layout import Drive, P
 from ..engine.step import fixed_of
-from ..engine.tick import Kind, Moving, advance, changed, failure_of
+from ..engine.tick import Kind, Moving, advance, changed
 from ..record import FAST_WIDTH
+from ..scenarios.roads import Lead
 from ..scenarios.steering import steering_at
 from ..sensors.inertial import Chance
-from ..task.failures import RUNNING
+from ..task.failures import RUNNING, failure_of
 from ..ticks import TICK
 from ..vehicle.dynamics import Motion
 
@@ -43,6 +44,7 @@ class Now(NamedTuple):
     drive: Numbers
     driver: Tensor
     refs: Numbers
+    lead: Numbers
     tick: Tensor
     failure: Tensor  # codes as floats
     cost: Tensor
@@ -87,8 +89,8 @@ class Ticks:
         task = fixed.task
         car = self._changed(fixed.car, fixed.change, now.tick > fixed.change.tick)
         # the load at the tick's start is computed anew where `anywhere` holds, and here it does
-        motion, drive = Motion(*now.motion), Drive(*now.drive)
-        before = Moving(motion, drive, None, now.driver, car, now.refs)
+        motion, drive, lead = Motion(*now.motion), Drive(*now.drive), Lead(*now.lead)
+        before = Moving(motion, drive, None, now.driver, car, now.refs, lead)
         after, seen = self._advance(
             fixed,
             share * task.yaw_scale,
@@ -114,6 +116,7 @@ class Ticks:
             chosen(alive, after.drive, now.drive),
             pick(alive, after.driver, now.driver),
             chosen(alive, refs, now.refs),
+            chosen(alive, after.lead, now.lead),
             tick,
             pick(alive, failure, now.failure),
             now.cost + pick(alive, seen.cost * TICK, 0.0),
@@ -139,7 +142,13 @@ class Ticks:
 
 
 def start_of(
-    motion: Tensor, drive: Tensor, driver: Tensor, refs: Tensor, tick: Tensor, alive: Tensor
+    motion: Tensor,
+    drive: Tensor,
+    driver: Tensor,
+    refs: Tensor,
+    lead: Tensor,
+    tick: Tensor,
+    alive: Tensor,
 ) -> Now:
     """Where rows are at the start of an env-step."""
     zeros = tick.new_zeros((2 + len(Shown._fields) + FAST_WIDTH, len(tick)))
@@ -152,6 +161,7 @@ def start_of(
         drive.unbind(0),
         driver,
         refs.unbind(0),
+        lead.unbind(0),
         tick,
         failure,
         cost,

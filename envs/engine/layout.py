@@ -10,6 +10,7 @@ from typing import Annotated, Any, NamedTuple
 from ..backend.arrays import offsets
 from ..record import PACKET_WIDTH
 from ..scenarios.driver import Driver
+from ..scenarios.roads import Bicycle, Lead
 from ..scenarios.speed import Pace
 from ..scenarios.steering import STEERING_WIDTH
 from ..scenarios.tracks import Path
@@ -112,6 +113,7 @@ class Params(NamedTuple):
     path: Path
     change: Change
     sight: View  # of the camera
+    leader: Bicycle  # nominal, which lays the road
 
 
 class State(NamedTuple):
@@ -122,6 +124,7 @@ class State(NamedTuple):
     drive: Drive
     clock: Clock
     refs: Annotated[tuple[Any, ...], 2]  # rad, rad/s, the references of beta and gamma
+    lead: Lead  # the nominal car where it lays the road
     slow: Annotated[tuple[Slow, ...], len(SLOW)]
     queue: Annotated[Any, len(SLOW) * IN_FLIGHT * PACKET_WIDTH]  # packets, columns as in `Packet`
     driver: Any  # rad, the driver's steering command
@@ -142,6 +145,7 @@ class Switches(NamedTuple):
     all_samples: int  # the observation holds every fast sample
     fail_bad: int  # a non-finite action ends the episode instead of being refused
     roll: int  # the body rolls
+    road: int  # of `scenarios.roads.ROADS`
 
 
 FLAGS, _ = offsets(Switches)

@@ -9,6 +9,7 @@ import numpy as np
 from ..arguments import brief, check_choice
 from ..record import Array
 from ..scenarios.driver import Driver
+from ..scenarios.roads import ROADS, bicycle_of
 from ..scenarios.scenario import Scenario
 from ..scenarios.speed import Pace
 from ..scenarios.steering import STEERING_KINDS, STEERING_WIDTH
@@ -186,6 +187,7 @@ def episode_config(
         path=path_of(scenario.path, vehicle.width),
         change=Change(FOREVER, 1.0, 1.0),  # drawn
         sight=View(scenario.camera_heading, scenario.camera_offset),
+        leader=bicycle_of(nominal),
     )
     switches = Switches(
         small_angle=int(scenario.small_angle),
@@ -195,6 +197,7 @@ def episode_config(
         all_samples=int(all_samples),
         fail_bad=int(fail_bad),
         roll=int(scenario.roll),
+        road=ROADS.index(scenario.road),
     )
     low, high = scenario.draws()
     start = Start(

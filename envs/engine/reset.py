@@ -18,7 +18,7 @@ from ..sensors.slow import GPS, first_drift
 from ..task.info import REPORT
 from ..task.reference import reference
 from ..ticks import FOREVER, NEVER, whole_ticks
-from ..vehicle.dynamics import gravity_at, sideslip_angle
+from ..vehicle.dynamics import curvature_beside, gravity_at, sideslip_angle
 from ..vehicle.vehicle import GRAVITY
 from .arrays import Row, Start
 from .layout import FLAGS, STATE_WIDTH, P, Z
@@ -118,7 +118,7 @@ def reset_vehicle(start: Start, key_low: int, key_high: int, bounds: Any, row: R
     beta = sideslip_angle(motion.v_x, motion.v_y, small_angle)
     fast = normals(key_low, key_high, 0, CHANNELS.inertial)
     wheels = normals(key_low, key_high, 0, CHANNELS.wheels)
-    acted = (steer, 0.0, 0.0, steer, 0.0)
+    acted = (steer, 0.0, 0.0, steer, 0.0, curvature_beside(motion, road))
     g_x, g_y = gravity_at(motion, road, small_angle)
     accel = (g_x, g_y + GRAVITY * motion.phi)
     chance, noise = Chance(fast, wheels), read(p, P.noise)

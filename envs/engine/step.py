@@ -18,7 +18,7 @@ from ..backend.primitives import anywhere, select
 from ..record import FAST
 from ..scenarios.steering import DRIVER
 from ..task.cost import rest_of_cost
-from ..task.failures import BAD_ACTION, REFUSED, RUNNING
+from ..task.failures import BAD_ACTION, REFUSED, RUNNING, failure_of
 from ..task.info import REPORT
 from ..ticks import TICK
 from ..vehicle.tyres import shifts
@@ -26,7 +26,7 @@ from .arrays import Row
 from .layout import FLAGS, P, Z
 from .observe import observe, write_report
 from .packets import due, sense_slow
-from .tick import Fixed, Kind, Moving, Seen, advance, changed, failure_of, standing_load
+from .tick import Fixed, Kind, Moving, Seen, advance, changed, standing_load
 from .window import WINDOW, chance_at, foresee
 
 
@@ -47,6 +47,7 @@ def fixed_of(p: Any) -> Fixed:
         person=read(p, P.driver),
         path=read(p, P.path),
         change=read(p, P.change),
+        leader=read(p, P.leader),
     )
 
 
@@ -57,7 +58,16 @@ def kind_of(p: Any, switches: Any) -> Kind:
     lag = int(p[P.motor.start] > 0.0) + int(p[P.steering.start] > 0.0)
     follows = int(flags.steering == DRIVER)
     shifting = shifts(flags.small_angle, flags.law, flags.roll)
-    return Kind(flags.small_angle, flags.law, flags.reference, flags.roll, follows, lag, shifting)
+    return Kind(
+        flags.small_angle,
+        flags.law,
+        flags.reference,
+        flags.roll,
+        follows,
+        lag,
+        shifting,
+        flags.road,
+    )
 
 
 @jit
@@ -83,8 +93,8 @@ def drive_on(
     fixed = fixed_of(p)
     motion, drive, tick = read(z, Z.motion), read(z, Z.drive), at(z, Z.clock.tick)
     car = changed(fixed.car, fixed.change, tick > fixed.change.tick)
-    load, refs = standing_load(drive, car, kind), read(z, Z.refs)
-    now = Moving(motion, drive, load, at(z, Z.driver), car, refs)
+    load, refs, lead = standing_load(drive, car, kind), read(z, Z.refs), read(z, Z.lead)
+    now = Moving(motion, drive, load, at(z, Z.driver), car, refs, lead)
     task = fixed.task
     N_z, added = share * task.yaw_scale, turn * task.authority
     cost = 0.0 * N_z
@@ -126,6 +136,7 @@ def write_end(
     write(z, now.drive, Z.drive)
     put(z, now.driver, Z.driver)
     write(z, refs, Z.refs)
+    write(z, now.lead, Z.lead)
     put(z, tick, Z.clock.tick)
     failure = failure_of(seen)
     put(z, failure, Z.clock.failure)

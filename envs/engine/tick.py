@@ -10,23 +10,16 @@ from ..backend.decorators import inlined, jit
 from ..backend.primitives import absolute, anywhere, select
 from ..record import FAST
 from ..scenarios.driver import steered
-from ..scenarios.speed import acceleration_command
+from ..scenarios.roads import NOMINAL_PATH, Lead, laid_by
+from ..scenarios.speed import acceleration_command, wanted_motion
 from ..scenarios.tracks import path_offset
 from ..scenarios.wind import wind_at
 from ..sensors.inertial import Chance, fast_row, specific_force
 from ..task.cost import cost_rate
-from ..task.failures import NOT_FINITE, OFF_ROAD, RUNNING, SPIN
 from ..task.reference import followed, reference
 from ..ticks import TICK
-from ..vehicle.actuators import (
-    distribute,
-    lagged,
-    slewed,
-    torque_limit,
-    within_stop,
-    yaw_moment,
-)
-from ..vehicle.dynamics import Car, Push, rk4, sideslip_angle
+from ..vehicle.actuators import distribute, lagged, slewed, torque_limit, within_stop, yaw_moment
+from ..vehicle.dynamics import Car, Push, Road, curvature_beside, rk4, sideslip_angle
 from ..vehicle.tyres import Inputs, load_of
 from .layout import Drive
 
@@ -43,6 +36,7 @@ class Kind(NamedTuple):
     follows: int  # the driver reacts to the car
     lag: int  # how many of motors and steering lag
     shifting: int  # `tyres.shifts`
+    road: int  # of `scenarios.roads.ROADS`
 
 
 class Fixed(NamedTuple):
@@ -61,6 +55,7 @@ class Fixed(NamedTuple):
     person: Any
     path: Any
     change: Any
+    leader: Any
 
 
 class Moving(NamedTuple):
@@ -72,16 +67,18 @@ class Moving(NamedTuple):
     driver: Any  # rad, the driver's steering command
     car: Any  # with its tyres as they are now
     refs: Any  # rad, rad/s, the references of beta and gamma
+    lead: Any  # the nominal car that lays the road
 
 
 class Acted(NamedTuple):
-    """Actuators during a tick, means; the first five are columns of `Fast`, from `steer` on."""
+    """What acts during a tick, means; the first six are columns of `Fast`, from `steer` on."""
 
     steer: Any  # rad, front wheels
     T_l: Any  # N m
     T_r: Any
     driver: Any  # rad, the driver's command
     a_x: Any  # m/s2, the driver's command
+    curvature: Any  # 1/m, the road's at the car
     added: Any  # rad, the part of steer that was added to the driver's
     moment: Any  # N m, yaw moment of both motors
     effort: Any  # its share of full scale
@@ -154,7 +151,17 @@ def _at_change(fixed: Fixed, now: Moving, tick: Any, kind: Kind) -> Moving:
     if anywhere(here):
         car = changed(car, fixed.change, here)
         start = standing_load(now.drive, car, kind)
-    return Moving(now.motion, now.drive, start, now.driver, car, now.refs)
+    return Moving(now.motion, now.drive, start, now.driver, car, now.refs, now.lead)
+
+
+@inlined
+def _road_laid(fixed: Fixed, now: Moving, tick: Any) -> tuple[Fixed, Lead]:
+    """(the parameters with the road as it turns during the tick, the nominal car at its end)."""
+    speed, _ = wanted_motion(tick, fixed.pace)
+    turn, lead = laid_by(now.lead, now.driver, speed, fixed.leader)
+    road, turns = fixed.road, (turn,)
+    laid = (Road(*(road[:5] + turns)),)
+    return Fixed(*(fixed[:1] + laid + fixed[2:])), lead
 
 
 @inlined
@@ -177,6 +184,7 @@ def command(fixed: Fixed, N_z: Any, turn: Any, now: Moving, tick: Any, chance: C
         right,
         driver,
         a_x,
+        curvature_beside(now.motion, fixed.road),
         lagged(extra, drive.added, steering.mean),
         moment,
         moment * (1.0 / task.yaw_scale),
@@ -278,18 +286,13 @@ def advance(
     reacts to the car.
     """
     small_angle, law, roll = kind.small_angle, kind.law, kind.roll
-    now = _at_change(fixed, now, tick, kind)
+    now, lead = _at_change(fixed, now, tick, kind), now.lead
+    if kind.road == NOMINAL_PATH:
+        fixed, lead = _road_laid(fixed, now, tick)
     control = command(fixed, N_z, turn, now, tick, chance)
     loads = _loads(fixed, control, now, kind)
     before, car, road = now.motion, now.car, fixed.road
     motion = rk4(before, loads, control.push, car, road, TICK, small_angle, law, roll)
     accel = specific_force(before, motion, road, small_angle, roll)
     driver, seen = sense(fixed, motion, accel, control.acted, now.refs, ahead, chance, kind)
-    return Moving(motion, control.drive, loads[2], driver, car, seen.refs), seen
-
-
-@jit
-def failure_of(seen: Seen) -> Any:
-    """The failure's code, as a float."""
-    failure = select(seen.spun, SPIN * 1.0, select(seen.off, OFF_ROAD * 1.0, RUNNING * 1.0))
-    return select(seen.lost, NOT_FINITE * 1.0, failure)
+    return Moving(motion, control.drive, loads[2], driver, car, seen.refs, lead), seen

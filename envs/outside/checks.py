@@ -11,6 +11,7 @@ CRAWL = 1.0  # m/s: the multi-body model's least speed; below 0.1 it freezes whi
 
 # Fields of a scenario that change our own plant or its road: only their defaults will do.
 _OURS = (
+    "road",
     "curvature",
     "bank",
     "grade",

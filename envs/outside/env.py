@@ -114,7 +114,8 @@ class OutsideEnv(StabilityEnv):
         """`step.drive_on` whose motion is the outside plant's; returns the ticks done."""
         z, plant, task = self._state, self.plant, fixed.task
         motion, drive, refs = read(z, Z.motion), read(z, Z.drive), read(z, Z.refs)
-        now = Moving(motion, drive, None, float(z[Z.driver]), fixed.car, refs)
+        lead = read(z, Z.lead)
+        now = Moving(motion, drive, None, float(z[Z.driver]), fixed.car, refs, lead)
         tick, cost, done, over = float(z[Z.clock.tick]), 0.0, 0, False
         N_z, added = share * task.yaw_scale, turn * task.authority
         while not over:
@@ -130,7 +131,7 @@ class OutsideEnv(StabilityEnv):
             ahead = at(self._window, WINDOW.ahead, done)
             driver, seen = _sense(fixed, motion, force, acted, now.refs, ahead, chance, kind)
             seen = seen._replace(lost=not plant.finite)
-            now = Moving(motion, control.drive, None, driver, now.car, seen.refs)
+            now = Moving(motion, control.drive, None, driver, now.car, seen.refs, lead)
             write(self.rows[done], seen.row, FAST)
             write(self._window, motion, WINDOW.track, done)
             tick, cost, done = tick + 1.0, cost + seen.cost * TICK, done + 1

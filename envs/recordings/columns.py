@@ -21,6 +21,7 @@ _ACCELERATION = {"mps2": 1.0, "g": GRAVITY}
 _LENGTH = {"m": 1.0}
 _TORQUE = {"nm": 1.0}
 _NUMBER = {"count": 1.0}
+_CURVATURE = {"radpm": 1.0}
 
 COLUMNS: dict[str, dict[str, float]] = {
     "time": {"s": 1.0, "ms": 1e-3},
@@ -38,6 +39,7 @@ COLUMNS: dict[str, dict[str, float]] = {
     "torque_right": _TORQUE,
     "steer_command": _ANGLE,
     "accel_command": _ACCELERATION,
+    "curvature": _CURVATURE,
     "course": _ANGLE,
     "gps_speed": _SPEED,
     "gps_x": _LENGTH,

@@ -25,7 +25,7 @@ _SAMPLED = {  # column of the record: quantity of the log
     "wheel_left": "wheel_left",
     "wheel_right": "wheel_right",
 }
-_INPUTS = ("steer", "torque_left", "torque_right", "steer_command", "accel_command")
+_INPUTS = ("steer", "torque_left", "torque_right", "steer_command", "accel_command", "curvature")
 _SLOW = {  # the values of a packet, as in SLOW_VALUES; the first tells where there is a sample
     "camera": ("camera_psi", "camera_y_l"),
     "gps": ("course", "gps_speed", "gps_x", "gps_y", "gps_hdop", "gps_satellites"),

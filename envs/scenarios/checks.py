@@ -10,6 +10,7 @@ from ..sensors.noise import Noise
 from ..ticks import TICK
 from ..vehicle.tyres import TYRE_LAWS
 from .draws import Draws, range_of
+from .roads import ROADS
 from .steering import STEERING_KINDS
 from .tracks import PATHS
 
@@ -24,6 +25,7 @@ TIER_NAMES = ("", "1", "2a", "2b", "2c")
 _CHOICES = {
     "steering": STEERING_KINDS,
     "path": PATHS,
+    "road": ROADS,
     "hdop_law": HDOP_LAWS,
     "tyres": TYRE_LAWS,
     "tier": TIER_NAMES,
@@ -111,6 +113,10 @@ def _check_names(fields: Fields) -> None:
         raise ValueError(
             f"path {fields['path']!r} needs the steering 'driver', got {fields['steering']!r}"
         )
+    if fields["road"] == "nominal-path" and fields["steering"] == "driver":
+        raise ValueError("road 'nominal-path' follows a programme's steering, not a driver's")
+    if fields["road"] == "nominal-path" and range_of(fields["curvature"]) != (0.0, 0.0):
+        raise ValueError(f"road 'nominal-path' has no curvature, got {fields['curvature']!r}")
     if fields["path_speed"] is not None and fields["path"] == "road":
         raise ValueError("path_speed needs a track as path; a road has no lengths to scale")
 

@@ -44,6 +44,9 @@ class Scenario:
     Surroundings: friction is the road's and replaces the vehicle's; friction_right, if given, is
     that under the right wheels. curvature, bank (rad, left side up) and grade (rad, uphill) come
     in from curve_start over curve_ramp metres; a negative curve_start has them from the beginning.
+    road: "straight", or "nominal-path", which bends as the nominal linear car would drive the
+    programme's steering at the speed that the driver wants (`roads.py`); its camera reports y_l
+    without that bend.
     wind_*: a side wind, wind_arm ahead of the centre of gravity and wind_height above the roll
     axis. disturbance_*: an Ornstein-Uhlenbeck force and moment.
 
@@ -109,6 +112,7 @@ class Scenario:
     disturbance_force: float = 50.0
     disturbance_moment: float = 20.0
     disturbance_time: float = 0.3
+    road: str = "straight"
     curvature: Range = 0.0
     curve_start: float = 20.0
     curve_ramp: float = 20.0

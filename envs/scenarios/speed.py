@@ -23,12 +23,8 @@ class Pace(NamedTuple):
 
 
 @inlined
-def acceleration_command(tick: Any, v_x: Any, integral: Any, pace: Any, limit: Any) -> Any:
-    """(a_x command in m/s2, next integral): PI on the speed with the integral held at the limit.
-
-    The wanted speed starts at `pace.speed` and is the integral of the wanted acceleration, which
-    is fed forward.
-    """
+def wanted_motion(tick: Any, pace: Any) -> Any:
+    """(speed in m/s, acceleration in m/s2) that the driver wants at a tick."""
     ahead = select((tick >= pace.start) & (tick < pace.end), pace.acceleration, 0.0)
     since = (minimum(maximum(tick, pace.start), pace.end) - pace.start) * TICK
     speed = pace.speed + pace.acceleration * since
@@ -36,6 +32,17 @@ def acceleration_command(tick: Any, v_x: Any, integral: Any, pace: Any, limit: A
         s, c = sincos(pace.surge_rate * (tick * TICK))
         ahead = ahead + pace.surge * s
         speed = speed + pace.surge / pace.surge_rate * (1.0 - c)
+    return speed, ahead
+
+
+@inlined
+def acceleration_command(tick: Any, v_x: Any, integral: Any, pace: Any, limit: Any) -> Any:
+    """(a_x command in m/s2, next integral): PI on the speed with the integral held at the limit.
+
+    The wanted speed starts at `pace.speed` and is the integral of the wanted acceleration, which
+    is fed forward.
+    """
+    speed, ahead = wanted_motion(tick, pace)
     error = speed - v_x
     wanted = pace.k_p * error + integral + pace.hold * ahead
     held = minimum(maximum(wanted, 0.0 - limit), limit)

@@ -53,4 +53,5 @@ def fast_row(motion: Any, accel: Any, acted: Any, d_f: Any, noise: Any, chance: 
         acted[2],
         acted[3],
         acted[4],
+        acted[5],
     )

@@ -71,6 +71,7 @@ class Road(NamedTuple):
     ramp: Any  # m, positive
     across: Any = 0.0  # m/s2, g sin(bank), left side up positive
     along: Any = 0.0  # m/s2, g sin(grade), uphill positive
+    turn: Any = 0.0  # rad/s, of its direction beside the car: of a road laid tick by tick
 
 
 @jit
@@ -82,6 +83,15 @@ def _ramped(road: Any, s: Any) -> Any:
 def curvature_at(road: Any, s: Any) -> Any:
     """Curvature of the road in 1/m at the distance s."""
     return road.curvature * _ramped(road, s)
+
+
+@jit
+def curvature_beside(motion: Any, road: Any) -> Any:
+    """Curvature of the road in 1/m at the car: by how much its direction turns in a metre."""
+    kappa = curvature_at(road, motion.s)
+    if anywhere(road.turn != 0.0):
+        kappa = kappa + road.turn / maximum(motion.v_x, 1.0)
+    return kappa
 
 
 @inlined
@@ -183,10 +193,11 @@ def derivative(
         dgamma = (car.l_f * F_yf - car.l_r * F_yr + N_z + push.N_d) * per_I  # (2)
         dY = v_x * motion.psi + v_y  # tie-vision (5), V_x (psi + beta)
         dy = v_x * (motion.psi - motion.theta) + v_y
-        return Motion(dv_x, dv_y, dgamma, gamma, v_x, dY, v_x, dy, v_x * kappa, phi_dot, phi_ddot)
+        turns = v_x * kappa + road.turn
+        return Motion(dv_x, dv_y, dgamma, gamma, v_x, dY, v_x, dy, turns, phi_dot, phi_ddot)
     turn, g_x, g_y = 0.0, 0.0, 0.0
     s_t, c_t = frame.sin_t, frame.cos_t
-    if anywhere(road.curvature != 0.0):
+    if anywhere((road.curvature != 0.0) | (road.turn != 0.0)):
         turn = motion.theta - frame.theta
         s_t, c_t = _turned(s_t, c_t, turn)
     s_r, c_r = _turned(frame.sin_r, frame.cos_r, motion.psi - frame.psi - turn)
@@ -209,7 +220,8 @@ def derivative(
         ds = along / maximum(1.0 - kappa * motion.y, 0.1)
     dX = along * c_t - across * s_t
     dY = along * s_t + across * c_t
-    return Motion(dv_x, dv_y, dgamma, gamma, dX, dY, ds, across, ds * kappa, phi_dot, phi_ddot)
+    turns = ds * kappa + road.turn
+    return Motion(dv_x, dv_y, dgamma, gamma, dX, dY, ds, across, turns, phi_dot, phi_ddot)
 
 
 @jit

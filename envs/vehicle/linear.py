@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import expm
 
 from ..backend.decorators import jit
 from ..backend.rebuild import plain
@@ -39,8 +38,9 @@ def bicycle_coefficients(
 
 
 @jit
-def write_lateral(A: Any, B: Any, car: Any, V: Any, states: int, preview: Any) -> None:
-    """beta and gamma, with more `states` psi and y_l, into A and B (columns delta_f, N_z).
+def write_lateral(A: Any, B: Any, car: Any, V: Any, states: int, inputs: int, preview: Any) -> None:
+    """beta and gamma, with more `states` psi and y_l, into A and B (columns delta_f, N_z and, with
+    more `inputs`, the road's curvature).
 
     car: the first six arguments of `bicycle_coefficients`. What is zero is left alone.
     """
@@ -53,6 +53,10 @@ def write_lateral(A: Any, B: Any, car: Any, V: Any, states: int, preview: Any) -
         A[2, 1] = 1.0  # tie-vision (7)
     if states > 3:
         A[3, 0], A[3, 1], A[3, 2] = V, preview, V  # tie-vision (6)
+    if inputs > 2 and states > 2:
+        B[2, 2] = -V  # psi' = gamma - V kappa
+        if states > 3:
+            B[3, 2] = -V * preview
 
 
 @jit
@@ -93,6 +97,8 @@ class LinearModel:
 
     def discrete(self, dt: float) -> tuple[Array, Array]:
         """(G, H) of tie-vision (9) by exact zero-order hold over dt seconds."""
+        from scipy.linalg import expm  # environments read this module too
+
         n, m = self.B.shape
         block = np.zeros((n + m, n + m))
         block[:n, :n], block[:n, n:] = self.A * dt, self.B * dt
@@ -127,7 +133,7 @@ def _lateral(vehicle: Vehicle, speed: float, states: int, inputs: int = 2) -> tu
         vehicle.rear_stiffness,
     )
     A, B = np.zeros((states, states)), np.zeros((states, inputs))
-    _write_lateral(A, B, car, float(speed), states, vehicle.preview)
+    _write_lateral(A, B, car, float(speed), states, inputs, vehicle.preview)
     return A, B
 
 
@@ -146,7 +152,6 @@ def vision(vehicle: Vehicle, speed: float) -> LinearModel:
     y_l = y_cg + l_pre psi - kappa l_pre^2 / 2 moves as y_l' = V beta + l_pre psi' + V psi.
     """
     A, B = _lateral(vehicle, speed, 4, 3)
-    B[2, 2], B[3, 2] = -float(speed), -float(speed) * vehicle.preview
     C = np.array([[0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
     states = ("beta", "gamma", "psi", "y_l")
     return LinearModel(A, B, C, states, ("delta_f", "N_z", "kappa"), ("gamma", "psi", "y_l"))

@@ -20,6 +20,13 @@ def dot(row: Row, v: Row, n: int) -> Any:
 
 
 @jit
+def expected(f: Memory, s: int, i: int) -> Any:
+    """What row i of sensor s would measure now: C x and, over the ground, the road's heading."""
+    value = dot(f.C[s, i], f.x, f.n)
+    return value + f.road_turn if f.ground[s, i] == 1 else value
+
+
+@jit
 def _plus(a: Any, g: Any, v: Row, j: int) -> Any:
     """a + g v[j : j + 8] of eight numbers a, at once: compiled, they stay in registers."""
     return (

@@ -17,7 +17,7 @@ literally at 1 ms) or by a first-order lag of the delay. ignore: late samples ar
 """
 
 from ...envs.backend.decorators import jit
-from .covariance import clone_covariance, dot, measure_state
+from .covariance import clone_covariance, dot, expected, measure_state
 from .memory import COUNTERS, SEEN, SLOW, WINDOW, Memory, Row
 from .transition import variance
 
@@ -43,7 +43,7 @@ def _clone(f: Memory, s: int, slot: int) -> None:
     for i in range(f.rows[s]):
         clone = f.first_clone[s] + slot * f.rows[s] + i
         row = f.C[s, i]
-        f.x[clone] = dot(row, f.x, f.n)
+        f.x[clone] = expected(f, s, i)
         f.e[clone] = dot(row, f.e, f.n)
         if f.periodic == 0:
             clone_covariance(f, row, clone)
@@ -54,7 +54,7 @@ def _take_covariance(f: Memory, s: int) -> None:
     """Larsen's update at the capture: the covariance now, the states when the sample is here."""
     for i in range(f.rows[s]):
         row = f.C[s, i]
-        f.larsen_expected[s, i] = dot(row, f.x, f.n)
+        f.larsen_expected[s, i] = expected(f, s, i)
         measure_state(f, row, variance(f, s, i, f.speed_before), 0.0)
         for j in range(i):
             _carry_gain(f, s, j, row)

@@ -11,7 +11,7 @@ innovation (`design.dual_rate`). single-rate: a filter that listens only at the 
 from typing import Any
 
 from ...envs.backend.decorators import jit
-from .covariance import dot, measure_clone, measure_state
+from .covariance import dot, expected, measure_clone, measure_state
 from .innovation import noise_of
 from .memory import Gains, Memory, Row
 from .speed import frame_row
@@ -30,7 +30,8 @@ def _measured(f: Memory, s: int, i: int, v: Row) -> Any:
 def expect(f: Memory, s: int) -> None:
     """What the slow rows are expected to be, and their pseudo-residuals: tie-vision (22)."""
     for i in range(f.rows[s]):
-        f.expected[i] = _measured(f, s, i, f.x)
+        cloned = f.frames[s] > 0
+        f.expected[i] = f.x[f.first_clone[s] + i] if cloned else expected(f, s, i)
         f.eps[f.fasts + i] = _measured(f, s, i, f.e)  # C G e
 
 

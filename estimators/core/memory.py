@@ -114,6 +114,7 @@ _SLOW = [  # slow sensors: what each one measures, how noisy it is, when it capt
     ("rows", _INT, (SLOW,)),  # of C
     ("C", _FLOAT, (SLOW, ROWS, CORE)),
     ("angle", _INT, (SLOW, ROWS)),  # 1: the residual is wrapped
+    ("ground", _INT, (SLOW, ROWS)),  # 1: a heading over the ground, where psi is the road's
     ("r", _FLOAT, (SLOW, ROWS)),  # variances, at the present speed
     ("noise_over_speed", _FLOAT, (SLOW, ROWS)),  # r is this / V^2; 0: r as it stands
     ("heading_fix", _INT, (SLOW,)),  # 1: where the first sample is far off, it sets the heading
@@ -167,6 +168,7 @@ _NOW = [
     ("start", _INT),  # tick of the first row
     ("tick", _INT),  # of the last row
     ("begun", _INT),  # 1: there was a first step
+    ("road_turn", _FLOAT),  # rad, of the road since the first row
     ("at", _INT),  # step within the schedule's cycle
     ("x", _FLOAT, (WIDTH,)),  # states, then clones
     ("P", _FLOAT, (WIDTH, WIDTH)),
@@ -216,6 +218,7 @@ _WINDOW = [  # history: of tick k in row k % WINDOW
     ("past_y", _FLOAT, (WINDOW, FASTS)),
     ("past_speed", _FLOAT, (WINDOW,)),  # the model's
     ("past_turning", _FLOAT, (WINDOW,)),
+    ("past_road_turn", _FLOAT, (WINDOW,)),  # of every rule
     ("snapshot_x", _FLOAT, (SNAPSHOTS + 1, CORE)),  # the last is "now", while the past is redone
     ("snapshot_P", _FLOAT, (SNAPSHOTS + 1, CORE, CORE)),
     ("recent", _FLOAT, (RECENT, PACKET_WIDTH)),

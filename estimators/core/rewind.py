@@ -62,6 +62,7 @@ def _recall(f: Memory, tick: int) -> None:
     slot = tick % WINDOW
     copied(f.past_u[slot], f.u)
     copied(f.past_y[slot], f.y)
+    f.road_turn = f.past_road_turn[slot]
     speed, turning = f.past_speed[slot], f.past_turning[slot]
     if speed != f.model_speed or turning != f.turning:
         build(f, speed, turning)

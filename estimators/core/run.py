@@ -32,7 +32,7 @@ from .packets import receive, use_waiting
 from .rewind import forget, remember
 from .second_layer import pass_on
 from .speed import next_cell, step_row
-from .transition import build
+from .transition import CURVATURE, LATERAL, build
 
 
 @jit
@@ -46,7 +46,7 @@ def begin(f: Memory, first: int) -> None:
     """A fresh filter whose first row is the tick `first`."""
     f.start, f.tick, f.begun, f.at = first, first - 1, 0, 0
     f.cell, f.wanted, f.cursor, f.waits, f.u_count = 0, -1, 0, 0, 0
-    f.first_fix, f.since, f.nis, f.turning = -1, -1, np.nan, 0.0
+    f.first_fix, f.since, f.nis, f.turning, f.road_turn = -1, -1, np.nan, 0.0, 0.0
     _fill(f.x, 0.0)
     _fill(f.e, 0.0)
     _fill(f.gain, 0.0)
@@ -88,6 +88,13 @@ def _start(f: Memory) -> None:
 
 
 @jit
+def _turn_road(f: Memory, u: Row) -> None:
+    """The road turns beside the car, over a step with the inputs u (INPUTS,)."""
+    if f.kind == LATERAL and f.inputs > CURVATURE:
+        f.road_turn += f.model_speed * u[CURVATURE] * f.step
+
+
+@jit
 def tick(f: Memory, gains: Gains) -> None:
     """From the last tick to this one, whose fast row was read."""
     f.tick += 1
@@ -103,12 +110,15 @@ def tick(f: Memory, gains: Gains) -> None:
         if f.stride > 1:
             for i in range(f.inputs):
                 f.u_sum[i] /= f.u_count
+            _turn_road(f, f.u_sum)
             advance_state(f, f.u_sum)
         else:
+            _turn_road(f, f.u)
             advance_state(f, f.u)
         f.at = f.at + 1 if f.at + 1 < f.cycle else 0
     else:
         _start(f)
+    f.past_road_turn[f.tick % WINDOW] = f.road_turn
     if f.store_predictions == 1:
         for i in range(f.n):
             f.predicted[f.tick % WINDOW, i] = f.x[i]

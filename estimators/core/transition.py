@@ -12,6 +12,8 @@ LATERAL, ROLL, KINEMATIC, VELOCITY_ROLL, YAW, FORCES, LINEAR = range(7)
 """Kinds of models; LINEAR is any linear system, whose matrices are arguments."""
 BETA, GAMMA, PSI, Y_L = range(4)
 """Places of a bicycle's states."""
+CURVATURE = 2
+"""Place of the road's curvature among a bicycle's inputs."""
 
 SLOWEST = 1.5  # m/s: below it the model stays that of this speed
 
@@ -21,7 +23,7 @@ def _lateral(f: Memory, V: Any) -> None:
     """tie-vision (8), dakf-stability (5)-(11), a body that rolls and what a_y feels of it."""
     A, B = f.A, f.B
     rolling = 2 if f.rolling > 0 else 0
-    write_lateral(A, B, f.car, V, f.dense - f.delayed - rolling, f.preview)
+    write_lateral(A, B, f.car, V, f.dense - f.delayed - rolling, f.inputs, f.preview)
     if f.forces == 1:
         B[0, INPUTS], B[1, INPUTS + 1] = 1.0 / (f.car[CAR.mass] * V), B[1, 1]
     if rolling > 0:

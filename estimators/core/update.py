@@ -8,7 +8,7 @@ from ...envs.backend.decorators import apart, jit
 from ...envs.backend.elementary import wrap
 from ...envs.backend.primitives import absolute, maximum
 from ...envs.record import PACKET
-from .covariance import dot, measure_clone, measure_state
+from .covariance import dot, expected, measure_clone, measure_state
 from .delay import BUFFER, CONSTANT, LARSEN, STORED_ONE, carry_gains
 from .innovation import adapt, innovate, noise_of, project_row
 from .intersample import NONE, PSEUDO, begin_shares, correct_sample, share_sample
@@ -26,12 +26,14 @@ def _expected(f: Memory, s: int, i: int, first: int, captured: int) -> Any:
         return f.larsen_expected[s, i]
     if first == STORED_ONE:
         stored = maximum(f.tick - f.assumed, f.start) if f.late == CONSTANT else captured
-        return dot(f.C[s, i], f.predicted[stored % WINDOW], f.n)  # uneven-delay (15)
+        before = dot(f.C[s, i], f.predicted[stored % WINDOW], f.n)  # uneven-delay (15)
+        turn = f.past_road_turn[stored % WINDOW]
+        return before + turn if f.ground[s, i] == 1 else before
     if f.between == PSEUDO:
         return f.expected[i]  # before this tick's corrections
     if first >= 0:
         return f.x[first + i]
-    return dot(f.C[s, i], f.x, f.n)
+    return expected(f, s, i)
 
 
 @jit

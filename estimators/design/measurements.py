@@ -18,7 +18,8 @@ class Row(NamedTuple):
 
     noise: its standard deviation is the option `<noise>_noise`. sd: that option's default, in the
     unit of the value. angle: the innovation is wrapped. over_speed: the default holds at
-    `COURSE_SPEED` and grows as 1/V; the option holds at every speed.
+    `COURSE_SPEED` and grows as 1/V; the option holds at every speed. ground: it is a direction over
+    the ground, where psi is relative to the road.
     """
 
     states: tuple[str, ...]
@@ -26,6 +27,7 @@ class Row(NamedTuple):
     sd: float
     angle: bool = False
     over_speed: bool = False
+    ground: bool = False
 
 
 @dataclass(frozen=True)
@@ -46,7 +48,7 @@ MEASUREMENTS: dict[str, Measurement] = {
         (Row(("psi",), "psi", 3.5e-3, angle=True), Row(("y_l",), "y_l", 0.02)),
     ),
     "gps": Measurement(
-        (Row(("beta", "psi"), "course", math.radians(0.14), angle=True, over_speed=True),),
+        (Row(("beta", "psi"), "course", math.radians(0.14), True, True, ground=True),),
         (Row(("v_x",), "gps_speed", 0.05), Row(("v_y",), "gps_speed", 0.05)),  # (41)
         heading_fix=True,
     ),

@@ -118,7 +118,7 @@ Signal = tuple[tuple[int, float], tuple[int, float]]
 def signals(vehicle: Vehicle) -> dict[str, Signal]:
     """Sums of two columns of a fast row, as (column, factor), by name."""
     arm = vehicle.rear_track / (2.0 * vehicle.wheel_radius)  # N_z = arm (T_r - T_l)
-    single = ("gyro", "accel_y", "accel_x", "roll_rate", "steer")
+    single = ("gyro", "accel_y", "accel_x", "roll_rate", "steer", "curvature")
     table: dict[str, Signal] = {
         name: ((getattr(FAST, name), 1.0), (getattr(FAST, name), 0.0)) for name in single
     }
@@ -150,8 +150,9 @@ def bicycle_model(
     states = states_for(sensors)
     lagging = tuple(_LATE[s] for s in states if s in _LATE) if late and "camera" in sensors else ()
     walks = tuple((name, state) for name, state in walks if state in states)
+    inputs = ("steer", "N_z", "curvature") if "psi" in states else ("steer", "N_z")
     forces, states = disturbances == "forces", states + BODY * body
-    return Model(LATERAL, states, ("steer", "N_z"), fast, walks, forces, lagging, biases)
+    return Model(LATERAL, states, inputs, fast, walks, forces, lagging, biases)
 
 
 def write_model(
@@ -229,7 +230,7 @@ def _write_rows(
         f.satellites_column[s] = packet_column(SLOW_NAMES[s], "satellites")
         f.speed_column[s] = packet_column(SLOW_NAMES[s], "speed")
         for i, row in enumerate(rows):
-            f.angle[s, i] = row.angle
+            f.angle[s, i], f.ground[s, i] = row.angle, row.ground
             f.r[s, i] = noise[row.noise] ** 2
             f.noise_over_speed[s, i] = noise_over_speed.get(row.noise, 0.0) ** 2
             for state in row.states:

@@ -26,13 +26,15 @@ ARM = COMS.rear_track / (2.0 * COMS.wheel_radius)
 
 
 def continuous(behind: Any, V: float, rolls: bool) -> Any:
-    """dx/dt of `STATES` and the specific force a_y, (7, 8 + m): columns `STATES`, steering, yaw
-    moment, then what is behind. A body that rolls leaves beta' and phi'' in one pair of equations,
-    double-layer-gps (1) and (3): M V (beta' + gamma) - S phi'' = F_y, I_x phi'' = S a_y - ...
+    """dx/dt of `STATES` and the specific force a_y, (7, 9 + m): columns `STATES`, steering, yaw
+    moment, the road's curvature, then what is behind.
+
+    A body that rolls leaves beta' and phi'' in one pair of equations, double-layer-gps (1) and (3):
+    M V (beta' + gamma) - S phi'' = F_y, I_x phi'' = S a_y - ...
     """
-    model, at = vision(COMS, V), 8
+    model, at = vision(COMS, V), 9
     rows = np.zeros((7, at + len(behind)))
-    rows[:4, :4], rows[:4, 6:8] = model.A, model.B[:, :2]
+    rows[:4, :4], rows[:4, 6:9] = model.A, model.B
     for j, name in enumerate(behind, at):
         if name in ("F_d", "N_d"):
             to, push = (0, 1.0 / (COMS.mass * V)) if name == "F_d" else (1, 1.0 / COMS.yaw_inertia)
@@ -53,7 +55,7 @@ def continuous(behind: Any, V: float, rolls: bool) -> Any:
 
 
 def transition(names: Any, V: float, dt: float) -> Any:
-    """F (n, n), B (n, 2) of a tick, and a_y's row (n,) and feed-through (2,); disturbances and
+    """F (n, n), B (n, 3) of a tick, and a_y's row (n,) and feed-through (3,); disturbances and
     inputs are held over it."""
     behind = [name for name in names if name not in STATES]
     slopes = continuous(behind, V, "phi" in names)
@@ -62,12 +64,12 @@ def transition(names: Any, V: float, dt: float) -> Any:
     exact = expm(block * dt)
     rows = [STATES.index(name) for name in names if name in STATES]
     n, m = len(names), len(rows)
-    F, B = np.zeros((n, n)), np.zeros((n, 2))
-    F[:m, :m], F[:m, m:] = exact[np.ix_(rows, rows)], exact[rows, 8:]
+    F, B = np.zeros((n, n)), np.zeros((n, 3))
+    F[:m, :m], F[:m, m:] = exact[np.ix_(rows, rows)], exact[rows, 9:]
     for j, name in enumerate(behind, m):
         F[j, j] = math.exp(-dt / 0.3) if name in ("F_d", "N_d") else 1.0
-    B[:m] = exact[rows, 6:8]
-    return F, B, np.concatenate([slopes[6, rows], slopes[6, 8:]]), slopes[6, 6:8]
+    B[:m] = exact[rows, 6:9]
+    return F, B, np.concatenate([slopes[6, rows], slopes[6, 9:]]), slopes[6, 6:9]
 
 
 def speeds(fast: Any, dt: float) -> Any:
@@ -120,7 +122,9 @@ class Posterior:
         self.T[0, :, :n] = np.diag(np.sqrt(prior))
         models = {speed: transition(names, speed, record.dt) for speed in set(V)}
         arm = ARM * (record.fast[:, FAST.torque_right] - record.fast[:, FAST.torque_left])
-        acted = np.column_stack([record.fast[:, FAST.steer], arm])
+        bends = record.fast[:, FAST.curvature]
+        acted = np.column_stack([record.fast[:, FAST.steer], arm, bends])
+        road = np.concatenate([[0.0], np.cumsum((V * bends)[1:])]) * record.dt  # its direction
         for k in range(1, K):
             a, u = n + (k - 1) * q, acted[k]
             F, B, _, _ = models[V[k]]
@@ -130,7 +134,7 @@ class Posterior:
         M: Any = [np.eye(n + (K - 1) * q)]
         b: Any = [np.zeros(n + (K - 1) * q)]
         for name in fast:
-            rows, through = np.zeros((K, n)), np.zeros((K, 2))
+            rows, through = np.zeros((K, n)), np.zeros((K, 3))
             if name == "accel_y":
                 rows[:] = [models[speed][2] for speed in V]
                 through[:] = [models[speed][3] for speed in V]
@@ -150,7 +154,8 @@ class Posterior:
                     sd *= factor(packet[PACKET.value + 4]) / V[k]
                 at = [names.index(state) for state in states]
                 M.append(self.T[k, at].sum(0)[None] / sd)
-                b.append(np.array([(packet[PACKET.value + i] - self.mean[k, at].sum()) / sd]))
+                known = self.mean[k, at].sum() + (road[k] if name == "gps" else 0.0)
+                b.append(np.array([(packet[PACKET.value + i] - known) / sd]))
         A = np.column_stack([np.concatenate(M), np.concatenate(b)])
         R: Any = np.linalg.qr(A, mode="r")
         self.R = R[:-1, :-1]
@@ -168,6 +173,7 @@ def inputs(rng: Any, rows: int) -> Any:
     fast[:, FAST.steer] = 0.05 * rng.standard_normal(rows)
     fast[:, FAST.torque_right] = 20.0 * rng.standard_normal(rows)
     fast[:, FAST.gyro] = 0.1 * rng.standard_normal(rows)
+    fast[:, FAST.curvature] = 0.05 * rng.standard_normal(rows)
     fast[:, FAST.accel_y] = rng.standard_normal(rows)
     fast[:, FAST.roll_rate] = 0.1 * rng.standard_normal(rows)
     V = rng.uniform(2.0, 15.0) + np.linspace(0.0, 3.0, rows)

@@ -45,7 +45,7 @@ def test_of_the_state_only_the_queue_has_room_for_more_numbers_than_names() -> N
 
 def test_what_a_tick_of_the_plant_changes_lies_before_the_slow_sensors() -> None:
     """The lanes copy that alone, and the driver's angle."""
-    assert max(leaves((Z.motion, Z.drive, Z.clock, Z.refs))) + 1 == Z.slow[0].frames
+    assert max(leaves((Z.motion, Z.drive, Z.clock, Z.refs, Z.lead))) + 1 == Z.slow[0].frames
 
 
 class Wheel(NamedTuple):
