@@ -5,10 +5,13 @@ from pathlib import Path
 from typing import Any
 
 from ..envs.backend.files import whole
-from .control.cells import REFERENCE_FILTER, YAW
+from .control.cells import REFERENCE_FILTER
+from .control.contests import TITLES
 from .harness.metrics import METRICS
 from .harness.results import Row, ShareMap, Suite
 from .report.colours import INK, SHARE_SCALE, colour
+
+_ACROSS = 3  # panels
 
 
 def write_picture(path: str | Path, suites: Sequence[Suite]) -> None:
@@ -23,13 +26,16 @@ def write_picture(path: str | Path, suites: Sequence[Suite]) -> None:
             "pictures need matplotlib: pip install 'sideslip[report]'"
         ) from None
     rows = [row for suite in suites for row in suite.rows]
-    error, score = "error of sideslip / mrad", "score (1: clairvoyant)"
+    error, score = "error of sideslip / mrad", "score (0: nominal, 1: oracle-state)"
     panels = [
         (title, [r for r in rows if (r.scenario, r.metric) == key and _shown(r)], label)
         for title, key, label in (
             ("Estimating with a late camera", ("tie-vision-fig7", "rmse"), error),
             ("Estimating with GPS, wind, outage", ("dakf-fig6", "rmse"), error),
-            (f"Controlling, on {REFERENCE_FILTER}", ("all", "score"), score),
+            *(
+                (f"Tier {tier}: {what}", (f"tier {tier}", "score"), score)
+                for tier, what in TITLES.items()
+            ),
         )
     ]
     panels = [panel for panel in panels if panel[1]]
@@ -38,13 +44,18 @@ def write_picture(path: str | Path, suites: Sequence[Suite]) -> None:
         raise ValueError(
             "nothing to draw: the picture needs the suites estimation, control or recovery"
         )
-    wide = max([4.0 * len(panels), *(2.4 * len(each.shares) for each in maps)])
-    figure = Figure(figsize=(wide, 2.6 * (bool(panels) + len(maps))), layout="constrained")
-    strips = figure.subfigures(bool(panels) + len(maps), 1, squeeze=False)[:, 0]
+    across = min(len(panels), _ACROSS)
+    down = -(-len(panels) // max(across, 1))
+    heights = [down] * bool(panels) + [1] * len(maps)
+    wide = max([4.0 * across, *(2.4 * len(each.shares) for each in maps)])
+    figure = Figure(figsize=(wide, 2.6 * sum(heights)), layout="constrained")
+    strips = figure.subfigures(len(heights), 1, squeeze=False, height_ratios=heights)[:, 0]
     for strip, each in zip(strips[bool(panels) :], maps, strict=True):
         _maps(strip, each)
-    axes = strips[0].subplots(1, len(panels), squeeze=False)[0] if panels else []
-    for axis, (title, mine, label) in zip(axes, panels, strict=True):
+    axes = strips[0].subplots(down, across, squeeze=False).ravel() if panels else []
+    for axis in axes[len(panels) :]:
+        axis.set_axis_off()
+    for axis, (title, mine, label) in zip(axes, panels, strict=False):
         _bars(axis, mine, title, label)
         over = {r.estimator: r.value for r in rows
                 if r.metric == "rmse_over_bound" and r.scenario == mine[0].scenario}  # fmt: skip
@@ -57,9 +68,8 @@ def write_picture(path: str | Path, suites: Sequence[Suite]) -> None:
 
 
 def _shown(row: Row) -> bool:
-    """Whether a row stands in the picture: of the scores those on the best filter, yaw moment."""
-    best = row.env_version.startswith(YAW) and row.estimator in ("", REFERENCE_FILTER)
-    return row.metric != "score" or best
+    """Whether a row stands in the picture: of the scores those on the reference filter."""
+    return row.metric != "score" or row.estimator in ("", REFERENCE_FILTER)
 
 
 def _maps(strip: Any, shown: ShareMap) -> None:

@@ -14,15 +14,15 @@ import numpy as np
 from .. import __version__
 from ..agents.learned.card import JsonMap
 from ..agents.learned.files import Policy, load_policy, save_policy
-from .control.cells import REFERENCE_FILTER, Cell
+from .control.cells import Cell
+from .control.contests import Contest
 from .control.episodes import Array, Chunk, Driven, drive
-from .control.scores import improvement
 from .control.seeds import salted_seeds
 from .control.tables import spec_of
 from .harness.results import Row, Suite, Table
-from .harness.stats import interval
+from .harness.stats import interval, won
 
-CLASSICAL = "lqr"
+CLASSICAL, FILTER = "lqr", "exact-kf"
 
 
 @dataclass
@@ -68,11 +68,11 @@ def enjoy(
     seeds = salted_seeds(salt, episodes) if seed is None else list(range(seed, seed + episodes))
     contestants = {
         loaded.name: (loaded.card.estimator, policy),
-        f"{CLASSICAL} on {REFERENCE_FILTER}": (REFERENCE_FILTER, CLASSICAL),
+        f"{CLASSICAL} on {FILTER}": (FILTER, CLASSICAL),
         "none": ("", "none"),
     }
     cells = {
-        name: Cell(home, shown, estimator, who, options)
+        name: Cell(Contest(env_id=home, scenario=shown), estimator, who, options)
         for name, (estimator, who) in contestants.items()
     }
     driven = {name: drive(Chunk(cell, tuple(seeds), keep=True)) for name, cell in cells.items()}
@@ -119,19 +119,19 @@ def suite_of(found: Enjoyed) -> Suite:
     name, card = found.policy.name, found.policy.card
     cell = found.cells[name]
     text = (
-        f"{len(found.seeds)} episodes of {cell.scenario}, the same seeds for all. {name} was "
-        f"trained by {card.algorithm or 'an unnamed algorithm'} on {card.steps} steps of "
-        f"{card.env_id} (reference: {card.reference}) in {card.cpu_seconds:.0f} CPU-s."
+        f"{len(found.seeds)} episodes of {cell.contest.scenario}, the same seeds for all. "
+        f"{name} was trained by {card.algorithm or 'an unnamed algorithm'} on {card.steps} "
+        f"steps of {card.env_id} (reference: {card.reference}) in {card.cpu_seconds:.0f} CPU-s."
     )
     judged = found.reference
     if judged != card.reference:
         text += f" Here it is judged by another reference, {judged}: by another cost."
-    suite = Suite("enjoy", f"{name} on {cell.env_id}", text, _rows(found), [_table(found)])
+    suite = Suite("enjoy", f"{name} on {cell.contest.env_id}", text, _rows(found), [_table(found)])
     from .control.figures import in_motion, over_time, run_of
 
     runs = {who: run_of(found.cells[who], found.seeds[0]) for who in found.driven}
     try:
-        suite.figures.append(in_motion(f"In motion: {cell.scenario}, first seed", runs))
+        suite.figures.append(in_motion(f"In motion: {cell.contest.scenario}, first seed", runs))
     except ModuleNotFoundError:
         return suite
     series: dict[tuple[str, ...], Array] = {
@@ -147,7 +147,7 @@ def _table(found: Enjoyed) -> Table:
     cells = []
     for name, driven in found.driven.items():
         cost = interval(driven.costs)
-        better = f"{100.0 * improvement(own, driven.costs):.0f} %"
+        better = f"{100.0 * won(own, driven.costs).value:.0f} %"
         cells.append(
             [
                 name,
@@ -161,8 +161,8 @@ def _table(found: Enjoyed) -> Table:
         )
     header = ("cost", "95 % interval", "of none", "better", "RMS slip", "step", "fails")
     note = (
-        "Mean cost of an episode. of none: share of the uncontrolled car's. better: probability "
-        f"that an episode of {first} costs less than one of this one. Slip in mrad. step: "
+        "Mean cost of an episode. of none: share of the uncontrolled car's. better: share "
+        f"of the seeds on which {first} costs less. Slip in mrad. step: "
         "the largest between two decisions, in N m."
     )
     left_out = [f"{name} was not driven: {error}." for name, error in found.left_out.items()]
@@ -175,8 +175,8 @@ def _rows(found: Enjoyed) -> list[Row]:
         cell, own = found.cells[name], name == found.policy.name
         who = {"estimator": cell.estimator, "controller": name if own else cell.controller}
         seeds: dict[str, Any] = {"n": len(found.seeds), "salt": found.salt, "spec": spec_of(cell)}
-        what = {"suite": "enjoy", "env_version": f"{cell.env_id} {__version__}"}
+        what = {"suite": "enjoy", "env_version": f"{cell.contest.env_id} {__version__}"}
         for metric in ("cost", "rms_slip", "peak_slip", "effort", "largest_step"):
-            columns = {"scenario": cell.scenario, **what, **who, **seeds}
+            columns = {"scenario": cell.contest.scenario, **what, **who, **seeds}
             rows.append(Row.of(metric, interval(driven[metric]), **columns))
     return rows

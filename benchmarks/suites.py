@@ -16,7 +16,8 @@ class Request:
     """The options of a run.
 
     quick: few seeds. jobs: processes, None for all processors. episodes: of a cell of the matrix,
-    None for the suite's own number. keep: a folder for finished cases.
+    None for the suite's own number. keep: a folder for finished cases. clairvoyant: a file of
+    `sideslip calibrate`, None for the package's.
     """
 
     quick: bool = False
@@ -24,6 +25,7 @@ class Request:
     console: Console | None = None
     episodes: int | None = None
     keep: Path | None = None
+    clairvoyant: Path | None = None
 
 
 _Run = Callable[[Any, Request], Suite]
@@ -37,7 +39,7 @@ def _control(suite: Any, r: Request) -> Any:
     from .control.cells import EPISODES, QUICK_EPISODES
 
     usual = QUICK_EPISODES if r.quick else EPISODES
-    return suite.run(r.episodes or usual, r.jobs, r.console, r.keep)
+    return suite.run(r.episodes or usual, r.jobs, r.console, r.keep, r.quick, r.clairvoyant)
 
 
 def _following(suite: Any, r: Request) -> Any:

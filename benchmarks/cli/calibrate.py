@@ -1,56 +1,52 @@
-"""`sideslip calibrate`: the clairvoyant's mean costs, into the file that scores are made with."""
+"""`sideslip calibrate`: what the clairvoyant costs, into a file beside the user."""
 
 import shlex
+import sys
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import typer
 from rich.console import Console
 from rich.table import Table
 
+from ...envs.arguments import check_choice
 from ..harness.results import check_writable
 
 
 def calibrate_command(
-    env: Annotated[str, typer.Option(help="An environment's id.")] = "sideslip/YawFusion-v0",
-    scenario: Annotated[
-        list[str] | None, typer.Option(help="Repeatable; default: all that are scored.")
+    out: Annotated[Path, typer.Argument(help="The file to write.")] = Path("clairvoyant.json"),
+    contest: Annotated[
+        list[str] | None, typer.Option(help="Its name in the tables; default: all. Repeatable.")
     ] = None,
-    seeds: Annotated[int, typer.Option(help="Calibration seeds a scenario.")] = 64,
-    start: Annotated[
-        str, typer.Option(help="The agent whose run is the second start; none: zero alone.")
-    ] = "two-dof",
-    estimator: Annotated[str, typer.Option(help="Of that agent; empty: none.")] = "exact-kf",
-    out: Annotated[Path | None, typer.Option(help="Default: the shipped calibration.")] = None,
+    seeds: Annotated[int, typer.Option(help="Seeds a contest.")] = 64,
+    write: Annotated[bool, typer.Option("--write", help="Into the package instead.")] = False,
     jobs: Annotated[int | None, typer.Option("--jobs", "-j", min=1, help="Processes.")] = None,
 ) -> None:
-    """Find the cost of the clairvoyant, which a score of 1 stands for.
+    """Find the cost of the clairvoyant, the ladder's highest rung, in the scored contests.
 
-    A stopped run goes on where it was when the same command runs again in the same folder.
+    A stopped run goes on where it was when the same command runs again in the same folder. `bench
+    control --clairvoyant FILE` reads the file.
     """
     from ..control.calibration import FILE, calibrate, cases_of, forget, update
-    from ..control.cells import MANOEUVRES
+    from ..control.contests import contests
 
-    path = FILE if out is None else out
+    path = FILE if write else out
     check_writable(path)
-    names = scenario or list(MANOEUVRES)
-    words = ["sideslip", "calibrate", "--env", env]
-    words += [word for name in scenario or [] for word in ("--scenario", name)]
-    words += ["--seeds", str(seeds), "--start", start, "--estimator", estimator]
-    console = Console()
-    folder = Path(f".{path.name}.cases")
-    made = calibrate(names, folder, env, seeds, start, estimator, shlex.join(words), jobs, console)
+    known = {each.name: each for each in contests()}
+    for name in contest or []:
+        check_choice("contest", name, known)
+    asked = [known[name] for name in contest or known]
+    console, folder = Console(), Path(f".{path.name}.cases")
+    command = shlex.join(["sideslip", *sys.argv[1:]])
+    made = calibrate(asked, folder, seeds, command, jobs, console)
     update(path, made)
-    forget(cases_of(names, folder, env, seeds, start, estimator))
-    table = Table("scenario", "none", "clairvoyant", "standard error", "plan from the agent wins")
+    forget(cases_of(asked, folder, seeds))
+    table = Table("contest", "none", "clairvoyant", "a plan wins")
     for entry in made:
-        wins = sum(episode.winner == f"from {start}" for episode in entry.episodes)
-        table.add_row(
-            entry.scenario,
-            f"{entry.none:.4g}",
-            f"{entry.clairvoyant:.4g}",
-            f"{entry.clairvoyant_error:.2g}",
-            f"{wins} of {seeds}",
-        )
+        none = np.mean([episode.costs["none"] for episode in entry.episodes])
+        wins = sum(episode.winner.startswith("from") for episode in entry.episodes)
+        best = f"{entry.costs.mean():.4g}"
+        table.add_row(entry.contest.name, f"{none:.4g}", best, f"{wins} of {seeds}")
     console.print(table)
     console.print(f"calibration: {path}", highlight=False, soft_wrap=True)

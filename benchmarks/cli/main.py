@@ -131,6 +131,9 @@ def bench(
     keep: Annotated[
         Path | None, typer.Option(help="A folder for finished cases: a stopped run goes on.")
     ] = None,
+    clairvoyant: Annotated[
+        Path | None, typer.Option(help="A file of `sideslip calibrate`; default: the package's.")
+    ] = None,
 ) -> None:
     """Compare estimators and controllers, and a recorded drive with --log."""
     names = suites or list(SUITES)
@@ -143,7 +146,7 @@ def bench(
         from ..recorded.suite import replay_file
 
         done.append(replay_file(log, vehicle, mapping=mapping))
-    request = Request(quick, jobs, console, episodes, keep)
+    request = Request(quick, jobs, console, episodes, keep, clairvoyant)
     done += [run_suite(name, request) for name in names]
     order = [*names, "replay"]
     done.sort(key=lambda suite: order.index(suite.name))

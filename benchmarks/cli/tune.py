@@ -140,8 +140,9 @@ def tune_controller(
     the contestant cannot drive is named and left out.
     """
     from ...agents.tuned import FILE
+    from ..control.seeds import tuning_seeds
     from ..tuning import controllers
-    from ..tuning.contests import contests_of, tuning_seeds
+    from ..tuning.contests import contests_of
     from ..tuning.file import put_tuned
     from ..tuning.spaces import KINDS
     from ..tuning.task import STORAGE

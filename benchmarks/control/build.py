@@ -1,6 +1,8 @@
 """A cell's cars: the vector env with its estimator, and the controller that drives them all."""
 
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Mapping
+from itertools import islice
 from typing import Any
 
 import gymnasium as gym
@@ -11,11 +13,18 @@ from gymnasium.vector.utils import batch_space
 
 from ...agents import make_agent
 from ...agents.learned.files import is_policy, load_policy
+from ...agents.rollout import steps_of
+from ...agents.rungs import FILTER, levels_of, make_rung
+from ...agents.tuned import tuned
+from ...envs.scenarios.manoeuvres import scenario_from
 from ...envs.task.observation import Entry
 from ...estimators.filters import FILTERS
 from ...estimators.vector.estimate import EstimateObservation
 from ..harness.drives import quietly
-from .cells import INFORMED, TRUTH, Cell
+from .cells import SETUPS, TRUTH, Cell
+
+STEPS = 200  # of a decision's time
+BIAS = 0.01  # rad/s, the standard deviation of the gyro's that an untuned filter expects
 
 _DISTURBANCES = {"forces": ("F_d", "N_d"), "walk": ("d1", "d2"), "walk-all": ("d1", "d2")}
 
@@ -52,8 +61,13 @@ class TrueState(VectorWrapper[Any, Any, Any, Any, Any]):
 
 def outputs_for(estimator: str) -> tuple[str, ...]:
     """The estimates that controllers read: beta, gamma, and disturbances if there are any."""
-    row = FILTERS.get(estimator)  # a user's own has none
+    row = FILTERS.get(name_of(estimator))  # a user's own has none
     return ("beta", "gamma", *_DISTURBANCES.get(row.disturbances if row else "", ()))
+
+
+def name_of(estimator: str) -> str:
+    """The name of `make_estimator` of a cell's estimator."""
+    return SETUPS.get(estimator, (estimator, {}))[0]
 
 
 def estimate_options(cell: Cell) -> dict[str, Any]:
@@ -62,22 +76,65 @@ def estimate_options(cell: Cell) -> dict[str, Any]:
         card = load_policy(cell.controller).card
         if card.estimator == cell.estimator:
             return card.estimator_options
-    return {"outputs": outputs_for(cell.estimator), "std": False}
+    found: dict[str, Any] = {"outputs": outputs_for(cell.estimator), "std": False}
+    if cell.estimator in SETUPS:
+        name, options = SETUPS[cell.estimator]
+        if name == FILTER:
+            levels = levels_of(scenario_from(cell.env_options["scenario"])) | {"bias_sd": BIAS}
+            options = levels | tuned(cell.contest.kind, cell.controller)["filter"] | options
+            if "gps" not in options["slow"]:
+                del options["hdop_table"]
+        found["options"] = options
+    return found
 
 
-def make_contest(cell: Cell, cars: int) -> tuple[VectorEnv[Any, Any, Any], Any]:
-    """(vector env of `cars` rows with the cell's estimator, its agent)."""
-    options = cell.env_options
-    if cell.controller == INFORMED:
-        from ...agents.rungs import make_rung
-
-        return make_rung("oracle-parameters", cell.env_id, num_envs=cars, **options)
-    env: Any = gym.make_vec(cell.env_id, num_envs=cars, **options)
-    agent_options: dict[str, Any] = {}
-    if cell.controller == "model-following":
-        agent_options["rejection"] = cell.estimator == "dakf"
+def make_cars(cell: Cell, cars: int) -> tuple[VectorEnv[Any, Any, Any], Any]:
+    """(vector env of `cars` rows with the cell's estimator, its agent), both as they are tuned."""
+    contest, options = cell.contest, cell.env_options
+    best = tuned(contest.kind, cell.controller)
+    if cell.rung:
+        return make_rung(cell.rung, contest.env_id, cars, options=best, **options)
+    env: Any = gym.make_vec(contest.env_id, num_envs=cars, **options)
     if cell.estimator == TRUTH:
         env = TrueState(env)
     elif cell.estimator:
-        env = quietly(EstimateObservation, env, cell.estimator, **estimate_options(cell))
-    return env, make_agent(cell.controller, env, **agent_options)
+        name = name_of(cell.estimator)
+        env = quietly(EstimateObservation, env, name, **estimate_options(cell))
+    return env, make_agent(cell.controller, env, **agent_options(cell))
+
+
+def agent_options(cell: Cell) -> dict[str, Any]:
+    """Options of `make_agent` for a cell."""
+    more: dict[str, Any] = {}
+    if cell.controller == "model-following":
+        more["rejection"] = cell.estimator == "dakf"
+    return more | tuned(cell.contest.kind, cell.controller)["controller"]
+
+
+class _Timed:
+    """A function that notes how long each of its calls takes, in s of wall time."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self.function, self.seconds = function, list[float]()
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        begun = time.perf_counter()
+        result = self.function(*args, **kwargs)
+        self.seconds.append(time.perf_counter() - begun)
+        return result
+
+
+def decision_time(cell: Cell) -> float:
+    """us (wall) a decision of one car: predict, and what the estimator adds to an env-step.
+
+    Medians over STEPS steps of an episode, the bare env stepped side by side.
+    """
+    cars: tuple[Any, Any] = make_cars(cell, 1)
+    env, agent = cars
+    bare: Any = gym.make_vec(cell.contest.env_id, num_envs=1, **cell.env_options)
+    bare.reset(seed=0)
+    agent.predict, env.step, without = _Timed(agent.predict), _Timed(env.step), _Timed(bare.step)
+    for step in islice(steps_of(env, agent, 0), 1, STEPS + 1):
+        without(np.zeros_like(step.action))
+    predict, whole, plain = (np.median(f.seconds) for f in (agent.predict, env.step, without))
+    return 1e6 * float(predict + max(whole - plain, 0.0))

@@ -1,13 +1,14 @@
-"""What 100 % means: the clairvoyant's mean cost on calibration seeds, scenario by scenario.
+"""The clairvoyant's costs, contest by contest, on seeds of their own that only the version salts.
 
-The seeds are the calibration's own; no test and no tuning sees them. An entry keeps every seed's
-costs, so that means over other seeds or methods can be checked against it.
+Solving for it takes minutes an episode, so it is done once, by `sideslip calibrate`, and lies in a
+file. The rungs of the ladder drive the same seeds when a table is made. An entry that no longer
+fits, by its version, its contest, or what the uncontrolled car costs on its seeds, is refused.
 """
 
 import hashlib
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -17,38 +18,36 @@ import numpy as np
 from rich.console import Console
 
 from ... import __version__
-from ...agents import make_agent
 from ...envs.arguments import is_finite
 from ...envs.backend.cache import source_stamp
-from ...envs.scenarios.manoeuvres import SCENARIOS
-from ...estimators.wrappers.estimate import EstimateObservation
 from ..harness.parallel import run_cases
 from ..harness.results import made_of, read_objects, write_text
+from .cells import Cell
+from .contests import NOMINAL, STATE, Contest, oracle_of
+from .episodes import Array
+from .run import Results, measure
+from .scores import gains, survived
 
-FILE = Path(__file__).with_name("calibration.json")
-SALT, SEEDS = "calibration", 64
-ENV_ID = "sideslip/YawFusion-v0"
-START, ESTIMATOR = "two-dof", "exact-kf"
+FILE = Path(__file__).with_name("clairvoyant.json")
+SEEDS = 64
 _FIRST = 2**30  # tests and tunings count their seeds from 0
+_SAME = 1e-9  # of a cost
 
 
 @dataclass(frozen=True)
 class Case:
-    """One episode; start: the agent whose run the plan starts from besides zero."""
+    """One episode of a contest."""
 
-    env_id: str
-    scenario: str
+    contest: Contest
     seed: int
-    start: str
-    estimator: str
     folder: str  # of finished cases
 
     @property
     def path(self) -> Path:
         """The file of the finished case; other sources or another question give another name."""
-        asked = [self.env_id, self.scenario, self.seed, self.start, self.estimator]
-        stamp = json.dumps([*asked, source_stamp("agents"), __version__])
-        return Path(self.folder) / f"{hashlib.sha256(stamp.encode()).hexdigest()[:24]}.json"
+        asked = [asdict(self.contest), self.seed, source_stamp("agents"), __version__]
+        digest = hashlib.sha256(json.dumps(asked).encode()).hexdigest()
+        return Path(self.folder) / f"{digest[:24]}.json"
 
 
 @dataclass(frozen=True)
@@ -65,59 +64,52 @@ class Episode:
 
 @dataclass(frozen=True)
 class Entry:
-    """The calibration of a scenario of an environment.
+    """A contest's episodes, and the command that made them."""
 
-    clairvoyant, none: mean costs. clairvoyant_error, none_error: their standard errors. sources:
-    the hash of the plant's sources. command: what made it.
-    """
-
+    tier: str
     env_id: str
+    vehicle: str
+    reference: str
     scenario: str
     env_version: str
-    sources: str
-    salt: str
-    start: str
-    estimator: str
-    clairvoyant: float
-    clairvoyant_error: float
-    none: float
-    none_error: float
     command: str
     episodes: tuple[Episode, ...]
 
     @property
-    def stale(self) -> bool:
-        """Whether the plant's sources have changed since."""
-        return self.sources != source_stamp("envs")
+    def contest(self) -> Contest:
+        """Of which these are the costs."""
+        return Contest(self.tier, self.env_id, self.vehicle, self.reference, self.scenario)
+
+    @property
+    def costs(self) -> Array:
+        """(n,) the clairvoyant's."""
+        return np.array([episode.cost for episode in self.episodes])
 
 
-def calibration_seeds(env_id: str, scenario: str, count: int) -> list[int]:
-    """The first `count` seeds of a scenario's calibration; more seeds begin with the same ones."""
-    return [_FIRST + _digits(f"{SALT} {env_id} {scenario} {i}") for i in range(count)]
+def seeds_of(contest: Contest, count: int = SEEDS) -> list[int]:
+    """The first `count` seeds of a contest's calibration; more seeds begin with the same ones."""
+    texts = [f"clairvoyant {__version__} {json.dumps(asdict(contest))} {i}" for i in range(count)]
+    digests = [hashlib.sha256(text.encode()).digest() for text in texts]
+    return [_FIRST + int.from_bytes(digest[:4]) % _FIRST for digest in digests]
 
 
-def _digits(text: str) -> int:
-    return int.from_bytes(hashlib.sha256(text.encode()).digest()[:4]) % _FIRST
-
-
-def measure(case: Case) -> Episode:
-    """The ceiling of one episode, from the folder of finished cases where it is there."""
+def solve(case: Case) -> Episode:
+    """The best of the plans from zero, nominal's and the oracle's runs; from the folder of
+    finished cases where it is there."""
     from ...agents.clairvoyant.plan import actions_of, ceiling
+    from ...agents.rungs import make_rung
 
     done = _finished(case)
     if done is not None:
         return done
-    env: gym.Env[Any, Any] = gym.make(case.env_id, scenario=case.scenario)
-    starts = {}
-    if case.start != "none":
-        sensed = env
-        if case.estimator:
-            sensed = EstimateObservation(env, case.estimator)
-        starts[case.start] = actions_of(sensed, make_agent(case.start, sensed), case.seed)
+    contest, starts = case.contest, {}
+    for name, rung in ((NOMINAL, NOMINAL), (STATE, oracle_of(contest))):
+        driver = make_rung(rung, contest.env_id, **contest.env_options)
+        starts[name] = actions_of(*driver, case.seed)
+    env: gym.Env[Any, Any] = gym.make(contest.env_id, **contest.env_options)
     found = ceiling(env, case.seed, starts)
-    episode = Episode(
-        case.seed, found.cost, found.winner, found.costs, found.statuses, round(found.seconds, 1)
-    )
+    seconds = round(found.seconds, 1)
+    episode = Episode(case.seed, found.cost, found.winner, found.costs, found.statuses, seconds)
     write_text(case.path, json.dumps(asdict(episode)))
     return episode
 
@@ -134,64 +126,44 @@ def _finished(case: Case) -> Episode | None:
 
 
 def calibrate(
-    scenarios: Sequence[str],
+    contests: Sequence[Contest],
     folder: Path,
-    env_id: str = ENV_ID,
     seeds: int = SEEDS,
-    start: str = START,
-    estimator: str = ESTIMATOR,
     command: str = "",
     jobs: int | None = None,
     console: Console | None = None,
 ) -> list[Entry]:
-    """One entry a scenario.
+    """One entry a contest; folder: of finished cases, from which a stopped run goes on.
 
-    folder: of finished cases; a stopped run that is started again goes on from there.
-    Raises ValueError for an unknown scenario and fewer than two seeds (no standard error).
+    Raises ValueError for fewer than two seeds (no interval), ModuleNotFoundError, with what to
+    install, before the work rather than in a worker.
     """
-    unknown = [name for name in scenarios if name not in SCENARIOS]
-    if unknown:
-        raise ValueError(f"unknown scenario {', '.join(unknown)}; known: {', '.join(SCENARIOS)}")
     if seeds < 2:
-        raise ValueError(f"a standard error needs two seeds or more, got {seeds}")
-    import_solvers()
-    folder.mkdir(exist_ok=True)
-    cases = cases_of(scenarios, folder, env_id, seeds, start, estimator)
-    episodes = run_cases(measure, cases, "calibration", jobs, console)
-    entries = []
-    for i, scenario in enumerate(scenarios):
-        mine = episodes[i * seeds : (i + 1) * seeds]
-        best = np.array([episode.cost for episode in mine])
-        none = np.array([episode.costs["none"] for episode in mine])
-        entries.append(
-            Entry(
-                env_id,
-                scenario,
-                f"{env_id} {__version__}",
-                source_stamp("envs"),
-                SALT,
-                start,
-                estimator,
-                float(best.mean()),
-                float(best.std(ddof=1) / math.sqrt(seeds)),
-                float(none.mean()),
-                float(none.std(ddof=1) / math.sqrt(seeds)),
-                command,
-                tuple(mine),
-            )
-        )
-    return entries
-
-
-def cases_of(
-    scenarios: Sequence[str], folder: Path, env_id: str, seeds: int, start: str, estimator: str
-) -> list[Case]:
-    """Every episode, scenario by scenario."""
+        raise ValueError(f"an interval needs two seeds or more, got {seeds}")
+    try:
+        import casadi  # noqa: F401
+        import osqp  # noqa: F401
+    except ModuleNotFoundError:
+        raise ModuleNotFoundError(
+            "the clairvoyant needs CasADi and OSQP: pip install 'sideslip[mpc]'"
+        ) from None
+    folder.mkdir(parents=True, exist_ok=True)
+    cases = cases_of(contests, folder, seeds)
+    episodes = run_cases(solve, cases, "calibration", jobs, console)
     return [
-        Case(env_id, scenario, seed, start, estimator, str(folder))
-        for scenario in scenarios
-        for seed in calibration_seeds(env_id, scenario, seeds)
+        Entry(
+            **asdict(contest),
+            env_version=__version__,
+            command=command,
+            episodes=tuple(episodes[i * seeds : (i + 1) * seeds]),
+        )
+        for i, contest in enumerate(contests)
     ]
+
+
+def cases_of(contests: Sequence[Contest], folder: Path, seeds: int) -> list[Case]:
+    """Every episode, contest by contest."""
+    return [Case(c, seed, str(folder)) for c in contests for seed in seeds_of(c, seeds)]
 
 
 def forget(cases: Sequence[Case]) -> None:
@@ -203,22 +175,11 @@ def forget(cases: Sequence[Case]) -> None:
         folder.rmdir()
 
 
-def import_solvers() -> None:
-    """ModuleNotFoundError, with what to install, before the work rather than in a worker."""
-    try:
-        import casadi  # noqa: F401
-        import osqp  # noqa: F401
-    except ModuleNotFoundError:
-        raise ModuleNotFoundError(
-            "the clairvoyant needs CasADi and OSQP: pip install 'sideslip[mpc]'"
-        ) from None
-
-
-def read_calibration(path: str | Path = FILE) -> dict[tuple[str, str], Entry]:
-    """The entries of a file by (env id, scenario).
+def read_calibration(path: str | Path = FILE) -> dict[Contest, Entry]:
+    """The entries of a file by contest.
 
     Raises FileNotFoundError where there is none, ValueError, with file, entry and field, for one
-    that is cut short or lacks something.
+    that is cut short or lacks something, of another version or of other seeds.
     """
     entries = {}
     for i, each in enumerate(read_objects(path), 1):
@@ -228,13 +189,53 @@ def read_calibration(path: str | Path = FILE) -> dict[tuple[str, str], Entry]:
             raise ValueError(f"{where}: episodes is no list")
         made = (made_of(Episode, one, f"{where}, episode {k}") for k, one in enumerate(episodes, 1))
         entry = made_of(Entry, each | {"episodes": tuple(made)}, where)
-        entries[entry.env_id, entry.scenario] = entry
+        name = f"{where}, {entry.contest.name},"
+        if entry.env_version != __version__:
+            raise ValueError(f"{name} is stale: of version {entry.env_version}, not {__version__}")
+        if [one.seed for one in entry.episodes] != seeds_of(entry.contest, len(entry.episodes)):
+            raise ValueError(f"{name} is stale: its seeds are not this contest's")
+        entries[entry.contest] = entry
     return entries
 
 
 def update(path: str | Path, made: Sequence[Entry]) -> None:
     """Replace or add entries of a file, which is made if it is not there."""
     entries = read_calibration(path) if Path(path).exists() else {}
-    entries |= {(entry.env_id, entry.scenario): entry for entry in made}
-    ordered = [asdict(entries[key]) for key in sorted(entries)]
-    write_text(path, json.dumps(ordered, indent=1) + "\n")
+    entries |= {entry.contest: entry for entry in made}
+    ordered = sorted(entries.values(), key=lambda entry: entry.contest.name)
+    write_text(path, json.dumps([asdict(entry) for entry in ordered], indent=1) + "\n")
+
+
+def check_fresh(entries: Mapping[Contest, Entry], path: str | Path = FILE) -> None:
+    """ValueError, with the contest, where the uncontrolled car no longer costs what it did."""
+    for contest, entry in entries.items():
+        cell, seeds = Cell(contest, "", "none"), [episode.seed for episode in entry.episodes]
+        now = measure([cell], seeds, jobs=1).found[cell]
+        then = np.array([episode.costs["none"] for episode in entry.episodes])
+        if now.error or not np.allclose(now.costs, then, rtol=_SAME, atol=0.0):
+            raise ValueError(
+                f"{path}: {contest.name} is stale: the uncontrolled car costs {now.costs[0]:.6g} "
+                f"on its first seed, {then[0]:.6g} when it was calibrated; run sideslip calibrate"
+            )
+
+
+def driven_there(
+    entries: Mapping[Contest, Entry], cells: Sequence[Cell], **options: Any
+) -> Results:
+    """The cells of calibrated contests on the clairvoyant's seeds; options: of `measure`."""
+    found = Results()
+    for contest, entry in entries.items():
+        mine = [cell for cell in cells if cell.contest == contest]
+        seeds = [episode.seed for episode in entry.episodes]
+        found.found |= measure(mine, seeds, **options).found
+    return found
+
+
+def leads(entries: Mapping[Contest, Entry], there: Results) -> dict[Cell, Array]:
+    """(n,) log(J / J_clairvoyant) of each cell on the seeds that it survives."""
+    found = {}
+    for cell, driven in there.found.items():
+        if not driven.error and survived(driven).any():
+            best = entries[cell.contest].costs[: len(driven.costs)]
+            found[cell] = -gains(best, driven)[survived(driven)]
+    return found

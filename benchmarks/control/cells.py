@@ -1,53 +1,61 @@
-"""The matrix: manoeuvres, estimators, controllers, and the cells they make."""
+"""The matrix: contests, estimators, controllers, and the cells they make."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-YAW = "sideslip/YawFusion-v0"
-STEERING = "sideslip/AfsYawFusion-v0"
+from .contests import NOMINAL, PARAMETERS, STATE, STATES, STEERING, TIERS, YAW, Contest, oracle_of
 
-MANOEUVRES = (
-    *("random-steering", "sine-with-dwell", "double-lane-change", "step-steer", "gust"),
-    *("low-friction", "brake-in-turn", "stiffness-step", "sensor-outage", "uneven-delay"),
-)
-
-TRUTH, REFERENCE_FILTER, REFERENCE_CONTROLLER = "truth", "exact-kf", "two-dof"
-ESTIMATORS = (
-    *("bicycle-kf", "single-rate-kf", "multirate-residual-kf", "uneven-delay-kf", "dakf"),
-    *(REFERENCE_FILTER, TRUTH),
-)
-OTHER_ESTIMATORS = (
-    *("multirate-kf", "constant-delay-kf", "vision-only-kf", "course-kf", "double-layer"),
-    *("dual-rate", "lob", "lob-2"),
-)
-BLIND = ("none", "feedforward")
-"""Controllers that ignore the estimate: one cell a manoeuvre."""
-SEEING = ("esc", REFERENCE_CONTROLLER, "sliding-mode", "lqr")
-STEERING_CONTROLLERS = ("model-following", "lqr", "two-dof", "esc")
-INFORMED = "informed"
-SLOW_CONTROLLERS = ("mpc",)
-LEARNED: dict[str, tuple[tuple[str, str], ...]] = {
-    YAW: (("", "ppo-yaw-vision"),),
-    STEERING: (("", "ppo-yaw-vision"),),
+TRUTH, REFERENCE_CONTROLLER = "truth", "lqr"
+REFERENCE_FILTER = "exact-kf, all sensors"
+SETUPS: dict[str, tuple[str, dict[str, Any]]] = {
+    REFERENCE_FILTER: ("exact-kf", {"slow": ["camera", "gps"]}),
+    "exact-kf, no bias state": ("exact-kf", {"slow": ["camera", "gps"], "bias_sd": 0.0}),
+    "exact-kf, no accelerometer": ("exact-kf", {"slow": ["camera", "gps"], "fast": ["gyro"]}),
+    "exact-kf, camera": ("exact-kf", {"slow": ["camera"]}),
+    "exact-kf, gps": ("exact-kf", {"slow": ["gps"]}),
+    "multirate-kf, camera and gps": ("multirate-kf", {"slow": ["camera", "gps"]}),
 }
-"""(estimator, policy) in each table, a policy by its shipped name or path. One that was trained on
-fewer sensors reads what it knows by name."""
+"""Filters by what they are called in the tables: a name of `make_estimator` and its options, over
+the contestant's tuned ones where the filter is `exact-kf`."""
+ESTIMATORS = (*SETUPS, "single-rate-kf", "uneven-delay-kf", "dakf", "bicycle-kf", TRUTH)
+CONTROLLERS: dict[str, tuple[str, ...]] = {
+    YAW: ("two-dof", "esc", "sliding-mode", "mpc", "nmpc"),
+    STEERING: ("two-dof", "esc", "model-following", "nmpc"),
+}
+"""Besides the reference controller, on the reference filter."""
+RUNGS = (NOMINAL, PARAMETERS, STATE)
+LEARNED: tuple[tuple[str, str], ...] = (("", "ppo-yaw-vision"),)
+"""(estimator, policy), a policy by its shipped name or path; in tier 1, whose car it knows. One
+that was trained on fewer sensors reads what it knows by name."""
+SLOW_CONTROLLERS = ("mpc", "nmpc", STATES[1], PARAMETERS)
 
-EPISODES, QUICK_EPISODES, SLOW_EPISODES = 1000, 16, 64
+EPISODES, QUICK_EPISODES, SLOW_EPISODES = 1000, 8, 128
+QUICK_CONTESTS = 3
+"""Of each tier, in a quick run."""
+
+
+def some_of(contests: Sequence[Contest]) -> list[Contest]:
+    """`QUICK_CONTESTS` of each tier, from its first to its last."""
+    found = []
+    for tier in dict.fromkeys(contest.tier for contest in contests):
+        mine = [contest for contest in contests if contest.tier == tier]
+        step = max(len(mine) / QUICK_CONTESTS, 1.0)
+        found += [mine[int(i * step)] for i in range(min(QUICK_CONTESTS, len(mine)))]
+    return found
 
 
 @dataclass(frozen=True)
 class Cell:
     """One square of the matrix.
 
-    estimator: a name of `make_estimator`, "truth", or "" where the controller reads none (or
-    brings its own). controller: a name of `make_agent`. options: of the env, a scenario that has no
-    name among them; cells are equal whatever theirs are.
+    estimator: a name of `SETUPS` or of `make_estimator`, "truth", or "" where the controller reads
+    none or brings its own. controller: a name of `make_agent`, or a rung. options: of the env
+    beside the contest's, a scenario that has no name among them; cells are equal whatever theirs
+    are.
     """
 
-    env_id: str
-    scenario: str
+    contest: Contest
     estimator: str
     controller: str
     options: dict[str, Any] = field(default_factory=dict, compare=False)
@@ -60,32 +68,32 @@ class Cell:
     @property
     def env_options(self) -> dict[str, Any]:
         """Options of the env: an action that is none ends the episode."""
-        return {"scenario": self.scenario, "on_bad_action": "fail"} | self.options
+        return self.contest.env_options | {"on_bad_action": "fail"} | self.options
+
+    @property
+    def rung(self) -> str:
+        """The rung of the ladder that drives, "" where a contestant does."""
+        if self.controller == STATE:
+            return oracle_of(self.contest)
+        return self.controller if self.controller in (*RUNGS, *STATES) else ""
 
     @property
     def slow(self) -> bool:
         """Whether it takes so long to decide that it gets fewer episodes."""
-        return self.controller in SLOW_CONTROLLERS
+        return (self.rung or self.controller) in SLOW_CONTROLLERS
 
 
-def cells(manoeuvres: tuple[str, ...] = MANOEUVRES) -> Iterator[Cell]:
-    """Every cell of both tables, manoeuvre by manoeuvre."""
-    for scenario in manoeuvres:
-        for controller in (*BLIND, INFORMED):
-            yield Cell(YAW, scenario, "", controller)
-        for estimator, policy in LEARNED[YAW]:
-            yield Cell(YAW, scenario, estimator, policy)
-        for controller in SEEING:
-            for estimator in ESTIMATORS:
-                yield Cell(YAW, scenario, estimator, controller)
-        for estimator in OTHER_ESTIMATORS:
-            yield Cell(YAW, scenario, estimator, REFERENCE_CONTROLLER)
-        for controller in SLOW_CONTROLLERS:
-            yield Cell(YAW, scenario, REFERENCE_FILTER, controller)
-        for controller in (*BLIND, INFORMED):
-            yield Cell(STEERING, scenario, "", controller)
-        for estimator, policy in LEARNED[STEERING]:
-            yield Cell(STEERING, scenario, estimator, policy)
-        for controller in STEERING_CONTROLLERS:
-            yield Cell(STEERING, scenario, REFERENCE_FILTER, controller)
-        yield Cell(STEERING, scenario, "dakf", "model-following")  # the paper's own pair
+def cells(contests: Sequence[Contest], quick: bool = False) -> Iterator[Cell]:
+    """Every cell of the matrix, contest by contest; quick: without the slow contestants.
+
+    All estimators in the contests with the first of their tier's ids.
+    """
+    for contest in contests:
+        made = [Cell(contest, "", rung) for rung in (*RUNGS, "none")]
+        first = contest.tier not in TIERS or contest.env_id == TIERS[contest.tier][0][0]
+        filters = ESTIMATORS if first else (REFERENCE_FILTER, TRUTH)
+        made += [Cell(contest, name, REFERENCE_CONTROLLER) for name in filters]
+        made += [Cell(contest, REFERENCE_FILTER, who) for who in CONTROLLERS[contest.env_id]]
+        if contest.tier == "1":
+            made += [Cell(contest, estimator, policy) for estimator, policy in LEARNED]
+        yield from (cell for cell in made if not (quick and cell.slow and not cell.rung))

@@ -9,10 +9,12 @@ import numpy.typing as npt
 
 from ...agents.rollout import Step, steps_of
 from ...envs.arguments import actions_of
+from ...envs.record import FAST
 from ...envs.task.failures import FAILURES
 from ...envs.ticks import TICK
+from ...envs.vehicle.dynamics import Motion
 from ..harness.metrics import EPISODE, FOLDS, Moment
-from .build import make_contest
+from .build import make_cars
 from .cells import Cell
 
 Array = npt.NDArray[np.float64]
@@ -65,14 +67,23 @@ class _Tally:
         self.full = np.array([car.yaw_moment_limit, car.steering_authority])
         self.full[self.width :] = 0.0
         self.dt = base.control_period * TICK
+        self.base, self.radius = base, car.wheel_radius
         self.last, self.before = reset.info, np.zeros((base.num_envs, 2))
+        self.turned, self.aside = np.zeros((2, base.num_envs))
         self.steps, self.totals = np.zeros(base.num_envs), np.zeros((len(EPISODE), base.num_envs))
 
     def add(self, step: Step) -> None:
         asked = np.zeros_like(self.before)
         shares = actions_of(step.action, len(asked), self.width, fail=True)
         asked[:, : self.width] = np.clip(np.nan_to_num(shares), -1.0, 1.0)
-        moment = Moment(asked, self.before, step.reward, step.info, self.last, self.full, self.dt)
+        info, speed = step.info, self.base.motion[:, Motion._fields.index("v_x")]
+        self.turned += (info["gamma"] - info["gamma_ref"]) * self.dt
+        self.aside += speed * (self.turned + info["beta"] - info["beta_ref"]) * self.dt
+        torques = self.base.rows[:, -1, [FAST.torque_left, FAST.torque_right]]
+        power = np.abs(torques).sum(axis=1) * speed / self.radius
+        moment = Moment(
+            asked, self.before, step.reward, info, self.last, self.full, self.dt, self.aside, power
+        )
         for metric, total in zip(EPISODE, self.totals, strict=True):
             added = FOLDS[metric.fold].add(total, metric.of(moment))
             np.copyto(total, added, where=step.running)
@@ -97,7 +108,7 @@ def drive(chunk: Chunk) -> Driven:
 
 def _drive(chunk: Chunk) -> Driven:
     begun = time.process_time()
-    env, agent = make_contest(chunk.cell, len(chunk.seeds))
+    env, agent = make_cars(chunk.cell, len(chunk.seeds))
     steps = steps_of(env, agent, list(chunk.seeds))
     reset = next(steps)
     tally, series = _Tally(env.unwrapped, reset), [_signals(reset.info)]

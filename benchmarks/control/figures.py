@@ -1,7 +1,6 @@
 """The matrix's figures: heat maps, any cell's time series, price of delay, runs in motion."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,19 +14,20 @@ from ..harness.explorer import Explorer, Panel
 from ..harness.results import Suite
 from ..report.colours import INK, colour
 from ..report.kml import track_kml
-from .build import estimate_options
-from .cells import STEERING, YAW, Cell
-from .delay_price import DELAYS, Price, lines
+from .build import agent_options, estimate_options, name_of
+from .cells import REFERENCE_FILTER, Cell
+from .contests import Contest
+from .delay_price import DELAYS, PRICE_CONTEST, Price, lines
 from .episodes import SIGNALS
 from .run import Results
 from .tables import Standing
 
 _SHOWN = (  # in motion
-    Cell(YAW, "", "", "none"),
-    Cell(YAW, "", "multirate-residual-kf", "two-dof"),
-    Cell(YAW, "", "exact-kf", "lqr"),
+    ("", "none"),
+    ("multirate-kf, camera and gps", "two-dof"),
+    (REFERENCE_FILTER, "lqr"),
 )
-_MOVING = ("sine-with-dwell", "double-lane-change")
+_MOST = 2  # contests in motion
 _PANELS = (
     Panel("sideslip angle / mrad", (("beta", "true", "#0072B2"), ("beta_ref", "reference", INK))),
     Panel("yaw rate / (rad/s)", (("gamma", "true", "#0072B2"), ("gamma_ref", "reference", INK))),
@@ -48,34 +48,40 @@ def illustrate(
 
     seed: of the runs in motion.
     """
-    drives = {
-        m: {cell.label: run_of(replace(cell, scenario=m), seed) for cell in _SHOWN} for m in _MOVING
-    }
-    for manoeuvre, runs in drives.items():
+    contests = list(dict.fromkeys(cell.contest for cell in results.found))
+    moving = contests[:1] + contests[-1:] if len(contests) > 1 else contests
+    drives = {contest: runs_of(contest, seed) for contest in moving[:_MOST]}
+    for contest, runs in drives.items():
         tracks = {name: (run["X"], run["Y"]) for name, run in runs.items()}
-        text = track_kml(manoeuvre, tracks, {name: colour(name) for name in tracks})
-        suite.files.append((f"{manoeuvre}.kml", "application/vnd.google-earth.kml+xml", text))
+        text = track_kml(contest.name, tracks, {name: colour(name) for name in tracks})
+        file = f"{contest.name.replace(', ', '-')}.kml"
+        suite.files.append((file, "application/vnd.google-earth.kml+xml", text))
     try:
         from ..report.figures import curves
     except ModuleNotFoundError:
         return
     suite.explorers.append(_time_series(results))
-    for env_id, standings in found.items():
-        suite.figures += _maps(env_id, standings)
-    for what, label in (("score", "score"), ("over", "cost / cost of informed")):
-        shown = lines(prices, what)
-        if shown:
-            ms = 1e3 * np.array(DELAYS)
-            suite.figures.append(
-                (
-                    f"The price of delay: {label}",
-                    curves(ms, shown, "delay of camera and GPS / ms", label),
-                    "Random steering, camera every 50 ms, GPS every 200 ms. informed is designed "
-                    "for each delay; dividing by its cost leaves what a method loses by it.",
-                )
+    for tier, standings in found.items():
+        suite.figures += _maps(tier, standings)
+    shown = lines(prices)
+    if shown:
+        ms, label = 1e3 * np.array(DELAYS), "cost / nominal's with sensors in time"
+        suite.figures.append(
+            (
+                "The price of delay",
+                curves(ms, shown, "further delay of camera and GPS / ms", label),
+                f"{PRICE_CONTEST.name}: camera every 50 ms, GPS every 200 ms. Each filter is "
+                "designed for its delay.",
             )
-    for manoeuvre, runs in drives.items():
-        suite.figures.append(in_motion(f"In motion: {manoeuvre}, first test seed", runs))
+        )
+    for contest, runs in drives.items():
+        suite.figures.append(in_motion(f"In motion: {contest.name}, first test seed", runs))
+
+
+def runs_of(contest: Contest, seed: int) -> dict[str, Rollout]:
+    """One episode of each contestant that is shown in motion and can be driven there."""
+    cells = [Cell(contest, *shown) for shown in _SHOWN]
+    return {cell.label: run_of(cell, seed) for cell in cells}
 
 
 def in_motion(title: str, runs: Mapping[str, Rollout]) -> tuple[str, Any, str]:
@@ -92,39 +98,36 @@ def in_motion(title: str, runs: Mapping[str, Rollout]) -> tuple[str, Any, str]:
     return title, animation(t, paths, size), caption
 
 
-def _maps(env_id: str, standings: Sequence[Standing]) -> list[tuple[str, Any, str]]:
+def _maps(tier: str, standings: Sequence[Standing]) -> list[tuple[str, Any, str]]:
     from ..report.heat_maps import heat_map
 
     names = [each.label for each in standings]
-    scenarios = list(standings[0].by_scenario)
+    contests = list(dict.fromkeys(c for each in standings for c in each.results))
     figures = []
     for metric, good, text in (
-        ("score", "high", "0: the uncontrolled car, 1: the clairvoyant optimum."),
-        ("cost_over_informed", "low", "1: the LQG of the true car with the same sensors."),
-        ("spin_rate", "low", "The share of episodes in which the car spun."),
+        ("cost_vs_nominal", "low", "Over nominal's, the paired geometric mean; 1: nominal."),
+        ("failure_rate", "low", "The share of episodes in which the car spun or left the road."),
     ):
-        values = np.array(
-            [
-                [e.by_scenario[s][metric].value if metric in e.by_scenario[s] else np.nan
-                 for s in scenarios]
-                for e in standings
-            ]
-        )  # fmt: skip
+        values = np.full((len(standings), len(contests)), np.nan)
+        for i, each in enumerate(standings):
+            for j, contest in enumerate(contests):
+                if metric in each.by_contest.get(contest, {}):
+                    values[i, j] = each.by_contest[contest][metric].value
         if np.isfinite(values).any():
-            title = f"{env_id}: {metric.replace('_', ' ')} on every manoeuvre"
-            figures.append((title, heat_map(names, scenarios, values, metric, good), text))
+            title = f"Tier {tier}: {metric.replace('_', ' ')} in every contest"
+            columns = [contest.name for contest in contests]
+            figures.append((title, heat_map(names, columns, values, metric, good), text))
     return figures
 
 
 def _time_series(results: Results) -> Explorer:
     """Every cell's first test seed."""
-    tables = {YAW: "yaw moment", STEERING: "yaw moment and steering"}
     series: dict[tuple[str, ...], Array] = {
-        (tables[cell.env_id], cell.scenario, cell.controller, cell.estimator): result.series
+        (cell.contest.tier, cell.contest.name, cell.controller, cell.estimator): result.series
         for cell, result in results.found.items()
         if result.series is not None
     }
-    menus = ("action", "manoeuvre", "controller", "estimator")
+    menus = ("tier", "contest", "controller", "estimator")
     return over_time("Any cell over time (its first test seed)", menus, series)
 
 
@@ -143,5 +146,6 @@ def over_time(
 def run_of(cell: Cell, seed: int) -> Rollout:
     """One episode of a contestant in a single env."""
     estimate = estimate_options(cell) if cell.estimator else None
-    env = make_env(cell.env_id, cell.estimator, estimate, **cell.env_options)
-    return rollout(env, make_agent(cell.controller, env), seed)
+    name = name_of(cell.estimator)
+    env = make_env(cell.contest.env_id, name, estimate, **cell.env_options)
+    return rollout(env, make_agent(cell.controller, env, **agent_options(cell)), seed)

@@ -1,50 +1,53 @@
-"""All cells driven: the episodes of each."""
+"""All cells driven: the episodes of each, and finished cases on disk."""
 
+import contextlib
+import hashlib
+import json
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from rich.console import Console
 
+from ...agents.learned.files import stamp
+from ...envs.backend.cache import source_stamp
+from ...envs.backend.files import whole
 from ..harness.parallel import run_cases
-from .cache import CachedDrive
-from .cells import EPISODES, INFORMED, SLOW_EPISODES, Cell
-from .episodes import Chunk, Driven
-from .seeds import salted_seeds
+from .cells import SLOW_EPISODES, Cell
+from .contests import Contest
+from .episodes import NUMBERS, SIGNALS, Chunk, Driven, drive
 
 CHUNK = 250
-NOTEWORTHY = 2.0  # times informed's cost: what the uncontrolled car's is where control matters
+_LENGTH = 24
 
 
 @dataclass
 class Results:
-    """Every cell's episodes and the salt of the seeds."""
+    """Every cell's episodes."""
 
-    salt: str
     found: dict[Cell, Driven] = field(default_factory=dict)
 
-    def of(self, env_id: str, scenario: str, controller: str, estimator: str = "") -> Driven:
+    def of(self, contest: Contest, controller: str, estimator: str = "") -> Driven:
         """One cell; KeyError if it was not asked for."""
-        return self.found[Cell(env_id, scenario, estimator, controller)]
-
-    def worth_controlling(self, env_id: str, scenario: str) -> bool:
-        """Whether the uncontrolled car costs more than twice what informed does."""
-        none, informed = (self.of(env_id, scenario, who).costs for who in ("none", INFORMED))
-        return bool(none.mean() > NOTEWORTHY * informed.mean())
+        return self.found[Cell(contest, estimator, controller)]
 
 
 def measure(
     cells: Sequence[Cell],
-    episodes: int = EPISODES,
+    seeds: Sequence[int],
     *,
-    salt: str,
     jobs: int | None = None,
     console: Console | None = None,
     keep: Path | None = None,
 ) -> Results:
-    """Drive every cell on the first `episodes` test seeds of the salt (slow ones on fewer)."""
-    seeds = salted_seeds(salt, episodes)
+    """Drive every cell on the seeds, slow ones on the first of them.
+
+    keep: a folder in which finished cases stay, so that a run that was stopped goes on.
+    """
     chunks = []
     for cell in cells:
         mine = seeds[:SLOW_EPISODES] if cell.slow else seeds
@@ -52,12 +55,11 @@ def measure(
             Chunk(cell, tuple(mine[first : first + CHUNK]), keep=first == 0)
             for first in range(0, len(mine), CHUNK)
         ]
-    driven = run_cases(CachedDrive(keep, salt), chunks, "control", jobs, console)
-    results = Results(salt)
-    for cell in cells:
-        mine_driven = [d for c, d in zip(chunks, driven, strict=True) if c.cell is cell]
-        results.found[cell] = _joined(mine_driven)
-    return results
+    driven = run_cases(CachedDrive(keep), chunks, "control", jobs, console)
+    parts: dict[Cell, list[Driven]] = {}
+    for chunk, each in zip(chunks, driven, strict=True):
+        parts.setdefault(chunk.cell, []).append(each)
+    return Results({cell: _joined(each) for cell, each in parts.items()})
 
 
 def _joined(parts: list[Driven]) -> Driven:
@@ -67,3 +69,75 @@ def _joined(parts: list[Driven]) -> Driven:
         parts[0].series,
         next((part.error for part in parts if part.error), ""),
     )
+
+
+@dataclass(frozen=True)
+class CachedDrive:
+    """`drive` that looks in a folder first and leaves its result there; None caches nothing.
+
+    Results of other sources, plant and matrix included, or of a policy's other weights, are not
+    taken for ours.
+    """
+
+    folder: Path | None
+
+    def __call__(self, chunk: Chunk) -> Driven:
+        """The chunk's result, from the folder if it is there."""
+        if self.folder is None:
+            return drive(chunk)
+        path = self._path(chunk)
+        found = _read(path, chunk)
+        if found is not None:
+            return found
+        driven = drive(chunk)
+        if not driven.error:  # an error is worth another try
+            _write(path, driven)
+        return driven
+
+    def _path(self, chunk: Chunk) -> Path:
+        assert self.folder is not None
+        weights = stamp(chunk.cell.controller)
+        text = json.dumps([sources(), weights, chunk.cell.rung, asdict(chunk)], sort_keys=True)
+        return self.folder / f"{hashlib.sha256(text.encode()).hexdigest()[:_LENGTH]}.npz"
+
+
+@cache
+def sources() -> str:
+    """A hash of all files that an episode's numbers depend on."""
+    digest = hashlib.sha256(source_stamp("agents").encode())
+    for name in ("build.py", "cells.py", "contests.py", "episodes.py", "../harness/metrics.py"):
+        digest.update((Path(__file__).parent / name).read_bytes())
+    return digest.hexdigest()
+
+
+def _read(path: Path, chunk: Chunk) -> Driven | None:
+    """The chunk's result; None where the file is absent, damaged or another chunk's."""
+    shapes: dict[str, tuple[int, ...]] = {
+        "numbers": (len(chunk.seeds), len(NUMBERS)),
+        "seconds": (),
+    }
+    try:
+        with np.load(path, allow_pickle=False) as found:
+            arrays = dict(found)
+        if chunk.keep:
+            shapes["series"] = len(arrays["series"]), 1 + len(SIGNALS)
+        if not all(_fits(arrays[name], shape) for name, shape in shapes.items()):
+            return None
+    except Exception:  # whatever NumPy, zipfile and zlib find wrong with it
+        return None
+    return Driven(arrays["numbers"], float(arrays["seconds"]), arrays.get("series"))
+
+
+def _fits(array: npt.NDArray[Any], shape: tuple[int, ...]) -> bool:
+    return array.dtype == np.float64 and array.shape == shape and bool(np.isfinite(array).all())
+
+
+def _write(path: Path, driven: Driven) -> None:
+    """A full disk loses the file, not the run."""
+    arrays: dict[str, Any] = {"numbers": driven.numbers, "seconds": np.array(driven.seconds)}
+    if driven.series is not None:
+        arrays["series"] = driven.series
+    with contextlib.suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with whole(path) as file:
+            np.savez_compressed(file, **arrays)

@@ -1,102 +1,76 @@
-"""From episode costs to scores: 0 is the uncontrolled car, 1 the clairvoyant optimum.
+"""From episode costs to scores: 0 is `nominal`, 1 is `oracle-state`, everything paired by episode.
 
-score = (mean J_none - J) / (mean J_none - mean J_clairvoyant), so that the mean of the episodes'
-scores is the score of the mean cost. Aggregates over manoeuvres are the mean and rliable's
-interquartile mean with its stratified bootstrap (Agarwal et al., Deep Reinforcement Learning at the
-Edge of the Statistical Precipice): seeds are drawn anew within each manoeuvre, the same ones for
-everybody, the uncontrolled car included.
+r = log((J_nominal + 0.001) / (J + 0.001)), clipped to +-3, over the episodes that both rungs
+survive; a contestant's failure there counts log(1 / 20). The score is the sum over contests of the
+mean r over that of the oracle's: a ratio of sums, so that no small gap decides.
 """
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.stats import trim_mean
 
-from ..harness.stats import Estimate
+from ..harness.stats import Estimate, ratio_of_sums
+from .episodes import Array, Driven
 
-Array = npt.NDArray[np.float64]
+NOTHING = 0.05
+"""A mean gap below which there is nothing to win."""
+_FLOOR, _CLIP = 0.001, 3.0
+_FAILED = math.log(1.0 / 20.0)
 
-RESAMPLES = 400
-_TAIL = 2.5  # percent on either side of a 95 % interval
-_QUARTER = 0.25
+
+def survived(driven: Driven) -> npt.NDArray[np.bool_]:
+    """(seeds,) whether an episode ended by no failure."""
+    return np.asarray(driven["failure"] == 0.0)
+
+
+def gains(nominal: Array, driven: Driven) -> Array:
+    """(n,) r of the first n episodes; nominal: (n,) costs of the same seeds."""
+    n = len(nominal)
+    with np.errstate(invalid="ignore"):
+        r = np.log((nominal + _FLOOR) / (driven.costs[:n] + _FLOOR))
+    return np.where(survived(driven)[:n], np.clip(r, -_CLIP, _CLIP), _FAILED)
 
 
 @dataclass(frozen=True)
-class Ceiling:
-    """mean: J_clairvoyant of a scenario. error: its standard error."""
+class Yardstick:
+    """What 0 and 1 are in a contest: the episodes of `nominal` and `oracle-state`.
 
-    mean: float
-    error: float
-
-
-class Resampled:
-    """The same bootstrap draws for everybody in a table.
-
-    seeds: episodes of a manoeuvre. manoeuvres: how many. Everything is deterministic.
+    Raises ValueError with the reason where one of them was not driven.
     """
 
-    def __init__(self, seeds: int, manoeuvres: int) -> None:
-        rng = np.random.default_rng(0)
-        self.draws = rng.integers(0, seeds, (RESAMPLES, manoeuvres, seeds))
-        self.normal = rng.standard_normal((RESAMPLES, manoeuvres))
+    nominal: Driven
+    oracle: Driven
 
-    def score(self, none: Array, costs: Array, ceiling: Ceiling, which: int) -> Estimate:
-        """The score of one manoeuvre; none, costs: (seeds,) of the same episodes."""
-        value = float(normalised(none, costs, ceiling).mean())
-        picked = self.draws[:, which, :]
-        top = ceiling.mean + ceiling.error * self.normal[:, which]
-        base = none[picked].mean(axis=1)
-        return _estimate(value, (base - costs[picked].mean(axis=1)) / (base - top))
+    def __post_init__(self) -> None:
+        for name, rung in (("nominal", self.nominal), ("oracle-state", self.oracle)):
+            if rung.error:
+                raise ValueError(f"{name}: {rung.error}")
 
-    def over(self, costs: Array, others: Array, which: int) -> Estimate:
-        """mean(costs) / mean(others) on the same episodes."""
-        picked = self.draws[:, which, :]
-        spread = costs[picked].mean(axis=1) / others[picked].mean(axis=1)
-        return _estimate(float(costs.mean() / others.mean()), spread)
+    def kept(self, n: int) -> npt.NDArray[np.bool_]:
+        """(m,) of at most n episodes: which of them both survive."""
+        n = min(n, len(self.nominal.costs), len(self.oracle.costs))
+        return survived(self.nominal)[:n] & survived(self.oracle)[:n]
 
-    def mean(self, values: Array, which: int) -> Estimate:
-        """The mean over seeds."""
-        return _estimate(float(values.mean()), values[self.draws[:, which, :]].mean(axis=1))
+    def paired(self, driven: Driven) -> tuple[Array, Array]:
+        """(r of a contestant, r of the oracle) on the same episodes, those that count."""
+        kept = self.kept(len(driven.costs))
+        nominal = self.nominal.costs[: len(kept)]
+        return gains(nominal, driven)[kept], gains(nominal, self.oracle)[kept]
 
-    def aggregate(self, none: Array, costs: Array, tops: list[Ceiling]) -> dict[str, Estimate]:
-        """{"score", "iqm"} over manoeuvres; none, costs: (manoeuvres, seeds)."""
-        own = np.array([normalised(*each) for each in zip(none, costs, tops, strict=True)])
-        means, middles = np.empty(RESAMPLES), np.empty(RESAMPLES)
-        rows = np.arange(len(none))[:, None]
-        for b, picked in enumerate(self.draws[:, : len(none)]):
-            again, against = costs[rows, picked], none[rows, picked]
-            drawn = np.array(
-                [
-                    normalised(n, c, Ceiling(t.mean + t.error * self.normal[b, i], 0.0))
-                    for i, (n, c, t) in enumerate(zip(against, again, tops, strict=True))
-                ]
-            )
-            means[b], middles[b] = drawn.mean(), trim_mean(drawn, _QUARTER, axis=None)
-        return {
-            "score": _estimate(float(own.mean()), means),
-            "iqm": _estimate(float(trim_mean(own, _QUARTER, axis=None)), middles),
-        }
+    @property
+    def gap(self) -> float:
+        """The oracle's mean r; NaN where no episode counts."""
+        _, own = self.paired(self.oracle)
+        return float(own.mean()) if len(own) else math.nan
 
 
-def normalised(none: Array, costs: Array, ceiling: Ceiling) -> Array:
-    """(seeds,) each episode's share of what could be gained on average."""
-    base = none.mean()
-    return np.asarray((base - costs) / (base - ceiling.mean))
-
-
-def improvement(costs: Array, others: Array) -> float:
-    """Probability that an episode of the one costs less than one of the other, ties half: rliable's
-    probability of improvement, the Mann-Whitney statistic. costs (n,), others (m,); NaN if one is.
-    """
-    if not (np.isfinite(costs).all() and np.isfinite(others).all()):
-        return float("nan")
-    ordered = np.sort(others)
-    after = np.searchsorted(ordered, costs, side="right")
-    ties = after - np.searchsorted(ordered, costs)
-    return float(np.mean(len(ordered) - after + 0.5 * ties)) / len(ordered)
-
-
-def _estimate(value: float, spread: Array) -> Estimate:
-    low, high = np.percentile(spread, [_TAIL, 100.0 - _TAIL])
-    return Estimate(value, float(low), float(high))
+def score(pairs: Sequence[tuple[Array, Array]]) -> Estimate:
+    """The score over contests from each one's `Yardstick.paired`, those that have no episode left
+    out; NaN where nothing is to be won."""
+    there = [pair for pair in pairs if len(pair[0])]
+    if not there or np.mean([own.mean() for _, own in there]) < NOTHING:
+        return Estimate(math.nan)
+    return ratio_of_sums([r for r, _ in there], [own for _, own in there])

@@ -1,6 +1,7 @@
 """Test seeds that nobody can have tuned on: they change with the contestants and the env."""
 
 import hashlib
+import re
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from ...agents.learned.files import ENDING
 _PACKAGE = Path(__file__).resolve().parents[2]
 _CONTESTANTS = {"estimators": (".py", ".toml"), "agents": (".py", ".toml", ENDING)}
 _LENGTH = 16
+_TUNING = 2**29  # the clairvoyant's are beyond 2^30
 
 
 def salt_of(*more: str) -> str:
@@ -31,6 +33,13 @@ def salted_seeds(salt: str, n: int) -> list[int]:
 
     Raises ValueError for a salt that is not hexadecimal.
     """
+    if not re.fullmatch("[0-9a-f]+", salt):
+        raise ValueError(f"a salt is hexadecimal digits, got {salt!r}")
     words = [int(salt[i : i + 8], 16) for i in range(0, len(salt), 8)]
     children = np.random.SeedSequence(words).spawn(n)
     return [int(child.generate_state(1)[0]) for child in children]
+
+
+def tuning_seeds(n: int) -> list[int]:
+    """The first n seeds on which contests are chosen and controllers tuned: no test's."""
+    return list(range(_TUNING, _TUNING + n))

@@ -1,35 +1,44 @@
-"""Question: which estimator with which controller keeps the car where it should be, and how far is
-that from the best possible? The matrix of both on ten manoeuvres."""
+"""Question: which estimator and which controller keeps the car where it should be, and how far is
+that from knowing its state? The matrix of both on the scored contests of four tiers."""
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
 from rich.console import Console
 
 from ... import __version__
 from ...agents.learned.files import is_policy, load_policy
 from ..harness.results import Row, Suite, Table
-from .ceiling import calibrated_by, judged, refusals_of, tops_of
-from .cells import EPISODES, LEARNED, STEERING, YAW, cells
-from .decision_time import decision_time
-from .delay_price import DELAYS, SCENARIO, Price, price_of_delay
+from .build import decision_time
+from .calibration import FILE, Entry, check_fresh, driven_there, leads, read_calibration
+from .cells import EPISODES, LEARNED, Cell, cells, some_of
+from .contests import STATE, TITLES, Contest, contests
+from .delay_price import DELAYS, PRICE_CONTEST, Price, price_of_delay
+from .episodes import Array
 from .figures import illustrate
+from .ladder import (
+    answer,
+    below_the_clairvoyant,
+    findings,
+    knowledge_table,
+    ladder_table,
+    refusals_of,
+    yardsticks,
+)
 from .run import Results, measure
 from .seeds import salt_of, salted_seeds
-from .tables import Standing, main_table, motion_table, rows_of, standings, yardsticks
+from .tables import Standing, contest_table, main_table, motion_table, rows_of, standings
 
-PRICE_SHARE = 0.2  # of the matrix's episodes
-TITLES = {YAW: "Yaw moment by two motors", STEERING: "Yaw moment and added steering"}
+PRICE_SHARE = 0.1  # of the matrix's episodes
 _TEXT = """\
-Ten manoeuvres with drawn tyres, friction, speed and steering; camera (33 ms, 30 ms late), GPS and \
-gyro; everybody, the uncontrolled car included, drives the same salted seeds. score: 0 is the \
-uncontrolled car, 1 the clairvoyant optimum, which knows the truth and the disturbances ahead; \
-IQM is the interquartile mean of the episodes' scores. `informed` is the LQG of the true car with \
-the same sensors, as it is at the start: cost / informed is 1 where nothing better can be made of \
-them on a linear plant whose tyres do not change. \
-Intervals are 95 % bootstraps, stratified by manoeuvre.
-
-An estimator uses its own sensors only, camera or GPS; "truth" is an estimator without error. \
-Controllers know the nominal car alone."""
+Everybody drives the same salted seeds, and everything is paired by episode. `nominal` is the LQG \
+that knows the nominal car, `oracle-parameters` knows car, friction and biases, `oracle-state` the \
+state too. score: 0 is nominal, 1 oracle-state, a ratio of sums over the contests. Only episodes \
+that both rungs survive are compared, a contestant's failure there counts as 20 times the cost; \
+failure rates are of all episodes, and rank where nominal fails in more than 10 %. Intervals \
+are 95 %. What is not won: a contest without the verdict "scored" in contests.json leaves too \
+little between the rungs to tell methods apart."""
 
 
 def run(
@@ -37,42 +46,94 @@ def run(
     jobs: int | None = None,
     console: Console | None = None,
     keep: Path | None = None,
+    quick: bool = False,
+    clairvoyant: Path | None = None,
 ) -> Suite:
-    """Both tables, the price of delay, and pictures.
+    """All tiers, the ladder, the price of delay, and pictures.
 
-    episodes: a cell (slow controllers have at most 64). keep: a folder in which finished cases
-    stay, so that a run that was stopped goes on.
+    episodes: a cell (slow controllers have at most 128). keep: a folder in which finished cases
+    stay, so that a run that was stopped goes on. quick: a few contests, without the slow
+    contestants. clairvoyant: a file of `sideslip calibrate`, None: the package's, if there is one.
     """
     salt = salt_of()
-    suite = Suite("control", "Which controller and estimator hold the car", _TEXT)
-    results = measure(list(cells()), episodes, salt=salt, jobs=jobs, console=console, keep=keep)
-    found, tops, yard, more = {}, {}, [], []
-    for env_id, title in TITLES.items():
-        tops[env_id], log = tops_of(results, env_id)
-        found[env_id] = standings(results, env_id, tops[env_id])
-        for each in found[env_id]:
-            if not any(result.error for result in each.results.values()):
-                each.us = decision_time(each.cell)
+    played = some_of(contests()) if quick else list(contests())
+    asked = list(cells(played, quick))
+    entries = _calibrated(clairvoyant, played)
+    seeds = salted_seeds(salt, episodes)
+    results = measure(asked, seeds, jobs=jobs, console=console, keep=keep)
+    there = driven_there(entries, asked, jobs=jobs, console=console, keep=keep)
+    suite = Suite("control", "Which controller and estimator hold the car", "")
+    tiers = {tier: [c for c in played if c.tier == tier] for tier in TITLES}
+    tiers = {tier: those for tier, those in tiers.items() if those}
+    found, foreseen, more = {}, _foreseen(entries, there), []
+    for tier, those in tiers.items():
+        found[tier] = standings(results.found, tier, yardsticks(results, those))
+        for each in found[tier]:
+            if each.driven:
+                each.us = decision_time(next(cell for cell in asked if _is_of(cell, each)))
             suite.rows += rows_of(each, salt)
-        note = " ".join([_note(found[env_id], episodes), *_learned(env_id), *log])
-        suite.tables.append(main_table(f"{title} ({env_id})", found[env_id], note))
-        more.append(motion_table(f"{title}: the motion", found[env_id]))
-        yard.append(yardsticks(results, env_id, tops[env_id]))
-    suite.tables += [*yard, *more]
+        title = f"Tier {tier}: {TITLES[tier]}"
+        note = " ".join([_NOTE, *findings(found[tier]), *(_learned() if tier == "1" else ())])
+        suite.tables.append(main_table(title, found[tier], note))
+        more += [contest_table(f"{title}, contest by contest", found[tier], those)]
+        more += [motion_table(f"{title}: the motion", found[tier])]
+    suite.tables.append(knowledge_table(results, tiers, foreseen))
+    ladder = ladder_table(results, played, foreseen)
+    ladder.note += _beaten(entries, there)
+    suite.tables += [ladder, *more]
     share = max(4, round(PRICE_SHARE * episodes))
-    top = tops[YAW][SCENARIO] if SCENARIO in judged(results, YAW, tops[YAW]) else None
-    prices, late = price_of_delay(top, share, salt=salt, jobs=jobs, console=console, keep=keep)
+    prices, late = price_of_delay(seeds[:share], jobs=jobs, console=console, keep=keep)
     suite.rows += _price_rows(prices, share, salt)
     suite.tables += _refusals([results, *late])
-    illustrate(suite, found, results, prices, salted_seeds(salt, 1)[0])
-    spent = sum(cell.seconds for each in (results, *late) for cell in each.found.values())
-    suite.text += f"\n\nDriven in {spent / 60.0:.1f} CPU-minutes. {calibrated_by()}"
+    illustrate(suite, found, results, prices, seeds[0])
+    spent = np.nansum([c.seconds for each in (results, there, *late) for c in each.found.values()])
+    suite.text = f"{answer(found)}\n\n{_TEXT} Driven in {spent / 60.0:.1f} CPU-minutes."
     return suite
 
 
-def _learned(env_id: str) -> list[str]:
-    """The training of the policies in a table."""
-    cards = {name: load_policy(name).card for _, name in LEARNED[env_id] if is_policy(name)}
+_NOTE = (
+    "won: share of the compared episodes that cost less than nominal's. worst 5 %: their mean "
+    "cost. contests: with an episode that counts. left out: episodes that nominal or oracle-state "
+    "did not survive. A decision is the estimator's step and the controller's, of one car."
+)
+
+
+def _is_of(cell: Cell, standing: Standing) -> bool:
+    """Whether it is a cell that the contestant drove without an error."""
+    same = (cell.controller, cell.estimator) == (standing.cell.controller, standing.cell.estimator)
+    return same and cell.contest in standing.driven
+
+
+def _calibrated(path: Path | None, played: Sequence[Contest]) -> dict[Contest, Entry]:
+    """The clairvoyant's entries of contests; ValueError where one is stale."""
+    path = FILE if path is None and FILE.is_file() else path
+    if path is None:
+        return {}
+    read = read_calibration(path)
+    entries = {contest: each for contest, each in read.items() if contest in played}
+    check_fresh(entries, path)
+    return entries
+
+
+def _foreseen(entries: Mapping[Contest, Entry], there: Results) -> dict[Contest, Array]:
+    """(n,) log(J_oracle-state / J_clairvoyant) of each calibrated contest."""
+    return {c.contest: each for c, each in leads(entries, there).items() if c.controller == STATE}
+
+
+def _beaten(entries: Mapping[Contest, Entry], there: Results) -> str:
+    """Who costs less than the clairvoyant on its own seeds."""
+    if not entries:
+        return ""
+    found = leads(entries, there)
+    names = [f"{cell.label} ({cell.contest.name})" for cell in found]
+    below = below_the_clairvoyant(names, list(found.values()))
+    who = f"below it: {'; '.join(below)}" if below else "nobody is below it (Holm-corrected)"
+    return f" On the clairvoyant's seeds {who}."
+
+
+def _learned() -> list[str]:
+    """The training of the policies in the table."""
+    cards = {name: load_policy(name).card for _, name in LEARNED if is_policy(name)}
     return [
         f"{name}: {card.algorithm}, {card.steps:.2g} steps of {card.env_id} alone, "
         f"for the reference {card.reference}."
@@ -80,42 +141,32 @@ def _learned(env_id: str) -> list[str]:
     ]
 
 
-def _refusals(all_results: list[Results]) -> list[Table]:
+def _refusals(all_results: Sequence[Results]) -> list[Table]:
     lines = [line for results in all_results for line in refusals_of(results)]
     if not lines:
         return []
-    header = ("env", "manoeuvre", "controller and estimator", "what happened")
+    header = ("tier", "contest", "controller and estimator", "what happened")
     note = (
         "The share of a cell's episodes; the rest of a failed one is charged at the highest cost."
     )
     return [Table("Cells that went wrong", header, lines, note, keyed=False)]
 
 
-def _price_rows(prices: list[Price], n: int, salt: str) -> list[Row]:
+def _price_rows(prices: Sequence[Price], n: int, salt: str) -> list[Row]:
     """Rows of the price of delay; the scenario has the delay."""
     return [
         Row.of(
-            metric,
+            "cost_vs_nominal",
             each,
             suite="control",
-            scenario=f"{SCENARIO}, sensors {1e3 * delay:.0f} ms late",
+            scenario=f"{PRICE_CONTEST.name}, sensors {1e3 * delay:.0f} ms late",
             estimator=price.cell.estimator,
             controller=price.cell.controller,
             n=n,
             salt=salt,
-            env_version=f"{YAW} {__version__}",
+            env_version=f"{PRICE_CONTEST.env_id} {__version__}",
         )
         for price in prices
-        for metric, series in (("score", price.score), ("cost_over_informed", price.over))
-        for delay, each in zip(DELAYS[: len(series)], series, strict=True)
+        for delay, each in zip(DELAYS[: len(price.over)], price.over, strict=True)
+        if np.isfinite(each.value)
     ]
-
-
-def _note(found: list[Standing], episodes: int) -> str:
-    widths = [s.overall["score"].half_width for s in found if "score" in s.overall]
-    wide = f" The widest interval of a score is +-{max(widths):.3f}." if widths else ""
-    return (
-        f"{episodes} episodes a manoeuvre, mpc at most 64.{wide} better: probability that an "
-        "episode costs less than one of two-dof on exact-kf. A decision is the estimator's step "
-        "and the controller's, of one car."
-    )

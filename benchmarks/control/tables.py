@@ -1,6 +1,8 @@
 """The matrix as rows for machines and tables for people."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import gymnasium as gym
@@ -9,31 +11,30 @@ import numpy as np
 from ... import __version__
 from ..harness.metrics import EPISODE
 from ..harness.results import Row, Table
-from ..harness.stats import Estimate
-from .ceiling import judged
-from .cells import INFORMED, REFERENCE_CONTROLLER, REFERENCE_FILTER, Cell
-from .episodes import NUMBERS, Driven, control_period
-from .run import Results
-from .scores import Ceiling, Resampled, improvement
+from ..harness.stats import Estimate, average, geometric_mean, share, won, worst
+from .cells import Cell
+from .contests import Contest
+from .episodes import Array, Driven, control_period
+from .scores import NOTHING, Yardstick, score, survived
 
 RATES = {"spin": "spin_rate", "off-road": "departure_rate"}
 _FAILED = {"not-finite": "not_finite_rate", "bad-action": "bad_action_rate"}
-_MEANS = tuple(name for name in NUMBERS if name not in ("cost", "failure"))
+_OFTEN = 0.1  # nominal's failure rate above which failures rank
+
+Yardsticks = Mapping[Contest, Yardstick]
 
 
 @dataclass
 class Standing:
-    """A contestant over all manoeuvres of a table.
+    """A contestant over the contests of a tier.
 
-    by_scenario: {scenario: {metric: Estimate}}. overall: "score" and "iqm" over the scored
-    manoeuvres, "cost_over_informed" (the geometric mean) and "probability_of_improvement" (on
-    two-dof with exact-kf, without interval) over all.
+    results: of all contests that it was to drive, errors among them. yards: of the tier.
     """
 
+    tier: str
     cell: Cell
-    results: dict[str, Driven]
-    by_scenario: dict[str, dict[str, Estimate]]
-    overall: dict[str, Estimate]
+    results: dict[Contest, Driven]
+    yards: Yardsticks
     us: float = float("nan")
 
     @property
@@ -41,104 +42,126 @@ class Standing:
         """As in tables and figures."""
         return self.cell.label
 
+    @cached_property
+    def driven(self) -> dict[Contest, Driven]:
+        """The contests without an error."""
+        return {contest: each for contest, each in self.results.items() if not each.error}
+
+    @cached_property
+    def pairs(self) -> dict[Contest, tuple[Array, Array]]:
+        """r of the contestant and of the oracle on the episodes that count, where any do."""
+        made = {c: self.yards[c].paired(each) for c, each in self.driven.items() if c in self.yards}
+        return {contest: pair for contest, pair in made.items() if len(pair[0])}
+
+    @cached_property
+    def by_contest(self) -> dict[Contest, dict[str, Estimate]]:
+        """Every metric of every contest that was driven."""
+        return {contest: self._metrics(contest) for contest in self.driven}
+
+    @cached_property
+    def overall(self) -> dict[str, Estimate]:
+        """Over all contests; failures of all episodes, NaN where none was driven."""
+        all_failed = [~survived(each) for each in self.driven.values()]
+        failed = np.concatenate(all_failed) if all_failed else np.empty(0)
+        found = {"failure_rate": share(failed)}
+        if self.pairs:
+            found["cost_vs_nominal"] = geometric_mean(*(-r for r, _ in self.pairs.values()))
+            found["score"] = score(list(self.pairs.values()))
+            yards = {c: self.yards[c].nominal.costs for c in self.pairs}
+            mine = np.concatenate([self.driven[c].costs[: len(yards[c])] for c in yards])
+            nominal = np.concatenate([yards[c][: len(self.driven[c].costs)] for c in yards])
+            found["share_won"] = won(mine, nominal)
+            found["worst_cost"] = worst(mine)
+        return found
+
+    @property
+    def excluded(self) -> int:
+        """Episodes of the compared ones that nominal or the oracle did not survive."""
+        everything = sum(len(self.yards[c].kept(len(self.driven[c].costs))) for c in self.pairs)
+        return everything - self.n
+
+    @property
+    def n(self) -> int:
+        """Episodes that count."""
+        return sum(len(r) for r, _ in self.pairs.values())
+
     def mean(self, name: str) -> float:
-        """A number of NUMBERS over all episodes of all manoeuvres."""
-        return float(np.mean([driven[name].mean() for driven in self.results.values()]))
+        """A number of `EPISODE` over all contests in which it means something."""
+        turning = next(metric.turning for metric in EPISODE if metric.name == name)
+        means = [
+            each[name].mean()
+            for contest, each in self.driven.items()
+            if not (turning and contest.reference == "zero-slip")
+        ]
+        return float(np.mean(means)) if means else float("nan")
 
-    def rate(self, failure: str) -> float:
-        """The share of episodes of all manoeuvres that ended so."""
-        return float(np.mean([driven.failed(failure).mean() for driven in self.results.values()]))
-
-
-def standings(results: Results, env_id: str, tops: dict[str, Ceiling]) -> list[Standing]:
-    """Every contestant of a table, the best first; tops: the ceilings by manoeuvre."""
-    cells = [cell for cell in results.found if cell.env_id == env_id]
-    contestants: dict[tuple[str, str], Cell] = {}
-    for cell in cells:
-        contestants.setdefault((cell.controller, cell.estimator), cell)
-    scenarios = list(dict.fromkeys(cell.scenario for cell in cells))
-    scored = judged(results, env_id, tops)
-    draws: dict[int, Resampled] = {}
-    found = []
-    for (controller, estimator), first in contestants.items():
-        mine = {s: results.of(env_id, s, controller, estimator) for s in scenarios}
-        n = len(mine[scenarios[0]].costs)
-        draw = draws.setdefault(n, Resampled(n, len(scenarios)))
-        yard = {s: results.of(env_id, s, "none").costs[:n] for s in scenarios}
-        informed = {s: results.of(env_id, s, INFORMED).costs[:n] for s in scenarios}
-        by = {
-            s: _metrics(draw, i, mine[s], yard[s], informed[s], tops[s] if s in scored else None)
-            for i, s in enumerate(scenarios)
-        }
-        overall = {}
-        if scored:
-            none, costs = [yard[s] for s in scored], [mine[s].costs for s in scored]
-            overall = draw.aggregate(np.array(none), np.array(costs), [tops[s] for s in scored])
-        overall["cost_over_informed"] = _geometric([by[s]["cost_over_informed"] for s in scenarios])
-        overall["probability_of_improvement"] = _improvement(results, env_id, mine)
-        found.append(Standing(first, mine, by, overall))
-    return sorted(found, key=lambda each: -_rank(each))
+    def _metrics(self, contest: Contest) -> dict[str, Estimate]:
+        driven = self.driven[contest]
+        found = {"failure_rate": share(~survived(driven)), "worst_cost": worst(driven.costs)}
+        if contest in self.pairs:
+            r, own = self.pairs[contest]
+            nominal = self.yards[contest].nominal.costs
+            n = min(len(nominal), len(driven.costs))
+            found["cost_vs_nominal"] = geometric_mean(-r)
+            found["score"] = score([(r, own)])
+            found["gap"] = average(own)
+            found["share_won"] = won(driven.costs[:n], nominal[:n])
+        for metric in EPISODE:
+            if metric.name != "failure":
+                found[metric.name] = average(driven[metric.name])
+        for failure, name in (RATES | _FAILED).items():
+            found[name] = share(driven.failed(failure))
+        return found
 
 
-def _rank(standing: Standing) -> float:
-    score = standing.overall["score"].value if "score" in standing.overall else np.nan
-    if np.isnan(score):
-        score = -standing.overall["cost_over_informed"].value
-    return -np.inf if np.isnan(score) else score
-
-
-def _metrics(
-    draw: Resampled, which: int, mine: Driven, none: Any, informed: Any, top: Ceiling | None
-) -> dict[str, Estimate]:
-    found = {
-        "cost": draw.mean(mine.costs, which),
-        "cost_over_informed": draw.over(mine.costs, informed, which),
-    }
-    if top is not None:
-        found["score"] = draw.score(none, mine.costs, top, which)
-    for name in _MEANS:
-        found[name] = draw.mean(mine[name], which)
-    for failure, metric in (RATES | _FAILED).items():
-        found[metric] = draw.mean(mine.failed(failure), which)
-    return found
-
-
-def _improvement(results: Results, env_id: str, mine: dict[str, Driven]) -> Estimate:
-    """Over the reference pair, on every manoeuvre alike."""
-    pairs = [
-        (r.costs, results.of(env_id, s, REFERENCE_CONTROLLER, REFERENCE_FILTER).costs)
-        for s, r in mine.items()
+def standings(found: Mapping[Cell, Driven], tier: str, yards: Yardsticks) -> list[Standing]:
+    """Every contestant of a tier, the best first: by failures where nominal fails in more than
+    10 %, else by score."""
+    mine: dict[tuple[str, str], list[Cell]] = {}
+    for cell in found:
+        if cell.contest.tier == tier:
+            mine.setdefault((cell.controller, cell.estimator), []).append(cell)
+    made = [
+        Standing(tier, cells[0], {cell.contest: found[cell] for cell in cells}, yards)
+        for cells in mine.values()
     ]
-    value = float(np.mean([improvement(ours, theirs) for ours, theirs in pairs]))
-    return Estimate(value)
+    failing = [1.0 - survived(yard.nominal).mean() for yard in yards.values()]
+    by_failures = bool(failing) and float(np.mean(failing)) > _OFTEN
+    return sorted(made, key=lambda each: _rank(each, by_failures))
 
 
-def _geometric(ratios: list[Estimate]) -> Estimate:
-    """The geometric mean of ratios; its interval as if the manoeuvres' were independent."""
-    logs = np.log([each.value for each in ratios])
-    errors = np.log([[each.low, each.high] for each in ratios]) - logs[:, None]
-    low, high = np.sqrt((errors**2).sum(axis=0)) / len(logs)
-    middle = logs.mean()
-    return Estimate(*np.exp([middle, middle - low, middle + high]).tolist())
+def _rank(standing: Standing, by_failures: bool) -> tuple[float, float]:
+    """Smaller is better; what has no number comes last."""
+    value = standing.overall.get("score", Estimate(float("nan"))).value
+    failed = standing.overall["failure_rate"].value if by_failures else 0.0
+    return tuple(np.nan_to_num([failed, -value], nan=np.inf).tolist())
 
 
 def rows_of(standing: Standing, salt: str) -> list[Row]:
-    """One row a metric and manoeuvre, and the aggregates under the scenario "all"."""
+    """One row a metric and contest, and the aggregates of the tier."""
     cell = standing.cell
     common: dict[str, Any] = {
         "suite": "control",
         "estimator": cell.estimator,
         "controller": cell.controller,
         "salt": salt,
-        "env_version": f"{cell.env_id} {__version__}",
     }
     rows = []
-    for scenario, metrics in standing.by_scenario.items():
-        n, spec = len(standing.results[scenario].costs), spec_of(replace(cell, scenario=scenario))
-        rest = common | {"n": n, "spec": spec}
-        rows += [Row.of(name, each, scenario=scenario, **rest) for name, each in metrics.items()]
-    common |= {"scenario": "all", "n": sum(len(r.costs) for r in standing.results.values())}
-    rows += [Row.of(name, each, **common) for name, each in standing.overall.items()]
+    for contest, metrics in standing.by_contest.items():
+        version = f"{contest.env_id} {__version__}"
+        rest = common | {"n": len(standing.driven[contest].costs), "env_version": version}
+        rest["spec"] = spec_of(replace(cell, contest=contest))
+        rows += [
+            Row.of(name, each, scenario=contest.name, **rest)
+            for name, each in metrics.items()
+            if np.isfinite(each.value)
+        ]
+    common |= {"scenario": f"tier {standing.tier}", "env_version": __version__}
+    rows += [
+        Row.of(name, each, n=standing.n, **common)
+        for name, each in standing.overall.items()
+        if np.isfinite(each.value)
+    ]
     if np.isfinite(standing.us):
         rows.append(Row(metric="us_per_decision", value=standing.us, **common))
     return rows
@@ -146,74 +169,90 @@ def rows_of(standing: Standing, salt: str) -> list[Row]:
 
 def spec_of(cell: Cell) -> str:
     """The env as JSON: what `gym.make` needs to build it again."""
-    env = gym.make(gym.spec(cell.env_id), **cell.env_options)
+    env = gym.make(gym.spec(cell.contest.env_id), **cell.env_options)
     return env.spec.to_json() if env.spec is not None else ""
 
 
-def main_table(title: str, found: list[Standing], note: str) -> Table:
-    """The contestants' scores, the best first."""
+def main_table(title: str, found: Sequence[Standing], note: str = "") -> Table:
+    """The contestants, the best first."""
     header = (
-        *("controller and estimator", "score", "95 % interval", "IQM", "cost / informed"),
-        *("better / %", "spin / %", "left road / %", "us a decision"),
+        *("controller and estimator", "fails / %", "95 %", "cost / nominal's, %", "95 % "),
+        *("score", "95 %  ", "won / %", "worst 5 %", "contests", "episodes", "left out"),
+        "us a decision",
     )
     cells = []
     for each in found:
-        score, overall = each.overall.get("score"), each.overall
+        texts: list[str] = []
+        for name, scale, digits in (
+            ("failure_rate", 100.0, ".1f"),
+            ("cost_vs_nominal", 100.0, ".1f"),
+            ("score", 1.0, ".2f"),
+        ):
+            texts += _texts(each.overall.get(name), scale, digits)
+        share_won, tail = (each.overall.get(name) for name in ("share_won", "worst_cost"))
         cells.append(
             [
                 each.label,
-                *(score.text() if score else ("", "")),
-                f"{overall['iqm'].value:.3f}" if score else "",
-                f"{overall['cost_over_informed'].value:.2f}",
-                f"{100 * overall['probability_of_improvement'].value:.0f}",
-                f"{100 * each.rate('spin'):.1f}",
-                f"{100 * each.rate('off-road'):.1f}",
+                *texts,
+                _texts(share_won, 100.0, ".0f")[0],
+                _texts(tail, 1.0, ".3g")[0],
+                f"{len(each.pairs)} of {len(each.results)}",
+                str(each.n),
+                str(each.excluded),
                 f"{each.us:.0f}" if np.isfinite(each.us) else "",
             ]
         )
     return Table(title, header, cells, note)
 
 
-def motion_table(title: str, found: list[Standing]) -> Table:
-    """The motion under each contestant, in the same order: means over all manoeuvres."""
+def _texts(number: Estimate | None, scale: float, digits: str) -> tuple[str, str]:
+    """A number and its interval, empty where there is none."""
+    if number is None or not np.isfinite(number.value):
+        return "", ""
+    value, spread = number.text(scale, digits)
+    return value, spread if np.isfinite(number.low) else ""
+
+
+def contest_table(title: str, found: Sequence[Standing], contests: Sequence[Contest]) -> Table:
+    """Cost against nominal in %, every contestant in every contest."""
+    cells = []
+    for each in found:
+        cells.append([each.label, *(_cell_text(each, contest) for contest in contests)])
+    note = "Percent of nominal's cost, the paired geometric mean; in brackets failures in percent."
+    return Table(title, ("controller and estimator", *(c.name for c in contests)), cells, note)
+
+
+def _cell_text(standing: Standing, contest: Contest) -> str:
+    """What stands in a square: the number, or why there is none."""
+    if contest not in standing.results:
+        return ""
+    if standing.results[contest].error:
+        return "not driven"
+    metrics = standing.by_contest[contest]
+    failed = f"({100.0 * metrics['failure_rate'].value:.0f})"
+    if contest not in standing.yards:
+        return f"no yardstick {failed}"
+    if contest not in standing.pairs:
+        return f"no episode counts {failed}"
+    if standing.yards[contest].gap < NOTHING:
+        return f"nothing to win here {failed}"
+    return f"{100.0 * metrics['cost_vs_nominal'].value:.0f} {failed}"
+
+
+def motion_table(title: str, found: Sequence[Standing]) -> Table:
+    """The motion under each contestant, in the same order: means over all contests."""
     shown = [metric for metric in EPISODE if metric.heading]
     header = ["controller and estimator", *(m.heading for m in shown), "of the period / %"]
     cells = []
     for each in found:
-        share = f"{1e-4 * each.us / control_period(each.cell):.2f}" if np.isfinite(each.us) else ""
-        cells.append([each.label, *(m.text(each.mean(m.name)) for m in shown), share])
+        share_ = f"{1e-4 * each.us / control_period(each.cell):.2f}" if np.isfinite(each.us) else ""
+        values = [(metric, each.mean(metric.name)) for metric in shown]
+        texts = [metric.text(value) if np.isfinite(value) else "" for metric, value in values]
+        cells.append([each.label, *texts, share_])
     note = (
-        "effort: mean square share of the full yaw moment. Steps: the largest of what is asked "
-        "between two decisions. saturated: of the decisions. The last column: a decision's time."
+        "Yaw error and path where the reference turns. motors: mechanical work of both. effort: "
+        "mean square share of the full yaw moment. Steps: the largest of what is asked between "
+        "two decisions. saturated: of the decisions. The last column: a decision's time. What the "
+        "tyres dissipate is not measured: no signal of the car has their forces."
     )
     return Table(title, header, cells, note)
-
-
-def yardsticks(results: Results, env_id: str, tops: dict[str, Ceiling]) -> Table:
-    """The costs that scores of 0 and 1 stand for on every manoeuvre, and where there is a score."""
-    cells, scored = [], judged(results, env_id, tops)
-    for scenario in dict.fromkeys(c.scenario for c in results.found if c.env_id == env_id):
-        none = results.of(env_id, scenario, "none")
-        informed = results.of(env_id, scenario, INFORMED)
-        top = tops.get(scenario)
-        failed = 100.0 * np.mean(none["failure"] != 0.0)
-        cells.append(
-            [
-                scenario,
-                f"{none.costs.mean():.3f}",
-                f"{failed:.1f}",
-                f"{informed.costs.mean():.3f}",
-                f"{top.mean:.3f}" if top else "",
-                f"{top.error:.3f}" if top else "",
-                "yes" if scenario in scored else "no",
-            ]
-        )
-    return Table(
-        f"{env_id}: what 0 and 1 mean (mean cost an episode)",
-        ("manoeuvre", "none", "fails / %", "informed", "clairvoyant", "+-", "scored"),
-        cells,
-        "The clairvoyant's mean is carried over from its calibration seeds by regression on the "
-        "uncontrolled cost. A manoeuvre is scored where the uncontrolled car costs more than twice "
-        "what `informed` does and the ceiling's error is below a tenth of what can be gained.",
-        keyed=False,
-    )

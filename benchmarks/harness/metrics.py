@@ -19,7 +19,8 @@ class Moment(NamedTuple):
 
     asked: (N, 2) shares of the yaw moment and of the added steering. before: those of the last
     step. reward: (N,). info, last: the env's infos after and before the step. full: (2,) N m and
-    rad at a share of 1. dt: s.
+    rad at a share of 1. dt: s. aside: (N,) m that the car is beside the path of its reference.
+    power: (N,) W of the motors.
     """
 
     asked: Array
@@ -29,6 +30,8 @@ class Moment(NamedTuple):
     last: Mapping[str, Any]
     full: Array
     dt: float
+    aside: Array
+    power: Array
 
 
 class Fold(NamedTuple):
@@ -59,7 +62,8 @@ class Metric:
     """A number of an episode.
 
     of: a step's value (N,) from its `Moment`. fold: a key of `FOLDS`. heading: of its column in
-    the matrix's table of motion, "" for none. scale, digits: of a number there.
+    the matrix's table of motion, "" for none. scale, digits: of a number there. turning: whether
+    it means something only where the reference has a yaw rate.
     """
 
     name: str
@@ -69,6 +73,7 @@ class Metric:
     heading: str = ""
     scale: float = 1.0
     digits: int = 1
+    turning: bool = False
 
     def text(self, value: float) -> str:
         """A value as its column shows it."""
@@ -84,12 +89,23 @@ def _change(i: int) -> Callable[[Moment], Array]:
     return lambda m: np.abs(m.asked[:, i] - m.before[:, i]) * m.full[i]
 
 
+_DEGREES = 180.0 / np.pi
 EPISODE = (
     Metric("cost", "-", lambda m: -m.reward, "sum"),
-    Metric("rms_slip", "rad", lambda m: m.info["beta"], "rms", "RMS slip / mrad", 1e3),
-    Metric("peak_slip", "rad", lambda m: np.abs(m.info["beta"]), "max", "peak slip / mrad", 1e3),
-    Metric("rms_slip_error", "rad", _error("beta"), "rms"),
-    Metric("rms_yaw_error", "rad/s", _error("gamma"), "rms", "yaw error / (mrad/s)", 1e3),
+    Metric("rms_slip", "rad", lambda m: m.info["beta"], "rms"),
+    Metric(
+        "peak_slip", "rad", lambda m: np.abs(m.info["beta"]), "max", "peak slip / deg", _DEGREES, 2
+    ),
+    Metric("rms_slip_error", "rad", _error("beta"), "rms", "slip error / deg", _DEGREES, 2),
+    Metric(
+        *("rms_yaw_error", "rad/s", _error("gamma"), "rms", "yaw error / (deg/s)", _DEGREES, 2),
+        turning=True,
+    ),
+    Metric(
+        *("path_error", "m", lambda m: np.abs(m.aside), "max", "off the path / m", 1.0, 2),
+        turning=True,
+    ),
+    Metric("motor_energy", "J", lambda m: m.power * m.dt, "sum", "motors / kJ", 1e-3),
     Metric(
         "effort", "-", lambda m: (m.info["yaw_moment"] / m.full[0]) ** 2, "mean", "effort", 1, 3
     ),
@@ -116,6 +132,8 @@ EPISODE = (
 )
 """The metrics of an episode.
 
+path_error: the largest distance from the path that the reference's yaw rate and slip would drive
+from the same start. motor_energy: mechanical, both motors' work without regard to its sign.
 effort: mean square share of the yaw moment that was delivered. moment_rate: how fast the delivered
 yaw moment changes, on average. steer_effort: mean square share of the added steering that was asked
 for. largest_step, largest_steer_step: between two decisions. saturation: share of the decisions
@@ -131,8 +149,8 @@ _OTHERS = {
     "dB": "decibels",
     "Hz": "hertz",
     "rad s2/m": "understeer_gradient",
-    "-": "rmse_over_bound score iqm cost_over_informed probability_of_improvement spin_rate "
-    "departure_rate saved_rate not_finite_rate bad_action_rate ratio difference residual rank "
+    "-": "rmse_over_bound score cost_vs_nominal share_won worst_cost failure_rate spin_rate "
+    "departure_rate saved_rate not_finite_rate bad_action_rate gap ratio difference residual rank "
     "share spectral_radius count amplitude overshoot",
 }
 METRICS = {metric.name: metric.unit for metric in EPISODE} | {

@@ -5,9 +5,11 @@ Their coverage on skewed costs is tested by simulation.
 
 import math
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 from scipy.stats import bootstrap, norm
 from scipy.stats import t as student
 
@@ -15,6 +17,7 @@ from ...envs.record import Array
 
 LEVEL = 0.95
 RESAMPLES = 2000
+_DRAWS = 1000  # of a ratio of sums
 WORST = 0.05
 """The share of the episodes that `worst` takes the mean of."""
 _TAIL = 0.5 * (1.0 - LEVEL)
@@ -80,25 +83,36 @@ def ratio_of_roots(squares: Array, reference: Array, axis: int = -1) -> Array:
     return np.asarray(root_mean(squares, axis) / root_mean(reference, axis))
 
 
-def geometric_mean(logs: Array) -> Estimate:
-    """exp(mean) of the logarithms (n,) of paired ratios, with Student's interval; NaN of none."""
-    n = len(logs)
-    if n == 0:
+def average(*strata: Array) -> Estimate:
+    """The mean over strata of the means of their numbers (n_i,), with Student's interval.
+
+    NaN of none, and where a number is.
+    """
+    there = [each for each in strata if len(each)]
+    if not there:
         return Estimate(math.nan)
-    middle = float(np.mean(logs))
-    if n == 1:
-        return Estimate(math.exp(middle))
-    reach = float(student.isf(_TAIL, n - 1) * np.std(logs, ddof=1)) / math.sqrt(n)
-    return Estimate(*(math.exp(each) for each in (middle, middle - reach, middle + reach)))
+    middle = float(np.mean([each.mean() for each in there]))
+    if min(map(len, there)) < 2:
+        return Estimate(middle)
+    variance = sum(float(each.var(ddof=1)) / len(each) for each in there) / len(there) ** 2
+    freedom = sum(map(len, there)) - len(there)
+    reach = float(student.isf(_TAIL, freedom)) * math.sqrt(variance)
+    return Estimate(middle, middle - reach, middle + reach)
 
 
-def share(hits: Array) -> Estimate:
+def geometric_mean(*strata: Array) -> Estimate:
+    """exp of the `average` of logarithms of paired ratios: strata of one weight."""
+    return Estimate(*(math.exp(each) for each in average(*strata)))
+
+
+def share(hits: npt.ArrayLike) -> Estimate:
     """The mean of (n,) numbers that are 0 or 1, a tie one half, with Wilson's interval.
 
     NaN where one is, or of none.
     """
-    n, z = len(hits), float(norm.isf(_TAIL))
-    value = float(np.mean(hits)) if n else math.nan
+    values, z = np.asarray(hits, np.float64), float(norm.isf(_TAIL))
+    n = len(values)
+    value = float(np.mean(values)) if n else math.nan
     if math.isnan(value):
         return Estimate(value)
     middle = (value + z * z / (2.0 * n)) / (1.0 + z * z / n)
@@ -145,15 +159,22 @@ def ratio_of_sums(tops: Sequence[Array], bottoms: Sequence[Array]) -> Estimate:
     least = min(map(len, tops))
     if least < 2:
         return Estimate(above / below)
-    rng, sums = np.random.default_rng(0), np.zeros((RESAMPLES, 2))
-    for pair in zip(tops, bottoms, strict=True):
-        n = len(pair[0])
-        sums += rng.multinomial(n, np.full(n, 1.0 / n), RESAMPLES) @ np.column_stack(pair) / n
+    sums = np.zeros((_DRAWS, 2))
+    for i, pair in enumerate(zip(tops, bottoms, strict=True)):
+        sums += _weights(i, len(pair[0])) @ np.column_stack(pair)
     freedom = sum(map(len, tops)) - len(tops)
     reach = float(student.isf(_TAIL, freedom)) * math.sqrt(least / (least - 1.0))
     ends = norm.cdf([-reach, reach])
     low, high = np.quantile(sums[:, 0] / sums[:, 1], ends)
     return Estimate(above / below, float(low), float(high))
+
+
+@lru_cache(maxsize=32)
+def _weights(stratum: int, n: int) -> Array:
+    """(_DRAWS, n) how often a resample of a stratum has each of its n, over n; the same for all."""
+    rng = np.random.default_rng([stratum, n])
+    counts = rng.multinomial(n, np.full(n, 1.0 / n), _DRAWS)
+    return np.asarray(counts / n)
 
 
 def chance_of_no_less(logs: Array) -> float:

@@ -13,8 +13,8 @@ from ...agents.rollout import steps_of
 from ...agents.rungs import FILTER, OUTPUTS, RUNGS, levels_of, make_rung
 from ...agents.tuned import Options
 from ...envs.arguments import check_choice
-from ...envs.scenarios.manoeuvres import SCENARIOS
 from ...estimators.vector.estimate import EstimateObservation
+from ..control.contests import candidates
 from ..harness.drives import quietly
 from .spaces import KINDS
 
@@ -60,29 +60,11 @@ def cars_of(contest: Contest, name: str, options: Options, count: int) -> tuple[
     return env, make_agent(name, env, **more, **options.get("controller", {}))
 
 
-FIRST_SEED = 2**29  # tests, calibration and tunings of filters have others
-
-
-def tuning_seeds(n: int) -> list[int]:
-    """The first n seeds that controllers are tuned on: no test's."""
-    return list(range(FIRST_SEED, FIRST_SEED + n))
-
-
-_DRIVEN: dict[str, tuple[str, str, str, tuple[str, ...]]] = {
-    "coms-model": ("sideslip/AfsYawFusion-v0", "coms", "model", ("1",)),
-    "coms-zero-slip": ("sideslip/YawFusion-v0", "coms", "zero-slip", ("1",)),
-    "car-yaw": ("sideslip/YawFusion-v0", "passenger-car", "limited", ("2a", "2b", "2c")),
-    "car-steering": ("sideslip/AfsYawFusion-v0", "passenger-car", "limited", ("2a", "2b", "2c")),
-}
-
-
 def contests_of(kind: str) -> tuple[Contest, ...]:
     """The contests of a class; ValueError for another name."""
     check_choice("class", kind, KINDS)
-    env_id, car, reference, tiers = _DRIVEN[kind]
-    common = {"vehicle": car, "nominal": car, "reference": reference}
     return tuple(
-        Contest(env_id, {"scenario": name, **common}, name)
-        for name, scenario in SCENARIOS.items()
-        if scenario.tier in tiers
+        Contest(each.env_id, each.env_options, each.scenario)
+        for each in candidates()
+        if each.kind == kind
     )

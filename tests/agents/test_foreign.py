@@ -10,8 +10,9 @@ from typer.testing import CliRunner
 from sideslip.agents import AGENTS, Agent, Controller, make_agent, register_agent
 from sideslip.agents.rollout import costs_of, rollout
 from sideslip.benchmarks.cli.main import app
-from sideslip.benchmarks.control.build import make_contest
-from sideslip.benchmarks.control.cells import YAW, Cell
+from sideslip.benchmarks.control.build import make_cars
+from sideslip.benchmarks.control.cells import Cell
+from sideslip.benchmarks.control.contests import Contest
 from sideslip.estimators import register_estimator
 from sideslip.estimators.make import ESTIMATORS
 from tests.envs.helpers import bits
@@ -81,7 +82,7 @@ def test_a_matrix_cell_of_foreign_parts() -> None:
     register_agent("yaw-damper", YAW_DAMPER)
     register_estimator("constant", CONSTANT)
     for estimator, controller in (("constant", "yaw-damper"), (CONSTANT, YAW_DAMPER)):
-        env, agent = make_contest(Cell(YAW, "step-steer", estimator, controller), 2)
+        env, agent = make_cars(Cell(Contest(scenario="step-steer"), estimator, controller), 2)
         obs, _ = env.reset(seed=1)
         actions, _ = agent.predict(obs)
         assert type(agent).__name__ == "YawDamper" and actions.shape == (2, 1)

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from sideslip.benchmarks.control import episodes
-from sideslip.benchmarks.control.cache import CachedDrive
-from sideslip.benchmarks.control.cells import YAW, Cell
+from sideslip.benchmarks.control.cells import Cell
+from sideslip.benchmarks.control.contests import Contest
 from sideslip.benchmarks.control.episodes import Chunk, Driven
+from sideslip.benchmarks.control.run import CachedDrive
 
 SEEDS = (3, 4, 5)
 NUMBERS, SIGNALS = len(episodes.NUMBERS), 1 + len(episodes.SIGNALS)
@@ -64,9 +65,9 @@ def test_a_damaged_case_is_driven_again(
         driven.append(chunk)
         return Driven(numbers, 1.0, series)
 
-    monkeypatch.setattr("sideslip.benchmarks.control.cache.drive", drive_it)
-    cached = CachedDrive(tmp_path, "salt")
-    chunk = Chunk(Cell(YAW, "gust", "", "none"), SEEDS, keep=True)
+    monkeypatch.setattr("sideslip.benchmarks.control.run.drive", drive_it)
+    cached = CachedDrive(tmp_path)
+    chunk = Chunk(Cell(Contest(scenario="gust"), "", "none"), SEEDS, keep=True)
     cached(chunk)
     (path,) = tmp_path.iterdir()
     DAMAGE[damage](path)

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from sideslip.agents import Controller
-from sideslip.benchmarks.control.cells import YAW, Cell
-from sideslip.benchmarks.control.decision_time import decision_time
+from sideslip.benchmarks.control.build import decision_time
+from sideslip.benchmarks.control.cells import Cell
+from sideslip.benchmarks.control.contests import Contest
+from sideslip.benchmarks.control.ladder import yardsticks
 from sideslip.benchmarks.control.run import measure
 from sideslip.benchmarks.control.tables import rows_of, standings
 
@@ -30,21 +32,26 @@ class Damper(Controller):
         action[:, 0] = 20.0 * inputs[:, 0]
 
 
+BEND = Contest(scenario=MINE["name"])
+
+
 def cell(controller: str, estimator: str = "") -> Cell:
-    return Cell(YAW, MINE["name"], estimator, controller, {"scenario": MINE})
+    return Cell(BEND, estimator, controller, {"scenario": MINE})
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_a_users_controller_on_a_users_scenario_stands_in_the_tables(jobs: int) -> None:
     mine = cell(f"{__name__}:Damper", "bicycle-kf")
-    asked = [mine, cell("none"), cell("informed"), cell("two-dof", "exact-kf")]
-    found = measure(asked, 6, salt="ab" * 8, jobs=jobs)
+    asked = [mine, *(cell(who) for who in ("none", "nominal", "oracle-state"))]
+    found = measure(asked, range(6), jobs=jobs)
     assert not any(driven.error for driven in found.found.values())
     ours, none = found.found[mine], found.found[cell("none")]
     assert np.median(ours["rms_slip"] / none["rms_slip"]) < 0.95  # it does what it is for
-    standing = {each.cell.controller: each for each in standings(found, YAW, {})}
-    rows = rows_of(standing[mine.controller], found.salt)
-    assert {row.scenario for row in rows} == {"my bend", "all"}
+    table = standings(found.found, "", yardsticks(found, [BEND]))
+    standing = {each.cell.controller: each for each in table}[mine.controller]
+    rows = rows_of(standing, "ab")
+    assert {row.scenario for row in rows} == {"my bend, yaw", "tier "}
+    assert {row.metric for row in rows} >= {"score", "cost_vs_nominal", "share_won"}
     assert {row.controller for row in rows} == {mine.controller}
-    assert all("my bend" in row.spec for row in rows if row.scenario == "my bend")
+    assert all("my bend" in row.spec for row in rows if row.scenario == BEND.name)
     assert decision_time(mine) > 0.0

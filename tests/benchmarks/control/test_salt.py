@@ -11,22 +11,24 @@ import sideslip
 from sideslip.agents.learned.files import ENDING
 from sideslip.agents.rollout import rollout
 from sideslip.benchmarks.control import delay_price, run, seeds
-from sideslip.benchmarks.control.cells import YAW, Cell
+from sideslip.benchmarks.control.cells import Cell
+from sideslip.benchmarks.control.contests import Contest
 from sideslip.benchmarks.control.episodes import NUMBERS, Driven
 from sideslip.benchmarks.control.run import measure
 from sideslip.benchmarks.control.seeds import salt_of, salted_seeds
 
 ONE, OTHER = "0123456789abcdef", "fedcba9876543210"
 SHORT = {"base": "gust", "duration": 0.5}
-NONE, SLOW = (Cell(YAW, "gust", "", who, {"scenario": SHORT}) for who in ("none", "mpc"))
+GUST = Contest(scenario="gust")
+NONE, SLOW = (Cell(GUST, "", who, {"scenario": SHORT}) for who in ("none", "mpc"))
 
 
 @pytest.mark.parametrize("salt", [ONE, OTHER])
 def test_the_episodes_are_those_of_the_salt(salt: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """In order and across chunks: each costs what the env alone does on that seed."""
     monkeypatch.setattr(run, "CHUNK", 3)
-    costs = measure([NONE], 5, salt=salt, jobs=1).of(YAW, "gust", "none").costs
-    env = gym.make(YAW, scenario=SHORT)
+    costs = measure([NONE], salted_seeds(salt, 5), jobs=1).of(GUST, "none").costs
+    env = gym.make(GUST.env_id, scenario=SHORT)
     alone = [rollout(env, None, seed).cost for seed in salted_seeds(salt, 5)]
     assert costs == pytest.approx(alone, rel=1e-12)
     assert len(set(costs)) == 5
@@ -34,7 +36,7 @@ def test_the_episodes_are_those_of_the_salt(salt: str, monkeypatch: pytest.Monke
 
 def test_another_salt_is_other_episodes() -> None:
     one, other = (
-        measure([NONE], 3, salt=salt, jobs=1).of(YAW, "gust", "none") for salt in (ONE, OTHER)
+        measure([NONE], salted_seeds(salt, 3), jobs=1).of(GUST, "none") for salt in (ONE, OTHER)
     )
     assert not set(one.costs) & set(other.costs)
 
@@ -52,19 +54,19 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 
 
 def test_everybody_drives_the_same_seeds(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Slow controllers the first ones; and results are looked for under this salt alone."""
+    """Slow controllers the first ones."""
     cases = asked(monkeypatch)
-    measure([NONE, SLOW], 300, salt=ONE, keep=tmp_path)
+    measure([NONE, SLOW], salted_seeds(ONE, 300), keep=tmp_path)
     driven: dict[Cell, list[int]] = {}
     for kept, chunk in cases:
         driven.setdefault(chunk.cell, []).extend(chunk.seeds)
-        assert (kept.salt, kept.folder) == (ONE, tmp_path)
-    assert driven == {NONE: salted_seeds(ONE, 300), SLOW: salted_seeds(ONE, 64)}
+        assert kept.folder == tmp_path
+    assert driven == {NONE: salted_seeds(ONE, 300), SLOW: salted_seeds(ONE, 128)}
 
 
 def test_the_price_of_delay_is_taken_on_the_salts_seeds(monkeypatch: pytest.MonkeyPatch) -> None:
     cases = asked(monkeypatch)
-    delay_price.price_of_delay(None, 4, salt=OTHER)
+    delay_price.price_of_delay(salted_seeds(OTHER, 4))
     assert len(cases) == len(delay_price.DELAYS) * len(delay_price.CONTESTANTS)
     assert {chunk.seeds for _, chunk in cases} == {tuple(salted_seeds(OTHER, 4))}
 
@@ -100,3 +102,18 @@ def test_the_contestants_are_this_packages() -> None:
     assert Path(sideslip.__file__ or "").resolve().parent == seeds._PACKAGE
     for folder in seeds._CONTESTANTS:
         assert (seeds._PACKAGE / folder / "__init__.py").is_file()
+
+
+@pytest.mark.parametrize("salt", ["", "not a salt", "0xab", "AB", "-1"])
+def test_a_salt_that_is_none_is_refused(salt: str) -> None:
+    with pytest.raises(ValueError, match="a salt is hexadecimal digits, got"):
+        salted_seeds(salt, 3)
+
+
+def test_seeds_follow_the_salt_and_only_grow() -> None:
+    salt = salt_of()
+    assert salt == salt_of() and salt != salt_of("more")
+    assert salted_seeds(salt, 10) == salted_seeds(salt, 30)[:10]
+    assert salted_seeds(salt_of("more"), 10) != salted_seeds(salt, 10)
+    assert len(set(salted_seeds(salt, 1000))) == 1000
+    assert not set(salted_seeds(salt, 1000)) & set(seeds.tuning_seeds(64))

@@ -1,102 +1,190 @@
-"""Standings: the best come first, ceilings are carried over, unsure ones judge nobody."""
+"""Standings: failures first, the best first, findings and the answer; what went wrong is said."""
+
+import re
 
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.control import episodes as drive
-from sideslip.benchmarks.control import run as results
-from sideslip.benchmarks.control.calibration import Entry, Episode
-from sideslip.benchmarks.control.ceiling import carried, judged, tops_of
-from sideslip.benchmarks.control.cells import MANOEUVRES, YAW, Cell, cells
-from sideslip.benchmarks.control.episodes import NUMBERS
-from sideslip.benchmarks.control.scores import Ceiling
-from sideslip.benchmarks.control.tables import motion_table, rows_of, standings
+from sideslip.benchmarks.control.cells import REFERENCE_FILTER, Cell
+from sideslip.benchmarks.control.contests import NOMINAL, PARAMETERS, STATE, Contest
+from sideslip.benchmarks.control.episodes import NUMBERS, Driven
+from sideslip.benchmarks.control.ladder import (
+    answer,
+    below_the_clairvoyant,
+    findings,
+    knowledge_table,
+    ladder_table,
+    refusals_of,
+    yardsticks,
+)
+from sideslip.benchmarks.control.run import Results
+from sideslip.benchmarks.control.tables import (
+    Standing,
+    contest_table,
+    main_table,
+    motion_table,
+    rows_of,
+    standings,
+)
 from sideslip.benchmarks.harness.metrics import EPISODE
+from sideslip.envs import FAILURES
+
+ONE, TWO = Contest("1", scenario="gust"), Contest("1", scenario="straight")
+BEST = {NOMINAL: 8.0, PARAMETERS: 4.0, STATE: 1.0, "lqr": 2.0, "esc": 6.0, "none": 12.0}
+COST, FAILURE = NUMBERS.index("cost"), NUMBERS.index("failure")
 
 
-def ready(asked: list[Cell]) -> results.Results:
-    """Made-up costs: none 10, informed 2, lqr 3, the rest 5."""
-    found = results.Results("ab" * 8)
-    rng = np.random.default_rng(0)
-    for cell in asked:
-        level = {"none": 10.0, "informed": 2.0, "lqr": 3.0}.get(cell.controller, 5.0)
-        numbers = np.abs(rng.normal(1.0, 0.01, (8, len(NUMBERS)))) * level
-        numbers[:, NUMBERS.index("failure")] = 0.0
-        found.found[cell] = drive.Driven(numbers, 1.0)
+def episodes(level: float, failed: int = 0, code: str = "spin", n: int = 40) -> Driven:
+    """Costs about a level on common seeds, the first of which failed."""
+    seeds, own = np.random.default_rng(0), np.random.default_rng(int(100 * level))
+    numbers = np.ones((n, len(NUMBERS)))
+    numbers[:, COST] = level * seeds.lognormal(0.0, 1.0, n) * own.lognormal(0.0, 0.1, n)
+    numbers[:, FAILURE] = np.where(np.arange(n) < failed, FAILURES.index(code), 0)
+    return Driven(numbers, 1.0)
+
+
+def results(*contests: Contest, **failed: int) -> Results:
+    found = Results()
+    for contest in contests or (ONE, TWO):
+        for who, level in BEST.items():
+            filter_ = REFERENCE_FILTER if who in ("lqr", "esc") else ""
+            found.found[Cell(contest, filter_, who)] = episodes(level, failed.get(who, 0))
+        found.found[Cell(contest, "dakf", "lqr")] = episodes(3.0)
     return found
 
 
-def test_standings_put_the_best_first_and_rows_hold_them(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked = [cell for cell in cells(MANOEUVRES[:3]) if cell.env_id == YAW]
-    found = ready(asked)
-    tops = {name: Ceiling(1.0, 0.0) for name in MANOEUVRES[:2]}  # the third is not calibrated
-    standing = standings(found, YAW, tops)
-    assert [each.cell.controller for each in standing[:2]] == ["informed", "lqr"]
-    assert standing[-1].label == "none"
-    assert standing[0].overall["score"].value == pytest.approx(8.0 / 9.0, abs=0.01)
-    assert standing[1].overall["cost_over_informed"].value == pytest.approx(1.5, abs=0.02)
-    assert "score" not in standing[0].by_scenario[MANOEUVRES[2]]
-    rows = rows_of(standing[0], found.salt)
-    assert {row.scenario for row in rows} == {*MANOEUVRES[:3], "all"}
-    monkeypatch.setattr(
-        "sideslip.benchmarks.control.ceiling.ceilings",
-        lambda *_: {MANOEUVRES[0]: Ceiling(4.0, 0.01)},
+def table(found: Results, *contests: Contest) -> list[Standing]:
+    return standings(found.found, "1", yardsticks(found, contests or (ONE, TWO)))
+
+
+def test_the_best_come_first_with_their_numbers() -> None:
+    standing = table(results())
+    labels = [each.cell.controller for each in standing]
+    assert labels == [STATE, "lqr", "lqr", PARAMETERS, "esc", NOMINAL, "none"]
+    lqr = standing[1].overall
+    assert lqr["score"].value == pytest.approx(2.0 / 3.0, abs=0.02)  # log 4 / log 8
+    assert lqr["cost_vs_nominal"].value == pytest.approx(0.25, rel=0.05)
+    assert lqr["share_won"].value == 1.0
+    assert standing[5].overall["score"] == pytest.approx((0.0, 0.0, 0.0))
+    assert standing[1].n == 80 and standing[1].excluded == 0
+
+
+def test_failures_are_of_all_episodes_and_rank_where_nominal_fails_often() -> None:
+    some = results(nominal=2, lqr=3)
+    standing = {each.label: each for each in table(some)}
+    lqr = standing[f"lqr on {REFERENCE_FILTER}"]
+    assert lqr.overall["failure_rate"].value == 3 / 40
+    assert (lqr.n, lqr.excluded) == (76, 4)
+    assert [each.cell.controller for each in table(some)][:2] == [STATE, "lqr"]
+    often = results(nominal=6, lqr=30)
+    assert [each.cell.controller for each in table(often)][-1] == "lqr"  # the one that failed
+    found = main_table("", table(often))
+    assert found.header[1] == "fails / %"
+    assert [float(line[1]) for line in found.cells] == sorted(float(x[1]) for x in found.cells)
+
+
+def test_a_cell_that_was_not_driven_says_so_and_the_rest_goes_on() -> None:
+    found = results()
+    cell = Cell(TWO, "dakf", "lqr")
+    found.found[cell] = Driven(np.full((40, len(NUMBERS)), np.nan), np.nan, error="no GPS")
+    standing = next(each for each in table(found) if each.cell.estimator == "dakf")
+    assert np.isfinite(standing.overall["score"].value)
+    assert main_table("", [standing]).cells[0][9] == "1 of 2"
+    assert contest_table("", [standing], [ONE, TWO]).cells[0][2] == "not driven"
+    assert ["1", TWO.name, "lqr on dakf", "not driven: no GPS"] in refusals_of(found)
+    assert all(np.isfinite(row.value) for row in rows_of(standing, "ab"))
+
+
+def test_a_contest_in_which_every_car_fails_counts_nowhere_and_says_so() -> None:
+    found = results()
+    for who in (NOMINAL, STATE):
+        found.found[Cell(TWO, "", who)] = episodes(9.0, 40)
+    standing = table(found)
+    assert all(len(each.pairs) == 1 for each in standing)
+    shown = contest_table("", standing, [TWO]).cells
+    assert [NOMINAL, "no episode counts (100)"] in shown and [
+        "none",
+        "no episode counts (0)",
+    ] in shown
+    lines = ladder_table(found, [ONE, TWO], {}).cells
+    assert [line[-1] for line in lines] == [
+        "yes",
+        "no episode that nominal and oracle-state survive",
+    ]
+    assert ["1", TWO.name, NOMINAL, "every car fails"] in refusals_of(found)
+    assert all(np.isfinite(each.overall["score"].value) for each in standing)
+
+
+def test_a_rung_that_cannot_be_computed_leaves_its_contest_without_score() -> None:
+    found = results()
+    found.found[Cell(TWO, "", STATE)] = Driven(
+        np.full((40, len(NUMBERS)), np.nan), np.nan, error="no plant"
     )
-    raised, log = tops_of(found, YAW)
-    assert raised[MANOEUVRES[0]].mean == pytest.approx(2.0, abs=0.02)
-    assert len(log) >= 1 and "informed" in log[0]
+    standing = table(found)
+    lqr = next(each for each in standing if each.cell.controller == "lqr")
+    assert list(lqr.pairs) == [ONE] and np.isfinite(lqr.overall["score"].value)
+    assert contest_table("", [lqr], [TWO]).cells[0][1].startswith("no yardstick")
+    assert ladder_table(found, [ONE, TWO], {}).cells[1][-1] == "no plant"
 
 
-def entry_of(none: np.ndarray, best: np.ndarray) -> Entry:
-    episodes = tuple(
-        Episode(k, float(b), "none", {"none": float(n)}, {}, 1.0)
-        for k, (n, b) in enumerate(zip(none, best, strict=True))
-    )
-    means = float(best.mean()), 0.0, float(none.mean()), 0.0
-    return Entry(YAW, "gust", "", "", "", "", "", *means, "", episodes)
+def test_a_nan_of_a_contestant_is_a_failure_that_is_not_the_cars() -> None:
+    found = results()
+    found.found[Cell(ONE, "dakf", "lqr")] = episodes(3.0, 10, "bad-action")
+    assert ["1", ONE.name, "lqr on dakf", "bad-action 25.0 %"] in refusals_of(found)
+    standing = next(each for each in table(found) if each.cell.estimator == "dakf")
+    assert standing.by_contest[ONE]["bad_action_rate"].value == 0.25
+    assert standing.overall["score"].value < 0.35
 
 
-def test_a_ceiling_is_carried_to_other_seeds() -> None:
-    """Exactly where it is linear in the uncontrolled cost; else within its error, mostly."""
+def test_nothing_to_win_is_said() -> None:
+    found = results()
+    for who in (NOMINAL, STATE):
+        found.found[Cell(TWO, "", who)] = episodes(5.0)
+    assert contest_table("", table(found)[:1], [TWO]).cells[0][1].startswith("nothing to win here")
+    assert ladder_table(found, [TWO], {}).cells[0][-1] == "nothing to win here"
+
+
+def test_who_is_above_the_oracle_is_a_finding() -> None:
+    assert findings(table(results())) == []
+    found = results()
+    for contest in (ONE, TWO):
+        found.found[Cell(contest, "dakf", "lqr")] = episodes(0.5)
+    (said,) = findings(table(found))
+    assert "lqr on dakf costs less than oracle-state in tier 1" in said
+
+
+def test_who_is_surely_below_the_clairvoyant_is_named() -> None:
     rng = np.random.default_rng(0)
-    none = rng.gamma(1.0, 5.0, 64)
-    other = rng.gamma(1.0, 8.0, 150)
-    sure = carried(entry_of(none, 0.5 + 0.2 * none), other)
-    assert sure.mean == pytest.approx(0.5 + 0.2 * other.mean())
-    assert sure.error == pytest.approx(0.0, abs=1e-12)
-    off = []
-    for _ in range(200):
-        none, other = rng.gamma(1.0, 5.0, 64), rng.gamma(1.0, 5.0, 150)
-        best, there = (5.0 + 0.2 * x + rng.normal(0.0, 1.0, len(x)) for x in (none, other))
-        top = carried(entry_of(none, best), other)
-        off.append((top.mean - there.mean()) / top.error)
-    assert 0.85 < np.std(off) < 1.15 and abs(np.mean(off)) < 0.25
+    leads = [rng.normal(0.3, 0.3, 64), rng.normal(-0.3, 0.3, 64), rng.normal(0.0, 0.3, 64)]
+    assert below_the_clairvoyant(["above", "below", "level"], leads) == ["below"]
+    many = [rng.normal(0.0, 0.3, 64) for _ in range(40)]
+    assert below_the_clairvoyant([str(k) for k in range(40)], many) == []
 
 
-def test_an_unsure_ceiling_is_no_yardstick() -> None:
-    asked = [cell for cell in cells(MANOEUVRES[:1]) if cell.env_id == YAW]
-    found = ready(asked)  # none 10
-    assert judged(found, YAW, {MANOEUVRES[0]: Ceiling(1.0, 0.8)}) == [MANOEUVRES[0]]
-    assert judged(found, YAW, {MANOEUVRES[0]: Ceiling(1.0, 1.0)}) == []
+def test_the_ladders_steps_are_ratios_of_costs() -> None:
+    ahead = {ONE: np.full(8, np.log(1.5))}
+    made = knowledge_table(results(), {"1": [ONE, TWO]}, ahead)
+    assert [float(re.split(" ", text)[0]) for text in made.cells[0][1:]] == pytest.approx(
+        [2.0, 4.0, 1.5], rel=0.05
+    )
+    assert knowledge_table(results(), {"1": [ONE, TWO]}, {}).cells[0][3] == ""
 
 
-def test_a_manoeuvre_that_informed_hardly_improves_is_not_scored() -> None:
-    asked = [cell for cell in cells(MANOEUVRES[:1]) if cell.env_id == YAW]
-    found = ready(asked)
-    assert found.worth_controlling(YAW, MANOEUVRES[0])
-    found.of(YAW, MANOEUVRES[0], "informed").costs[:] = 5.5
-    assert not found.worth_controlling(YAW, MANOEUVRES[0])
-    assert "score" not in standings(found, YAW, {MANOEUVRES[0]: Ceiling(1.0, 0.0)})[0].overall
+def test_the_answer_names_the_best_and_by_how_much() -> None:
+    said = answer({"1": table(results())})
+    assert f"best estimator (with lqr) {REFERENCE_FILTER}, score 0.6" in said
+    assert "of the cost of dakf" in said and "best controller" in said
+    ratio = re.search(r"(\d+) % \[\d+, \d+\] of the cost of dakf", said)
+    assert ratio is not None and int(ratio[1]) == pytest.approx(67, abs=4)
 
 
 def test_a_metric_of_the_table_has_its_rows_and_its_column() -> None:
-    asked = [cell for cell in cells(MANOEUVRES[:1]) if cell.env_id == YAW]
-    standing = standings(ready(asked), YAW, {})
+    standing = table(results())
     metrics = {row.metric for row in rows_of(standing[0], "ab")}
     assert {metric.name for metric in EPISODE} - {"failure"} <= metrics
-    table = motion_table("", standing)
+    shown = motion_table("", standing)
     for metric in EPISODE:
         if metric.heading:
-            column = list(table.header).index(metric.heading)
-            value = float(table.cells[0][column]) / metric.scale
+            column = list(shown.header).index(metric.heading)
+            value = float(shown.cells[0][column]) / metric.scale
             assert value == pytest.approx(standing[0].mean(metric.name), abs=0.5 / metric.scale)

@@ -9,6 +9,7 @@ from scipy.stats import trim_mean
 
 from sideslip.benchmarks.harness.stats import (
     Estimate,
+    average,
     chance_of_no_less,
     geometric_mean,
     holm,
@@ -44,6 +45,7 @@ def score(rng: np.random.Generator, n: int) -> Estimate:
 STATISTICS: dict[str, tuple[Callable[[np.random.Generator, int], Estimate], int]] = {
     "geometric mean": (lambda rng, n: geometric_mean(logs(rng, n)[0]), 60),
     "score": (score, 40),
+    "average": (lambda rng, n: average(costs(rng, n)[1] / costs(rng, n)[0].clip(1.0)), 100),
     "share won": (lambda rng, n: won(*costs(rng, n)[1::-1]), 100),
     "failure rate": (lambda rng, n: share(costs(rng, n)[0] > 50.0), 400),
     "worst 5 %": (lambda rng, n: worst(costs(rng, n)[1]), 1000),
@@ -66,13 +68,15 @@ def truth(name: str) -> float:
     rng = np.random.default_rng(11)
     r, gap = logs(rng, 1_000_000)
     nominal, mine, _ = costs(rng, 1_000_000)
-    return {
+    true: dict[str, float] = {
         "geometric mean": math.exp(r.mean()),
         "score": r.mean() / gap.mean(),
+        "average": float(np.mean(mine / costs(rng, 1_000_000)[0].clip(1.0))),
         "share won": float(np.mean(mine < nominal)),
         "failure rate": float(np.mean(nominal > 50.0)),
         "worst 5 %": float(np.sort(mine)[-50_000:].mean()),
-    }[name]
+    }
+    return true[name]
 
 
 def test_what_the_numbers_are() -> None:
@@ -88,6 +92,12 @@ def test_what_the_numbers_are() -> None:
     sums = ratio_of_sums([r, 2.0 * r], [gap, gap])
     assert sums.value == pytest.approx(3.0 * r.mean() / (2.0 * gap.mean()))
     assert trim_mean(r, 0.25) / gap.mean() != pytest.approx(sums.value, rel=1e-3)  # no middle
+
+
+def test_strata_have_one_weight_each() -> None:
+    few, many = np.full(4, 2.0), np.full(400, 4.0)
+    assert average(few, many) == pytest.approx((3.0, 3.0, 3.0))
+    assert geometric_mean(np.log(few), np.log(many)).value == pytest.approx(8.0**0.5)
 
 
 def test_pairing_makes_intervals_narrow() -> None:
@@ -115,8 +125,7 @@ def test_holm_accuses_nobody_in_19_of_20_tables() -> None:
     """Twenty contestants as good as the best, 500 times: at most one table in 20 accuses one."""
     rng = np.random.default_rng(5)
     wrong = sum(
-        any(holm([chance_of_no_less(rng.laplace(size=64)) for _ in range(20)]))
-        for _ in range(500)
+        any(holm([chance_of_no_less(rng.laplace(size=64)) for _ in range(20)])) for _ in range(500)
     )
     assert wrong / 500 < 0.08
     assert holm([chance_of_no_less(rng.normal(-0.5, 1.0, 64)) for _ in range(20)]).count(True) > 10

@@ -11,8 +11,9 @@ import pytest
 pytest.importorskip("optuna")
 
 from sideslip.agents.tuned import FILE, read_tuned, tuned
+from sideslip.benchmarks.control.seeds import tuning_seeds
 from sideslip.benchmarks.tuning import controllers, spaces
-from sideslip.benchmarks.tuning.contests import Contest, contests_of, drive, tuning_seeds
+from sideslip.benchmarks.tuning.contests import Contest, contests_of, drive
 from sideslip.benchmarks.tuning.controllers import Contestant, objective, tune
 from sideslip.benchmarks.tuning.file import put_tuned
 from sideslip.benchmarks.tuning.spaces import KINDS, SPACES, Number, options_of

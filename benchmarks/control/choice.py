@@ -1,0 +1,128 @@
+"""Which contests are scored: where the rungs of the ladder lie apart, on tuning seeds.
+
+`python -m sideslip.benchmarks.control.choice --write` measures all candidates and writes the file.
+"""
+
+import argparse
+import math
+from collections.abc import Sequence
+from dataclasses import asdict
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from ... import __version__
+from ..harness.stats import Estimate, geometric_mean
+from .cells import Cell
+from .contests import (
+    LIMIT,
+    NOMINAL,
+    STATES,
+    Contest,
+    Measured,
+    candidates,
+    write_contests,
+)
+from .episodes import Array
+from .run import Results, measure
+from .scores import Yardstick, survived
+from .seeds import tuning_seeds
+
+EPISODES = 64
+GAP, LEAST, FAILING = 0.3, 0.2, 0.1
+"""A contest is scored whose gap is above the first, its lower limit above the second, and in which
+nominal fails in less than this share (at the limit in any, but never always)."""
+
+
+def rungs_of(contest: Contest) -> list[Cell]:
+    """Nominal and both candidates for `oracle-state`."""
+    return [Cell(contest, "", name) for name in (NOMINAL, *STATES)]
+
+
+def judged(results: Results, contest: Contest) -> Measured:
+    """A candidate's numbers; the better oracle is that of fewer failures, then of the larger gap.
+
+    A rung that could not be computed, and cars that all fail, leave a gap of 0 and the reason.
+    """
+    nominal = results.of(contest, NOMINAL)
+    found: list[tuple[float, float, str, Estimate, int]] = []
+    errors = [f"{NOMINAL}: {nominal.error}"] if nominal.error else []
+    for name in STATES:
+        oracle = results.of(contest, name)
+        if oracle.error:
+            errors.append(f"{name}: {oracle.error}")
+            continue
+        if nominal.error:
+            continue
+        own = Yardstick(nominal, oracle).paired(oracle)[1]
+        gap, failing = _gap(own), float(np.mean(~survived(oracle)))
+        found.append((failing > FAILING, -gap.value, name, gap, len(own)))
+    failing = 1.0 if nominal.error else float(np.mean(~survived(nominal)))
+    nothing = (True, 0.0, STATES[0], Estimate(0.0, 0.0, 0.0), 0)
+    _, _, name, gap, kept = min(found) if found else nothing
+    return Measured(
+        **asdict(contest),
+        env_version=__version__,
+        oracle=name,
+        gap=round(gap.value, 4),
+        low=round(gap.low, 4),
+        high=round(gap.high, 4),
+        failing=round(failing, 4),
+        judged=kept,
+        n=len(nominal.costs),
+        verdict=_verdict(contest, gap, failing, kept) if found else "; ".join(errors),
+    )
+
+
+def _gap(own: Array) -> Estimate:
+    """The mean of r with its interval, 0 where no episode or only one is left."""
+    if len(own) < 2:
+        return Estimate(0.0, 0.0, 0.0)
+    return Estimate(*(math.log(each) for each in geometric_mean(own)))
+
+
+def _verdict(contest: Contest, gap: Estimate, failing: float, kept: int) -> str:
+    if kept < 2:
+        return "no episode that nominal and oracle-state survive"
+    if failing >= FAILING and contest.tier not in LIMIT:
+        return f"nominal fails in {100.0 * failing:.0f} %"
+    if not (gap.value > GAP and gap.low > LEAST):
+        return f"too little to win: {gap.value:.2f} [{gap.low:.2f}, {gap.high:.2f}]"
+    return "scored"
+
+
+def choose(
+    among: Sequence[Contest] | None = None,
+    episodes: int = EPISODES,
+    jobs: int | None = None,
+    console: Console | None = None,
+) -> list[Measured]:
+    """Measure candidates (default: all); one that cannot be driven is not scored, with why."""
+    among = candidates() if among is None else among
+    cells = [cell for contest in among for cell in rungs_of(contest)]
+    results = measure(cells, tuning_seeds(episodes), jobs=jobs, console=console)
+    return [judged(results, contest) for contest in among]
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--write", action="store_true", help="replace the package's file")
+    parser.add_argument("--episodes", type=int, default=EPISODES)
+    parser.add_argument("--jobs", type=int)
+    arguments = parser.parse_args()
+    console = Console()
+    found = choose(None, arguments.episodes, arguments.jobs, console)
+    table = Table("tier", "contest", "oracle-state", "gap", "nominal fails / %", "verdict")
+    for each in found:
+        gap = f"{each.gap:.2f} [{each.low:.2f}, {each.high:.2f}]"
+        failing = f"{100.0 * each.failing:.1f}"
+        table.add_row(each.tier, each.contest.name, each.oracle, gap, failing, each.verdict)
+    console.print(table)
+    if arguments.write:
+        write_contests(found)
+
+
+if __name__ == "__main__":
+    main()

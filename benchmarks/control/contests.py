@@ -1,0 +1,156 @@
+"""A contest: a manoeuvre with its car, its actuators and the reference it is judged by.
+
+Those of a tier are chosen once, on tuning seeds, by what is to be won there (`choice.py`), and
+`contests.json` holds them with the measured gaps.
+"""
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from ... import __version__
+from ...envs.arguments import check_choice
+from ...envs.scenarios.manoeuvres import SCENARIOS
+from ..harness.results import made_of, read_objects, write_text
+
+YAW = "sideslip/YawFusion-v0"
+STEERING = "sideslip/AfsYawFusion-v0"
+FILE = Path(__file__).with_name("contests.json")
+COMMAND = "python -m sideslip.benchmarks.control.choice --write"
+
+NOMINAL, PARAMETERS, STATE = "nominal", "oracle-parameters", "oracle-state"
+STATES = ("oracle-state-lqr", "oracle-state-nmpc")
+"""The rungs of which a contest's better one is its `oracle-state`."""
+
+TIERS: dict[str, tuple[tuple[str, str, str], ...]] = {
+    "1": ((STEERING, "coms", "model"), (YAW, "coms", "zero-slip")),
+    "2a": ((YAW, "passenger-car", "lagged"), (STEERING, "passenger-car", "lagged")),
+    "2b": ((YAW, "passenger-car", "lagged"), (STEERING, "passenger-car", "lagged")),
+    "2c": ((YAW, "passenger-car", "lagged"), (STEERING, "passenger-car", "lagged")),
+}
+"""The (env id, vehicle, reference) with which a tier's scenarios are driven."""
+TITLES = {
+    "1": "the COMS at 18 to 28 km/h",
+    "2a": "the passenger car at 60 to 80 km/h on a dry road",
+    "2b": "the passenger car on a road of unknown friction",
+    "2c": "the passenger car at the limit of its tyres",
+}
+LIMIT = ("2c",)
+"""Tiers in which nominal may fail as often as it does."""
+
+
+@dataclass(frozen=True)
+class Contest:
+    """A scenario in an environment; vehicle and reference: "" for the id's own. tier: "" where it
+    is none of a score's."""
+
+    tier: str = ""
+    env_id: str = YAW
+    vehicle: str = ""
+    reference: str = ""
+    scenario: str = "random-steering"
+
+    @property
+    def name(self) -> str:
+        """In tables: the scenario and what acts."""
+        return f"{self.scenario}, {'steering' if self.env_id == STEERING else 'yaw'}"
+
+    @property
+    def kind(self) -> str:
+        """The class of contests that share their tuned options."""
+        if self.vehicle in ("", "coms"):
+            return f"coms-{'zero-slip' if self.reference == 'zero-slip' else 'model'}"
+        return f"car-{'steering' if self.env_id == STEERING else 'yaw'}"
+
+    @property
+    def env_options(self) -> dict[str, Any]:
+        """Options of the env."""
+        car = {"vehicle": self.vehicle, "nominal": self.vehicle} if self.vehicle else {}
+        judged = {"reference": self.reference} if self.reference else {}
+        return {"scenario": self.scenario} | car | judged
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A candidate with what was measured on tuning seeds: an entry of the file.
+
+    oracle: the better of `STATES`. gap: mean log(J_nominal / J_oracle) of the episodes that both
+    survive, `judged` of n, with its 95 % interval; failing: the share in which nominal fails.
+    verdict: "scored", or why not.
+    """
+
+    tier: str
+    env_id: str
+    vehicle: str
+    reference: str
+    scenario: str
+    env_version: str
+    oracle: str
+    gap: float
+    low: float
+    high: float
+    failing: float
+    judged: int
+    n: int
+    verdict: str
+
+    @property
+    def contest(self) -> Contest:
+        """Of which these are the numbers."""
+        return Contest(self.tier, self.env_id, self.vehicle, self.reference, self.scenario)
+
+
+def candidates() -> list[Contest]:
+    """Every scenario that has a tier, with each of the tier's ids and references."""
+    return [
+        Contest(tier, *driven, name)
+        for tier, those in TIERS.items()
+        for driven in those
+        for name, scenario in SCENARIOS.items()
+        if scenario.tier == tier
+    ]
+
+
+def read_contests(path: Path = FILE) -> tuple[Measured, ...]:
+    """All candidates of a file.
+
+    Raises FileNotFoundError, and ValueError, with the file and what to do, where it was measured
+    with another version, is cut short, or names what there is not.
+    """
+    found = []
+    for i, each in enumerate(read_objects(path), 1):
+        entry, where = made_of(Measured, each, f"{path}: entry {i}"), f"{path}: entry {i}"
+        if entry.env_version != __version__:
+            raise ValueError(
+                f"{where} was measured with version {entry.env_version}, this is {__version__}; "
+                f"measure the contests anew: {COMMAND}"
+            )
+        check_choice(f"{where}: oracle", entry.oracle, STATES)
+        if entry.contest not in candidates():
+            raise ValueError(f"{where}: {entry.contest} is no contest of this version; {COMMAND}")
+        found.append(entry)
+    return tuple(found)
+
+
+def write_contests(entries: Sequence[Measured], path: Path = FILE) -> None:
+    """Write a file that `read_contests` reads."""
+    write_text(path, json.dumps([asdict(each) for each in entries], indent=1) + "\n")
+
+
+@cache
+def contests() -> tuple[Contest, ...]:
+    """The scored contests, tier by tier; raises as `read_contests`."""
+    return tuple(each.contest for each in read_contests() if each.verdict == "scored")
+
+
+@cache
+def _oracles() -> dict[Contest, str]:
+    return {each.contest: each.oracle for each in read_contests()} if FILE.is_file() else {}
+
+
+def oracle_of(contest: Contest) -> str:
+    """The better of `STATES` in a contest; LQR where none was measured."""
+    return _oracles().get(contest, STATES[0])

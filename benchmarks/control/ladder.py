@@ -1,0 +1,210 @@
+"""The ladder of rungs: its yardsticks, whether it falls, what each step of knowledge costs, and the
+answer."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from ...envs.task.failures import FAILURES
+from ..harness.results import Table
+from ..harness.stats import average, chance_of_no_less, geometric_mean, holm
+from .cells import REFERENCE_CONTROLLER, REFERENCE_FILTER, RUNGS, TRUTH
+from .contests import NOMINAL, PARAMETERS, STATE, TITLES, Contest, oracle_of
+from .episodes import Array
+from .run import Results
+from .scores import NOTHING, Yardstick, survived
+from .tables import Standing
+
+_OF_THE_CAR = ("none", "spin", "off-road")
+CLAIRVOYANT = "clairvoyant"
+
+
+def yardsticks(results: Results, contests: Sequence[Contest]) -> dict[Contest, Yardstick]:
+    """The yardstick of each contest in which both rungs were driven."""
+    found = {}
+    for contest in contests:
+        nominal, oracle = (results.of(contest, rung) for rung in (NOMINAL, STATE))
+        if not nominal.error and not oracle.error:
+            found[contest] = Yardstick(nominal, oracle)
+    return found
+
+
+def ladder_table(
+    results: Results, contests: Sequence[Contest], foreseen: Mapping[Contest, Array]
+) -> Table:
+    """Every contest's rungs and whether they fall in cost.
+
+    foreseen: (n,) log(J_oracle-state / J_clairvoyant) of the clairvoyant's own seeds, where it is
+    calibrated.
+    """
+    yards, cells = yardsticks(results, contests), []
+    for contest in contests:
+        if contest not in yards:
+            errors = [results.of(contest, rung).error for rung in (NOMINAL, STATE)]
+            cells.append([contest.name, *[""] * 6, "; ".join(filter(None, errors))])
+            continue
+        yard = yards[contest]
+        own = yard.paired(yard.oracle)[1]
+        gap, parameters = average(own), results.of(contest, PARAMETERS)
+        known = "" if parameters.error else f"{_mean(yard.paired(parameters)[0]):.2f}"
+        ahead = foreseen.get(contest)
+        cells.append(
+            [
+                contest.name,
+                f"{100.0 * (1.0 - survived(yard.nominal).mean()):.1f}",
+                oracle_of(contest),
+                f"{gap.value:.2f} [{gap.low:.2f}, {gap.high:.2f}]",
+                known,
+                "" if ahead is None else f"{ahead.mean():.2f}",
+                f"{len(own)} of {len(yard.kept(len(yard.oracle.costs)))}",
+                _fall(yard, own, ahead),
+            ]
+        )
+    header = (
+        *("contest", "nominal fails / %", "oracle-state is", "its gap", "oracle-parameters"),
+        *("clairvoyant beyond", "episodes", "falls"),
+    )
+    note = "Mean of log(J_nominal / J), 0.69 for half the cost; the score's 1 is the gap."
+    if not foreseen:
+        note += " The clairvoyant is not calibrated: its column is empty (`sideslip calibrate`)."
+    return Table("The ladder", header, cells, note, keyed=False)
+
+
+def _mean(values: Array) -> float:
+    return float(values.mean()) if len(values) else float("nan")
+
+
+def _fall(yard: Yardstick, own: Array, ahead: Array | None) -> str:
+    """Whether each rung costs less than the one below it."""
+    if not len(own):
+        return "no episode that nominal and oracle-state survive"
+    if yard.gap < NOTHING:
+        return "nothing to win here"
+    if ahead is not None and ahead.mean() <= 0.0:
+        return "clairvoyant does not"
+    return "yes" if average(own).low > 0.0 else "not surely"
+
+
+def findings(found: Sequence[Standing]) -> list[str]:
+    """The contestants that cost less than oracle-state over their tier, Holm-corrected."""
+    others = [s for s in _judged(found) if s.cell.controller not in RUNGS]
+    ahead = [
+        np.concatenate([own - r for r, own in each.pairs.values()]) for each in others
+    ]  # below 0 where the contestant is better
+    sure = holm([chance_of_no_less(each) for each in ahead])
+    return [
+        f"Finding: {each.label} costs less than oracle-state in tier {each.tier} "
+        f"(score {each.overall['score'].value:.2f})."
+        for each, is_sure in zip(others, sure, strict=True)
+        if is_sure
+    ]
+
+
+def below_the_clairvoyant(names: Sequence[str], leads: Sequence[Array]) -> list[str]:
+    """Of contestants with log(J / J_clairvoyant) (n,) on its seeds: who is surely below it."""
+    sure = holm([chance_of_no_less(each) for each in leads])
+    return [name for name, is_sure in zip(names, sure, strict=True) if is_sure]
+
+
+def knowledge_table(results: Results, tiers: Mapping[str, Sequence[Contest]],
+                    foreseen: Mapping[Contest, Array]) -> Table:  # fmt: skip
+    """What not knowing costs, tier by tier: the ratio of the costs of neighbouring rungs."""
+    cells = []
+    for tier, contests in tiers.items():
+        yards = yardsticks(results, contests)
+        steps: list[list[Array]] = [[], [], [c for k, c in foreseen.items() if k in contests]]
+        for contest, yard in yards.items():
+            parameters = results.of(contest, PARAMETERS)
+            if not parameters.error and yard.kept(len(parameters.costs)).any():
+                r, own = yard.paired(parameters)
+                steps[0].append(r)
+                steps[1].append(own - r)
+        texts = []
+        for logs in steps:
+            ratio = geometric_mean(*logs)
+            spread = f"{ratio.value:.2f} [{ratio.low:.2f}, {ratio.high:.2f}]"
+            texts.append(spread if logs else "")
+        cells.append([f"{tier}: {TITLES[tier]}", *texts])
+    header = (
+        *("tier", "car, friction, biases (model)", "state and disturbances (sensing)"),
+        "what is ahead (foresight)",
+    )
+    note = (
+        "Cost without over cost with the knowledge: nominal / oracle-parameters, oracle-parameters "
+        "/ oracle-state, oracle-state / clairvoyant. Paired geometric means."
+    )
+    return Table("What not knowing costs", header, cells, note, keyed=False)
+
+
+def answer(found: Mapping[str, Sequence[Standing]]) -> str:
+    """A line a tier: the best estimator and the best controller, and by how much."""
+    return "\n\n".join(_answer_of(tier, each) for tier, each in found.items())
+
+
+def _judged(found: Sequence[Standing]) -> list[Standing]:
+    """Those that have a score."""
+    return [s for s in found if "score" in s.overall and np.isfinite(s.overall["score"].value)]
+
+
+def _answer_of(tier: str, found: Sequence[Standing]) -> str:
+    """The best of those that drove in all of the tier's contests."""
+    most = max((len(each.pairs) for each in found), default=0)
+    judged = [each for each in _judged(found) if len(each.pairs) == most]
+    filters = [
+        each
+        for each in judged
+        if each.cell.controller == REFERENCE_CONTROLLER and each.cell.estimator != TRUTH
+    ]
+    others = [
+        each
+        for each in judged
+        if each.cell.controller not in RUNGS and each.cell.estimator in ("", REFERENCE_FILTER)
+    ]
+    best = [
+        _first(f"estimator (with {REFERENCE_CONTROLLER})", filters, "estimator"),
+        _first(f"controller (on {REFERENCE_FILTER})", others, "controller"),
+    ]
+    return f"Tier {tier}, {TITLES[tier]}: {'; '.join(best)}."
+
+
+def _first(what: str, ranked: Sequence[Standing], attribute: str) -> str:
+    """The best of a kind, its score, and its cost over that of the next best one."""
+    if not ranked:
+        return f"no {what} has a score"
+    best, *others = ranked
+    value, low, high = best.overall["score"]
+    text = f"best {what} {getattr(best.cell, attribute)}, score {value:.2f} [{low:.2f}, {high:.2f}]"
+    if not others:
+        return text
+    logs = []
+    for contest, (r, _) in best.pairs.items():
+        second = others[0].pairs[contest][0]
+        n = min(len(r), len(second))  # the first seeds are everybody's
+        logs.append(second[:n] - r[:n])
+    ratio = geometric_mean(*logs)
+    value, low, high = (100.0 * each for each in ratio)
+    sure = "" if high < 100.0 or low > 100.0 else ", a tie"
+    next_best = getattr(others[0].cell, attribute)
+    return f"{text}, {value:.0f} % [{low:.0f}, {high:.0f}] of the cost of {next_best}{sure}"
+
+
+def refusals_of(results: Results) -> list[list[str]]:
+    """A line for every cell that could not be driven, or whose episodes ended by a failure that is
+    not the car's (a NaN, an action that is none): tier, contest, contestant, what happened."""
+    lines = []
+    for cell, result in results.found.items():
+        where = [cell.contest.tier, cell.contest.name, cell.label]
+        if result.error:
+            lines.append([*where, f"not driven: {result.error}"])
+            continue
+        codes = result["failure"].astype(int)
+        ended = [
+            f"{name} {100.0 * (codes == code).mean():.1f} %"
+            for code, name in enumerate(FAILURES)
+            if name not in _OF_THE_CAR and (codes == code).any()
+        ]
+        if ended:
+            lines.append([*where, ", ".join(ended)])
+        elif (codes != 0).all():
+            lines.append([*where, "every car fails"])
+    return lines

@@ -1,0 +1,141 @@
+"""Contests: chosen by what is to be won, refused where they are another version's; the ladder."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sideslip.benchmarks.control import contests as module
+from sideslip.benchmarks.control.cells import RUNGS, Cell
+from sideslip.benchmarks.control.choice import judged, rungs_of
+from sideslip.benchmarks.control.contests import (
+    NOMINAL,
+    STATE,
+    STATES,
+    TIERS,
+    Contest,
+    Measured,
+    candidates,
+    contests,
+    read_contests,
+    write_contests,
+)
+from sideslip.benchmarks.control.episodes import NUMBERS, Driven
+from sideslip.benchmarks.control.run import Results, measure
+from sideslip.benchmarks.control.scores import Yardstick
+from sideslip.benchmarks.control.seeds import salt_of, salted_seeds
+from sideslip.benchmarks.harness.stats import average
+from sideslip.envs import FAILURES, SCENARIOS
+
+ONE = candidates()[0]
+LIMIT = next(contest for contest in candidates() if contest.tier == "2c")
+
+
+def driven(costs: np.ndarray, failed: int = 0, error: str = "") -> Driven:
+    numbers = np.ones((len(costs), len(NUMBERS)))
+    numbers[:, NUMBERS.index("cost")] = costs
+    code = np.where(np.arange(len(costs)) < failed, FAILURES.index("spin"), 0)
+    numbers[:, NUMBERS.index("failure")] = code
+    return Driven(numbers, 1.0, error=error)
+
+
+def found(contest: Contest, levels: dict[str, float], **failed: int) -> Measured:
+    """What is made of nominal's and both oracles' costs on 40 seeds."""
+    seeds = np.random.default_rng(0).lognormal(0.0, 1.0, 40) + 1.0
+    made = {
+        Cell(contest, "", name): driven(level * seeds, failed.get(name.replace("-", "_"), 0))
+        for name, level in levels.items()
+    }
+    for cell in rungs_of(contest):
+        made.setdefault(cell, driven(np.full(40, np.nan), error="no plant"))
+    return judged(Results(made), contest)
+
+
+def test_a_contest_is_scored_where_the_rungs_lie_apart() -> None:
+    both = {STATES[0]: 1.0, STATES[1]: 0.5}
+    wide = found(ONE, {NOMINAL: 2.0, **both})
+    assert (wide.verdict, wide.oracle, wide.judged) == ("scored", STATES[1], 40)
+    assert wide.gap == pytest.approx(np.log(4.0), abs=0.01)
+    narrow = found(ONE, {NOMINAL: 0.65, **both})
+    assert narrow.verdict.startswith("too little to win: 0.26")
+    failing = found(ONE, {NOMINAL: 2.0, **both}, nominal=4)
+    assert failing.verdict == "nominal fails in 10 %"
+    assert found(LIMIT, {NOMINAL: 2.0, **both}, nominal=20).verdict == "scored"
+
+
+def test_an_oracle_that_fails_more_often_is_not_the_better_one() -> None:
+    levels = {NOMINAL: 2.0, STATES[0]: 0.5, STATES[1]: 1.0}
+    assert found(ONE, levels).oracle == STATES[0]
+    assert found(ONE, levels, oracle_state_lqr=20).oracle == STATES[1]
+
+
+def test_a_rung_that_cannot_be_computed_leaves_the_other_or_the_reason() -> None:
+    assert found(ONE, {NOMINAL: 2.0, STATES[0]: 1.0}).verdict == "scored"
+    for there in ({NOMINAL: 2.0}, {STATES[0]: 1.0}, {}):
+        lost = found(ONE, there)
+        assert "no plant" in lost.verdict and lost.gap == 0.0
+
+
+@pytest.mark.parametrize("contest", [ONE, LIMIT])
+def test_where_every_car_fails_nothing_is_scored(contest: Contest) -> None:
+    lost = found(contest, {NOMINAL: 2.0, STATES[0]: 1.0}, nominal=40)
+    assert lost.verdict != "scored" and lost.judged == 0 and lost.failing == 1.0
+
+
+def test_the_file_holds_every_number_and_is_refused_where_it_is_another_versions(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "contests.json"
+    entry = found(ONE, {NOMINAL: 2.0, STATES[0]: 1.0})
+    write_contests([entry], path)
+    assert read_contests(path) == (entry,)
+    for change, message in (
+        ({"env_version": "0.0.1"}, "measured with version 0.0.1, this is"),
+        ({"scenario": "moon"}, "is no contest of this version"),
+        ({"tier": "2a"}, "is no contest of this version"),
+        ({"oracle": "nobody"}, "nobody"),
+        ({"gap": "wide"}, "gap is 'wide', not float"),
+    ):
+        path.write_text(json.dumps([dataclasses.asdict(entry) | change]))
+        with pytest.raises(ValueError, match=message) as caught:
+            read_contests(path)
+        assert str(path) in str(caught.value)
+    path.write_text("[")
+    with pytest.raises(ValueError, match="cut short"):
+        read_contests(path)
+
+
+def test_every_tier_has_its_contests_and_they_can_be_built() -> None:
+    assert {contest.tier for contest in candidates()} == set(TIERS)
+    assert len({contest.name for contest in candidates()}) == len(candidates())
+    assert {each.contest for each in read_contests()} == set(candidates())
+    for contest in contests():
+        assert SCENARIOS[contest.scenario].tier == contest.tier
+        assert (contest.env_id, contest.vehicle, contest.reference) in TIERS[contest.tier]
+
+
+SCORED = contests() if module.FILE.is_file() else ()
+FIRST = {contest.tier: contest for contest in SCORED[::-1]}
+
+
+@pytest.mark.parametrize("contest", FIRST.values(), ids=FIRST)
+def test_the_ladder_falls_in_a_sample(contest: Contest) -> None:
+    """Nominal costs more than oracle-state, paired, in the first scored contest of each tier."""
+    falls(contest, 16)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("contest", SCORED, ids=[contest.name for contest in SCORED])
+def test_the_ladder_falls_in_every_scored_contest(contest: Contest) -> None:
+    falls(contest, 64)
+
+
+def falls(contest: Contest, episodes: int) -> None:
+    cells = [Cell(contest, "", rung) for rung in RUNGS]
+    there = measure(cells, salted_seeds(salt_of(), episodes), jobs=1)
+    assert not any(each.error for each in there.found.values())
+    yard = Yardstick(there.of(contest, NOMINAL), there.of(contest, STATE))
+    gap = average(yard.paired(yard.oracle)[1])
+    assert gap.low > 0.0, (contest.name, gap)
