@@ -1,6 +1,6 @@
 """The manoeuvres of the two scored tiers: everything that decides is drawn by the seed.
 
-So is what real sensors do: biases, a GPS that is late, a camera that is uneven.
+So is what real sensors do: biases, a GPS that is late, an uneven camera that may lose the lane.
 
 Tier 1 is the COMS at 18 to 28 km/h. Tier 2 is the passenger car at 60 to 80 km/h: on a dry road
 (2a), on a road of any friction (2b), and at the limit of its tyres (2c). A contest adds an id and
@@ -23,6 +23,8 @@ _DRAWN: dict[str, Any] = {
     "camera_delays": (0.030,),
     "camera_jitter": 0.010,
     "camera_loss": 0.05,
+    "camera_heading": 0.35,
+    "camera_offset": 4.0,
     "gps_latency": (0.1, 0.3),
     "gyro_bias": (-0.5 * DEGREE, 0.5 * DEGREE),
     "accel_y_bias": (-0.2, 0.2),
@@ -101,11 +103,14 @@ def _turn(shape: dict[str, Any], low: float, high: float) -> dict[str, Any]:
 
 
 def _scenarios(tier: str, common: dict[str, Any], **shapes: dict[str, Any]) -> list[Scenario]:
-    """The scenarios of a tier by their names, written with underscores."""
-    return [
-        Scenario(name=name.replace("_", "-"), tier=tier, **(common | shape))
-        for name, shape in shapes.items()
-    ]
+    """The scenarios of a tier by their names, written with underscores; where no driver keeps to a
+    track, the road follows the nominal car, so that the camera has a lane to see."""
+    found = []
+    for name, shape in shapes.items():
+        road = "straight" if shape["steering"] == "driver" else "nominal-path"
+        fields: dict[str, Any] = {"road": road} | common | shape
+        found.append(Scenario(name=name.replace("_", "-"), tier=tier, **fields))
+    return found
 
 
 # "gentle" and the step: what one yaw moment can hold at zero slip
