@@ -20,7 +20,7 @@ _DRAWN: dict[str, Any] = {
     "mirror": True,
     "front_stiffness": (0.6, 1.4),
     "rear_stiffness": (0.6, 1.4),
-    "camera_delays": (0.030,),
+    "camera_delays": (0.022,),  # within a period with the jitter, as the papers' filters need
     "camera_jitter": 0.010,
     "camera_loss": 0.05,
     "camera_heading": 0.35,
