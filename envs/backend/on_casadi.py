@@ -23,6 +23,7 @@ SYMBOLS: dict[str, Callable[..., Any]] = {
     "sqrt": ca.sqrt,
     "select": ca.if_else,
     "to_float": lambda a: a * 1.0,
+    "anywhere": lambda condition: isinstance(condition, ca.SX | ca.MX) or condition,
 }
 """The primitives for CasADi's SX and MX, by the names the equations use."""
 

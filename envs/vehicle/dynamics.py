@@ -197,7 +197,7 @@ def derivative(
         return Motion(dv_x, dv_y, dgamma, gamma, v_x, dY, v_x, dy, turns, phi_dot, phi_ddot)
     turn, g_x, g_y = 0.0, 0.0, 0.0
     s_t, c_t = frame.sin_t, frame.cos_t
-    if anywhere((road.curvature != 0.0) | (road.turn != 0.0)):
+    if anywhere(road.curvature != 0.0) or anywhere(road.turn != 0.0):
         turn = motion.theta - frame.theta
         s_t, c_t = _turned(s_t, c_t, turn)
     s_r, c_r = _turned(frame.sin_r, frame.cos_r, motion.psi - frame.psi - turn)

@@ -70,6 +70,7 @@ def test_a_symbolic_tick_is_the_envs(scenario: str, small_angle: bool, lags: boo
         {"base": "double-lane-change", "onset": 0.05},
         {"base": "random-steering", "friction": 0.3, "tyres": "dugoff"},
         {"base": "coms-brake-in-turn", "change_start": 0.05, "friction": 0.4},
+        {"base": "coms-slalom", "onset": 0.02, "amplitude": 0.1, "bank": 0.03, "grade": 0.02},
     ],
     ids=[
         "changing tyres",
@@ -77,6 +78,7 @@ def test_a_symbolic_tick_is_the_envs(scenario: str, small_angle: bool, lags: boo
         "driver",
         "Dugoff tyres",
         "motor power, load transfer",
+        "a road that winds and leans",
     ],
 )
 def test_a_symbolic_tick_is_the_envs_where_the_road_the_tyres_or_the_driver_act(
