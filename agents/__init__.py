@@ -10,6 +10,7 @@ from .controllers.lane_keeping import LaneKeeping
 from .controllers.lqr import Lqr
 from .controllers.model_following import ModelFollowing
 from .controllers.mpc import Mpc
+from .controllers.nmpc import Nmpc
 from .controllers.sliding_mode import SlidingMode
 from .controllers.two_dof import Feedforward, TwoDof
 from .env_facts import AnyEnv
@@ -27,6 +28,7 @@ AGENTS = Registry(
         "sliding-mode": SlidingMode,
         "lqr": Lqr,
         "mpc": Mpc,
+        "nmpc": Nmpc,
         "lane-keeping": LaneKeeping,
         "learned": Learned,
     },
@@ -44,6 +46,7 @@ __all__ = [
     "Lqr",
     "ModelFollowing",
     "Mpc",
+    "Nmpc",
     "NoControl",
     "SlidingMode",
     "TwoDof",

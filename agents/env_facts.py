@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 from gymnasium.vector import VectorEnv, VectorWrapper
 
+from ..envs.engine.config import EnvConfig
 from ..envs.task.observation import Entry
 from ..envs.vehicle.vehicle import Vehicle
 
@@ -67,6 +68,12 @@ def facts_of(env: AnyEnv) -> EnvFacts:
                 "vehicle or other limits than row 0: make an agent for each kind of car"
             )
     return EnvFacts(layout, nominals[0], *limits[0], period, kind, width)
+
+
+def configs_of(env: AnyEnv) -> Sequence[EnvConfig]:
+    """The arguments of an env, or of each environment in a vector env that has no one for all."""
+    base: Any = env.unwrapped
+    return [base.config] if hasattr(base, "config") else base.get_attr("config")
 
 
 def _plain(env: Any, layout: tuple[Entry, ...]) -> tuple[Entry, ...]:

@@ -21,13 +21,17 @@ from ..estimators.wrappers.estimate import EstimateObservation
 from ..estimators.wrappers.truth import STIFFNESSES, TRUTH, TruthObservation
 from .controllers.base import FRICTION, Controller
 from .controllers.lqr import Lqr
+from .controllers.nmpc import Nmpc
 
-NOMINAL, PARAMETERS, STATE_LQR = "nominal", "oracle-parameters", "oracle-state-lqr"
-RUNGS = (NOMINAL, PARAMETERS, STATE_LQR)
-"""From the bottom up; `oracle-parameters` knows car, friction, noise and biases."""
+NOMINAL, PARAMETERS = "nominal", "oracle-parameters"
+STATE_LQR, STATE_NMPC = "oracle-state-lqr", "oracle-state-nmpc"
+RUNGS = (NOMINAL, PARAMETERS, STATE_LQR, STATE_NMPC)
+"""From the bottom up: `oracle-parameters` knows car, friction, noise and biases, the last two also
+the state and what pushes the car; neither of these is always the better one."""
 
 FILTER = "exact-kf"
 OUTPUTS = ("beta", "gamma", "F_d", "N_d")
+STATES = (*OUTPUTS, "phi", "phi_rate")
 GRIP = 0.7  # share of the rear tyres' grip for the yaw moment; 0.71 of it is left across
 STEER_WEIGHT = 100.0  # of added steering, which `lqr`'s design does not know the rate limit of
 _NOISE = {
@@ -114,15 +118,16 @@ def make_rung(
         env = _filtered(env, base, vehicle, chosen["filter"])
     if name != NOMINAL:
         told = VectorTruthObservation if num_envs is not None else TruthObservation
-        states = () if name == PARAMETERS else OUTPUTS
+        states = () if name == PARAMETERS else STATES
         parameters = (*STIFFNESSES, FRICTION.removeprefix("true_"))
         env = told(env, parameters, states)
     settings: dict[str, Any] = {"disturbance_time": base.scenario.disturbance_time, "grip": GRIP}
-    if base.action_space.shape == (2,):
+    if name != STATE_NMPC:  # which foresees the steering's rate
         settings["steer_weight"] = STEER_WEIGHT
     if name != NOMINAL:
         settings |= {"vehicle": base.vehicle, "stiffness": [f"true_{each}" for each in STIFFNESSES]}
-    return env, Lqr(env, **settings | dict(chosen["controller"]))
+    kind = Nmpc if name == STATE_NMPC else Lqr
+    return env, kind(env, **settings | dict(chosen["controller"]))
 
 
 def _filtered(env: Any, base: Any, vehicle: str | None, options: Mapping[str, Any]) -> Any:

@@ -37,13 +37,15 @@ class Controller(ABC):
 
     needs: tuple[str, ...] = ()
     memory = 0
+    knows_friction = False  # whether it reads the true friction, if that is there, without a grip
     _design: tuple[Any, ...] = ()  # the arguments of a compiled law behind inputs, state, action
 
     def __init__(self, env: AnyEnv, grip: float | None = None) -> None:
         facts = facts_of(env)
         names = [entry.name for entry in facts.layout]
         self.grip = None if grip is None else positive("grip", grip)
-        self._true_friction = grip is not None and FRICTION in names
+        limits = grip is not None or self.knows_friction
+        self._true_friction = limits and FRICTION in names
         if self._true_friction:
             self.needs = (*self.needs, FRICTION)
         missing = [name for name in self.needs if name not in names]

@@ -101,6 +101,8 @@ class Lqr(Controller):
     python-control.
     """
 
+    shortest = 1  # ticks, of the period that the gains are designed for
+
     def __init__(
         self,
         env: AnyEnv,
@@ -125,12 +127,13 @@ class Lqr(Controller):
             "gamma_hat" if "gamma_hat" in names else "gyro",
             *pairs.get(kind, instead),
             *(stiffness or instead),
+            *self._more(names),
         )
         super().__init__(env, grip)
         car = self.nominal if vehicle is None else vehicle
         self.memory = 1 if self.width == 2 else 0
         self.purpose = Purpose(
-            self.control_period,
+            max(self.control_period, self.shortest),
             self.full_scale,
             self.width == 2,
             REFERENCES.index(self.reference),
@@ -145,12 +148,16 @@ class Lqr(Controller):
         self.share = 0.5 * car.rear_track / car.wheel_radius / self.full_scale
         self.vehicle = car
         speeds = SPEEDS[::2] if stiffness else SPEEDS
-        self.table = gain_table(car, self.purpose, speeds, fronts, rears)
+        self.table, self._terminal = gain_table(car, self.purpose, speeds, fronts, rears)
         self.axes = tuple(np.array(axis) for axis in (speeds, fronts or (0.0,), rears or (0.0,)))
         slew = car.steering_rate * self.control_period * TICK
         self.scheduled = len(stiffness) == 2
         limits = self.authority, slew, car.front_arm
         self._design = self.table, self.axes, int(self.scheduled), self.share, *limits
+
+    def _more(self, names: set[str]) -> tuple[str, ...]:
+        """Entries of an observation that a subclass reads behind `Inputs`."""
+        return ()
 
     def gains(self, speed: float, front: float = 0.0, rear: float = 0.0) -> Array:
         """K (m, n) at a speed in m/s, and at stiffnesses in N/rad where it is scheduled on them."""

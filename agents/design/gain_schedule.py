@@ -3,14 +3,14 @@
 import itertools
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ...envs.backend.decorators import jit
 from ...envs.record import Array
 from ...envs.vehicle.vehicle import Vehicle
-from .sampled_model import Purpose, design_model, regulator
+from .sampled_model import DYNAMIC, Purpose, cost_to_go, design_model, input_cost
 
 SPEEDS = tuple(np.geomspace(2.0, 60.0, 48).tolist())
 """m/s: gains are designed at these, interpolated between and held beyond."""
@@ -42,6 +42,13 @@ def interpolated(table: Any, axes: Any, v: Any, front: Any, rear: Any, K: Any) -
             K += w * table[i + p, j + q, k + r]
 
 
+class Tables(NamedTuple):
+    """What the regulator is on a grid, (speeds, fronts, rears, ...): see `regulator`."""
+
+    gains: Array  # [K S], (..., m, n + m)
+    terminal: Array  # T, (..., d, n): what is to come costs |T x|^2, but for what no input changes
+
+
 @lru_cache(maxsize=16)
 def gain_table(
     vehicle: Vehicle,
@@ -49,17 +56,27 @@ def gain_table(
     speeds: Sequence[float],
     fronts: Sequence[float],
     rears: Sequence[float],
-) -> Array:
-    """[K S] on a grid, (speeds, fronts, rears, m, n + m); see `regulator`.
+) -> Tables:
+    """The regulators of a car over speeds in m/s and stiffnesses.
 
     fronts, rears: stiffnesses in N/rad, none: the vehicle's.
     """
     shape = len(speeds), max(len(fronts), 1), max(len(rears), 1)
-    gains = []
+    gains, terminal = [], []
     for speed, front, rear in itertools.product(
         speeds, fronts or (vehicle.front_stiffness,), rears or (vehicle.rear_stiffness,)
     ):
         car = vehicle.replace(front_stiffness=front, rear_stiffness=rear)
-        gains.append(np.hstack(regulator(design_model(car, speed, purpose))))
-    table = np.array(gains)
-    return np.ascontiguousarray(table.reshape(*shape, *table.shape[1:]))
+        model = design_model(car, speed, purpose)
+        K, V = cost_to_go(model)
+        gains.append(np.hstack([K, input_cost(model, V)]))
+        terminal.append(_root(V))
+    return Tables(*(np.array(each).reshape(*shape, *each[0].shape) for each in (gains, terminal)))
+
+
+def _root(V: Array) -> Array:
+    """T (d, n) with |T x|^2 = x'Vx but for the part of the states that no input moves."""
+    d = len(DYNAMIC)
+    P = V[:d, :d] + 1e-9 * np.diag(np.diag(V)[:d]) + 1e-15 * np.eye(d)  # without lag: singular
+    L = np.linalg.cholesky(P)
+    return np.hstack([L.T, np.linalg.solve(L, V[:d, d:])])

@@ -161,7 +161,12 @@ def regulator(model: DesignModel) -> tuple[Array, Array]:
     """K (m, n) of u = -K x, which minimises the sum of the model's cost, and S (m, m): another
     input for one period costs (u + K x)'S(u + K x) more. See `cost_to_go`."""
     K, V = cost_to_go(model)
-    return K, model.R + model.H.T @ V @ model.H
+    return K, input_cost(model, V)
+
+
+def input_cost(model: DesignModel, V: Array) -> Array:
+    """S (m, m) of `regulator`, for the cost to go V."""
+    return model.R + model.H.T @ V @ model.H
 
 
 def cost_to_go(model: DesignModel) -> tuple[Array, Array]:

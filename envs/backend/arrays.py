@@ -65,7 +65,8 @@ def write(array: Any, values: Any, where: Any, *index: int) -> None:
 
 def at(array: Any, *index: int) -> Any:
     """The number at an index."""
-    return float(array[index])
+    found: Any = array[index]
+    return found.item()
 
 
 def put(array: Any, value: Any, *index: int) -> None:

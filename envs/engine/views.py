@@ -59,7 +59,7 @@ class TrueState(NamedTuple):
     F_d: int = 2  # N, all that pushes to the side: wind and the slope of a banked road too
     N_d: int = 3  # N m, with the wind's
     phi: int = 4  # rad
-    phi_dot: int = 5  # rad/s
+    phi_rate: int = 5  # rad/s
 
 
 TRUE_STATE = TrueState()
@@ -83,7 +83,7 @@ def _write_true_states(params: Any, states: Any, switches: Any, out: Any) -> Non
         out[i, TRUE_STATE.gamma] = motion.gamma
         out[i, TRUE_STATE.F_d] = z[Z.drive.F_d] + F_w - p[P.car.m] * across
         out[i, TRUE_STATE.N_d] = z[Z.drive.N_d] + N_w
-        out[i, TRUE_STATE.phi], out[i, TRUE_STATE.phi_dot] = motion.phi, motion.phi_dot
+        out[i, TRUE_STATE.phi], out[i, TRUE_STATE.phi_rate] = motion.phi, motion.phi_dot
 
 
 def record_in(state: Array, rows: Array, packets: Array) -> Record:

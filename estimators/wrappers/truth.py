@@ -25,7 +25,7 @@ _STATES = {
     "F_d": ("N", LARGEST),
     "N_d": ("N m", LARGEST),
     "phi": ("rad", math.pi),
-    "phi_dot": ("rad/s", 100.0),
+    "phi_rate": ("rad/s", 100.0),
 }
 
 

@@ -1,0 +1,248 @@
+"""Nonlinear model predictive control: the plant's own text foreseen, a plan improved each time."""
+
+import math
+from collections import namedtuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from ...envs.backend.decorators import jit
+from ...envs.backend.elementary import sincos
+from ...envs.engine.tick import Kind
+from ...envs.task.reference import LAGGED, Target, reference, target_of
+from ...envs.ticks import TICK
+from ...envs.vehicle.dynamics import Motion, Push
+from ...envs.vehicle.tyres import SLOW, TYRE_LAWS, shifts
+from ...envs.vehicle.vehicle import GRAVITY, Vehicle
+from ..design.gain_schedule import interpolated
+from ..design.gauss_newton import MOST_VARIABLES, improved
+from ..design.prediction import Model, Start, blocks_of, changed_tyres, model_of
+from ..env_facts import AnyEnv, configs_of
+from .base import Array, positive
+from .lqr import IN, Lqr
+
+STEP = 10  # ticks, the shortest of the prediction
+FIRST = 6  # more iterations at an episode's first decision
+STEEPEST = 1.2  # rad of sideslip, beyond which a prediction starts from this
+STATUSES = ("unknown", "solved", "the observation is not finite", "diverged")
+UNKNOWN, SOLVED, NOT_FINITE, DIVERGED = range(len(STATUSES))
+
+Memory = namedtuple("Memory", "slewing status")
+"""rad of steering last added, and of `STATUSES`; the plan stands behind."""
+
+LAST = Memory(*range(2))
+PLAN = len(Memory._fields)
+
+
+class Design(NamedTuple):
+    """What all decisions of a controller share."""
+
+    model: Model
+    target: Target
+    gains: Any  # K of `gain_schedule.Tables`, (..., m, n)
+    terminal: Any
+    axes: Any
+    blocks: Any
+    scheduled: int  # 1: on the stiffnesses of the observation
+    disturbed: int  # 0, 1 by forces, 2 by rates
+    steps: float  # of the prediction in a control period
+    iterations: int
+
+
+@jit
+def _shifted(plan: Any, blocks: Any, m: int, steps: float) -> None:
+    """Move a plan on by so many steps of the prediction, each block towards its next."""
+    for i in range(len(plan) - m):
+        plan[i] += (plan[i + m] - plan[i]) * min(1.0, steps / blocks[i // m])
+
+
+@jit
+def _regulator(table: Any, axes: Any, v: Any, front: Any, rear: Any, per: Any) -> Any:
+    """(rows, 9) of a table: columns of the states with forces, which may be rates in the table."""
+    found, full = np.empty(table.shape[3:]), np.zeros((table.shape[3], 9))
+    interpolated(table, axes, v, front, rear, found)
+    for i in range(len(found)):
+        for j in range(min(found.shape[1], 9)):
+            full[i, j] = found[i, j]
+        full[i, 7] *= per[0]
+        full[i, 8] *= per[1]
+    return full
+
+
+@jit
+def problem_of(design: Design, x: Any, friction: Any, roll: Any, slewing: Any, most: Any) -> Any:
+    """(where the prediction starts, K, T) for a row of `lqr.Inputs`.
+
+    roll: rad, rad/s; NaN where they are not measured. slewing: rad of steering last added.
+    """
+    model, disturbed = design.model, design.disturbed
+    v = max(0.5 * (x[IN.wheel_left] + x[IN.wheel_right]), SLOW)
+    front = x[IN.front_stiffness] if design.scheduled else model.car.C_f
+    rear = x[IN.rear_stiffness] if design.scheduled else model.car.C_r
+    car = changed_tyres(model.car, front, rear, friction)
+    gamma, driver, refs = x[IN.gamma_hat], x[IN.steer_command], (x[IN.beta_ref], x[IN.gamma_ref])
+    steady = reference(driver, v, design.target, LAGGED) if model.kind.reference == LAGGED else refs
+    per = (car.m * v, car.I) if disturbed == 2 else (1.0, 1.0)
+    F_d = x[IN.disturbance_1] * per[0] if disturbed else 0.0
+    N_d = x[IN.disturbance_2] * per[1] if disturbed else 0.0
+    phi, rate = roll[0], roll[1]
+    if phi != phi:  # as in a steady turn
+        phi, rate = car.S * v * gamma / (car.K_x - car.S * GRAVITY), 0.0
+    rolls = float(model.kind.roll)
+    sine, cosine = sincos(min(max(x[IN.beta_hat], -STEEPEST), STEEPEST))
+    v_y = v * (x[IN.beta_hat] if model.kind.small_angle else sine / cosine)
+    start = Start(
+        car,
+        Motion(v, v_y, gamma, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, rolls * phi, rolls * rate),
+        x[IN.torque_left],
+        x[IN.torque_right],
+        x[IN.steer],
+        slewing,
+        driver,
+        (x[IN.torque_left] + x[IN.torque_right]) / (car.m * car.r),
+        refs,
+        steady,
+        Push(F_d, N_d, 0.0),
+        most,
+    )
+    per_force = (1.0 / per[0], 1.0 / per[1])
+    K = _regulator(design.gains, design.axes, v, front, rear, per_force)
+    return start, K, _regulator(design.terminal, design.axes, v, front, rear, per_force)
+
+
+@jit
+def _nmpc_law(
+    x: Any, state: Any, action: Any, most: Any, friction: Any, rolls: Any, design: Design
+) -> None:
+    """x: `lqr.Inputs`. state: `Memory` and the plan. rolls: (N, 2), as in `problem_of`."""
+    blocks, m = design.blocks, design.gains.shape[3]
+    for row in range(len(x)):
+        slewing = state[row, LAST.slewing]
+        start, K, T = problem_of(design, x[row], friction[row], rolls[row], slewing, most[row])
+        plan, more = state[row, PLAN:].copy(), FIRST
+        if state[row, LAST.status] == SOLVED:
+            _shifted(plan, blocks, m, design.steps)
+            more = 0
+        J, share, wheel = improved(
+            design.model, start, K, T, blocks, plan, design.iterations + more
+        )
+        if np.isfinite(J):
+            state[row, PLAN:], state[row, LAST.slewing] = plan, wheel
+            state[row, LAST.status] = SOLVED
+            action[row, 0] = share
+            if m > 1:
+                action[row, 1] = wheel / design.model.authority
+        else:
+            state[row, :], action[row, :] = 0.0, math.nan
+            state[row, LAST.status] = DIVERGED
+
+
+class Nmpc(Lqr):
+    """Real-time Gauss-Newton iterations on the env's own plant and cost, held by `lqr` behind.
+
+    The plant is foreseen for `horizon` seconds in steps of a control period or of 10 ms where that
+    is shorter: its tyres, roll, motors and limits are those of the nominal car or, where the
+    observation tells them, of the true one (`stiffness`, `true_friction`); the driver's command
+    and acceleration are held. What follows costs what the linear car would under `lqr`. Optimised
+    is what is added to `lqr`'s answer, within the limits of moment, `grip`, steering and its rate;
+    where none is met and nothing is bent the action is `lqr`'s. `iterations` from the last plan,
+    more at an episode's first decision.
+
+    The other options are those of `lqr`, whose entries it reads, and phi_hat and phi_rate_hat where
+    they are there. Memory: `Memory` and the plan. `status` names a row's: where no prediction is
+    finite the action is NaN.
+
+    Raises ValueError for a missing entry or an option out of range, or where the rows of a vector
+    env have different plants; ModuleNotFoundError without python-control.
+    """
+
+    shortest = STEP
+    knows_friction = True
+
+    def __init__(
+        self,
+        env: AnyEnv,
+        horizon: float = 0.5,
+        iterations: int = 2,
+        disturbance_time: float = 0.3,
+        vehicle: Vehicle | None = None,
+        stiffness: Sequence[str] = (),
+        span: tuple[float, float] = (0.5, 1.6),
+        knots: int = 7,
+        steer_weight: float = 10.0,
+        grip: float | None = None,
+    ) -> None:
+        options = disturbance_time, vehicle, stiffness, span, knots, steer_weight, grip
+        super().__init__(env, *options)
+        if isinstance(iterations, bool) or not isinstance(iterations, int) or iterations < 1:
+            raise ValueError(f"iterations is a positive whole number, got {iterations!r}")
+        purpose, target = self.purpose, target_of(self.nominal)
+        period = purpose.period
+        steps = max(round(positive("horizon", horizon) / (period * TICK)), 1)
+        blocks = blocks_of(steps, MOST_VARIABLES // self.width)
+        self.memory = PLAN + self.width * len(blocks)
+        kind, lags, yaw_first = _plant(env, purpose.kind)
+        model = model_of(
+            self.vehicle, kind, period, lags,
+            disturbance_time if purpose.disturbances == "forces" else math.inf,
+            target.rest if purpose.kind == LAGGED else 1.0,
+            purpose.steer_weight, self.full_scale, self.authority, yaw_first,
+        )  # fmt: skip
+        self.design = Design(
+            model,
+            target,
+            np.ascontiguousarray(self.table[..., : -self.width]),
+            self._terminal,
+            self.axes,
+            blocks,
+            int(self.scheduled),
+            ("none", "forces", "rates").index(purpose.disturbances),
+            self.control_period / period,
+            iterations,
+        )
+
+    def _more(self, names: set[str]) -> tuple[str, ...]:
+        rolling = ("phi_hat", "phi_rate_hat")
+        self._rolling = names.issuperset(rolling)
+        return rolling if self._rolling else ()
+
+    def predict(
+        self,
+        observation: npt.NDArray[np.float32],
+        state: Array | None = None,
+        episode_start: npt.NDArray[np.bool_] | None = None,
+        deterministic: bool = True,
+    ) -> tuple[npt.NDArray[np.float32], Array]:
+        """As every controller's; `status` of the state has the reason for a NaN."""
+        shares, memory = super().predict(observation, state, episode_start, deterministic)
+        rows = shares.reshape(-1, self.width)
+        bad = np.isnan(rows).any(axis=1) & (memory[:, LAST.status] != DIVERGED)
+        memory[bad, LAST.status] = NOT_FINITE
+        return shares, memory
+
+    def status(self, state: Array) -> list[str]:
+        """Of each row of a state, what became of its last decision: of `STATUSES`."""
+        return [STATUSES[int(each)] for each in state[:, LAST.status]]
+
+    def _law(self, inputs: Array, state: Array, action: Array) -> None:
+        rolls = np.full((len(inputs), 2), np.nan)
+        if self._rolling:
+            rolls = np.ascontiguousarray(inputs[:, len(IN) : len(IN) + 2])
+        friction = np.ascontiguousarray(self._friction(inputs))
+        _nmpc_law(inputs, state, action, self._most(inputs), friction, rolls, self.design)
+
+
+def _plant(env: AnyEnv, reference: int) -> tuple[Kind, bool, bool]:
+    """(the plant's text, whether its actuators lag, whether the yaw moment comes first)."""
+    plants = set()
+    for config in configs_of(env):
+        scenario = config.scenario
+        law, small, roll = TYRE_LAWS.index(scenario.tyres), int(scenario.small_angle), scenario.roll
+        shifting = shifts(small, law, int(roll))
+        kind = Kind(small, law, reference, int(roll), follows=0, lag=2, shifting=shifting, road=0)
+        plants.add((kind, scenario.lags, config.yaw_first))
+    if len(plants) != 1:
+        raise ValueError("the rows of a vector env share one prediction, but their plants differ")
+    return plants.pop()
