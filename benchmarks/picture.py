@@ -33,7 +33,7 @@ def write_picture(path: str | Path, suites: Sequence[Suite]) -> None:
             ("Estimating with a late camera", ("tie-vision-fig7", "rmse"), error),
             ("Estimating with GPS, wind, outage", ("dakf-fig6", "rmse"), error),
             *(
-                (f"Tier {tier}: {what}", (f"tier {tier}", "score"), score)
+                (f"Tier {tier}\n{what}", (f"tier {tier}", "score"), score)
                 for tier, what in TITLES.items()
             ),
         )

@@ -15,6 +15,7 @@ from ...agents import make_agent
 from ...agents.learned.files import is_policy, load_policy
 from ...agents.rollout import steps_of
 from ...agents.rungs import FILTER, levels_of, make_rung
+from ...agents.tuned import tuned
 from ...envs.scenarios.manoeuvres import scenario_from
 from ...envs.task.observation import Entry
 from ...estimators.filters import FILTERS
@@ -23,7 +24,6 @@ from ..harness.drives import quietly
 from .cells import SETUPS, TRUTH, Cell
 
 STEPS = 200  # of a decision's time
-BIAS = 0.01  # rad/s, the standard deviation of the gyro's that an untuned filter expects
 
 _DISTURBANCES = {"forces": ("F_d", "N_d"), "walk": ("d1", "d2"), "walk-all": ("d1", "d2")}
 
@@ -79,10 +79,12 @@ def estimate_options(cell: Cell) -> dict[str, Any]:
     if cell.estimator in SETUPS:
         name, options = SETUPS[cell.estimator]
         if name == FILTER:
-            levels = levels_of(scenario_from(cell.env_options["scenario"])) | {"bias_sd": BIAS}
-            options = levels | cell.best["filter"] | options
-            if "gps" not in options["slow"]:
-                del options["hdop_table"]
+            levels = levels_of(scenario_from(cell.env_options["scenario"]))
+            options = levels | tuned(cell.contest.kind, cell.controller)["filter"] | options
+            unused = set() if "gps" in options["slow"] else {"hdop_table"}
+            if "accel_y" not in options["fast"]:
+                unused |= {"accel_y_noise", "accel_bias_sd"}
+            options = {key: value for key, value in options.items() if key not in unused}
         found["options"] = options
     return found
 
@@ -90,8 +92,9 @@ def estimate_options(cell: Cell) -> dict[str, Any]:
 def make_cars(cell: Cell, cars: int) -> tuple[VectorEnv[Any, Any, Any], Any]:
     """(vector env of `cars` rows with the cell's estimator, its agent), both as they are tuned."""
     contest, options = cell.contest, cell.env_options
+    best = tuned(contest.kind, cell.controller)
     if cell.rung:
-        return make_rung(cell.rung, contest.env_id, cars, options=cell.best, **options)
+        return make_rung(cell.rung, contest.env_id, cars, options=best, **options)
     env: Any = gym.make_vec(contest.env_id, num_envs=cars, **options)
     if cell.estimator == TRUTH:
         env = TrueState(env)
@@ -106,7 +109,7 @@ def agent_options(cell: Cell) -> dict[str, Any]:
     more: dict[str, Any] = {}
     if cell.controller == "model-following":
         more["rejection"] = cell.estimator == "dakf"
-    return more | cell.best["controller"]
+    return more | tuned(cell.contest.kind, cell.controller)["controller"]
 
 
 class _Timed:

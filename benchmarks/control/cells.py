@@ -4,14 +4,16 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from ...agents.tuned import Options, tuned
 from .contests import NOMINAL, PARAMETERS, STATE, STATES, STEERING, TIERS, YAW, Contest, oracle_of
 
 TRUTH, REFERENCE_CONTROLLER = "truth", "lqr"
 REFERENCE_FILTER = "exact-kf, all sensors"
 SETUPS: dict[str, tuple[str, dict[str, Any]]] = {
     REFERENCE_FILTER: ("exact-kf", {"slow": ["camera", "gps"]}),
-    "exact-kf, no bias state": ("exact-kf", {"slow": ["camera", "gps"], "bias_sd": 0.0}),
+    "exact-kf, no bias states": (
+        "exact-kf",
+        {"slow": ["camera", "gps"], "bias_sd": 0.0, "accel_bias_sd": 0.0},
+    ),
     "exact-kf, no accelerometer": ("exact-kf", {"slow": ["camera", "gps"], "fast": ["gyro"]}),
     "exact-kf, camera": ("exact-kf", {"slow": ["camera"]}),
     "exact-kf, gps": ("exact-kf", {"slow": ["gps"]}),
@@ -32,7 +34,7 @@ that was trained on fewer sensors reads what it knows by name."""
 SLOW_CONTROLLERS = ("mpc", "nmpc", STATES[1], PARAMETERS)
 
 EPISODES, QUICK_EPISODES, SLOW_EPISODES = 1000, 8, 128
-QUICK_CONTESTS = 3
+QUICK_CONTESTS = 2
 """Of each tier, in a quick run."""
 
 
@@ -52,20 +54,14 @@ class Cell:
 
     estimator: a name of `SETUPS` or of `make_estimator`, "truth", or "" where the controller reads
     none or brings its own. controller: a name of `make_agent`, or a rung. options: of the env
-    beside the contest's, a scenario that has no name among them; tuned: options of filter and
-    controller instead of the best known; cells are equal whatever both are.
+    beside the contest's, a scenario that has no name among them; cells are equal whatever theirs
+    are.
     """
 
     contest: Contest
     estimator: str
     controller: str
     options: dict[str, Any] = field(default_factory=dict, compare=False)
-    tuned: Options | None = field(default=None, compare=False)
-
-    @property
-    def best(self) -> Options:
-        """The options of its filter and its controller: `tuned`, or those of `agents.tuned`."""
-        return tuned(self.contest.kind, self.controller) if self.tuned is None else self.tuned
 
     @property
     def label(self) -> str:

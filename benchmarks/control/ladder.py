@@ -1,6 +1,7 @@
 """The ladder of rungs: its yardsticks, whether it falls, what each step of knowledge costs, and the
 answer."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -12,7 +13,7 @@ from .cells import REFERENCE_CONTROLLER, REFERENCE_FILTER, RUNGS, TRUTH
 from .contests import NOMINAL, PARAMETERS, STATE, TITLES, Contest, oracle_of
 from .episodes import Array
 from .run import Results
-from .scores import NOTHING, Yardstick, survived
+from .scores import NOTHING, Yardstick, score, survived
 from .tables import Standing
 
 _OF_THE_CAR = ("none", "spin", "off-road")
@@ -87,7 +88,13 @@ def _fall(yard: Yardstick, own: Array, ahead: Array | None) -> str:
 
 def findings(found: Sequence[Standing]) -> list[str]:
     """The contestants that cost less than oracle-state over their tier, Holm-corrected."""
-    others = [s for s in _judged(found) if s.cell.controller not in RUNGS]
+    others = [
+        each
+        for each in found
+        if each.cell.controller not in RUNGS
+        and "score" in each.overall
+        and np.isfinite(each.overall["score"].value)
+    ]
     ahead = [
         np.concatenate([own - r for r, own in each.pairs.values()]) for each in others
     ]  # below 0 where the contestant is better
@@ -141,23 +148,15 @@ def answer(found: Mapping[str, Sequence[Standing]]) -> str:
     return "\n\n".join(_answer_of(tier, each) for tier, each in found.items())
 
 
-def _judged(found: Sequence[Standing]) -> list[Standing]:
-    """Those that have a score."""
-    return [s for s in found if "score" in s.overall and np.isfinite(s.overall["score"].value)]
-
-
 def _answer_of(tier: str, found: Sequence[Standing]) -> str:
-    """The best of those that drove in all of the tier's contests."""
-    most = max((len(each.pairs) for each in found), default=0)
-    judged = [each for each in _judged(found) if len(each.pairs) == most]
     filters = [
         each
-        for each in judged
+        for each in found
         if each.cell.controller == REFERENCE_CONTROLLER and each.cell.estimator != TRUTH
     ]
     others = [
         each
-        for each in judged
+        for each in found
         if each.cell.controller not in RUNGS and each.cell.estimator in ("", REFERENCE_FILTER)
     ]
     best = [
@@ -167,25 +166,34 @@ def _answer_of(tier: str, found: Sequence[Standing]) -> str:
     return f"Tier {tier}, {TITLES[tier]}: {'; '.join(best)}."
 
 
-def _first(what: str, ranked: Sequence[Standing], attribute: str) -> str:
-    """The best of a kind, its score, and its cost over that of the next best one."""
+def _first(what: str, found: Sequence[Standing], attribute: str) -> str:
+    """The best of a kind, its score, and its cost over that of the next best one, over the contests
+    that more than one of them drove; who did not drive all of these is left out."""
+    driven = Counter(contest for each in found for contest in each.pairs)
+    shared = [contest for contest, count in driven.items() if count > 1]
+    ranked = [(each, score([each.pairs[c] for c in shared])) for each in found
+              if all(contest in each.pairs for contest in shared)]  # fmt: skip
+    ranked = [(each, number) for each, number in ranked if np.isfinite(number.value)]
     if not ranked:
         return f"no {what} has a score"
-    best, *others = ranked
-    value, low, high = best.overall["score"]
+    if found[0].by_failures:
+        ranked.sort(key=lambda pair: pair[0].overall["failure_rate"].value)
+    else:
+        ranked.sort(key=lambda pair: -pair[1].value)
+    (best, (value, low, high)), *others = ranked
     text = f"best {what} {getattr(best.cell, attribute)}, score {value:.2f} [{low:.2f}, {high:.2f}]"
     if not others:
         return text
+    second = others[0][0]
     logs = []
-    for contest, (r, _) in best.pairs.items():
-        second = others[0].pairs[contest][0]
-        n = min(len(r), len(second))  # the first seeds are everybody's
-        logs.append(second[:n] - r[:n])
-    ratio = geometric_mean(*logs)
-    value, low, high = (100.0 * each for each in ratio)
+    for contest in shared:
+        ours, theirs = best.pairs[contest][0], second.pairs[contest][0]
+        n = min(len(ours), len(theirs))  # the first seeds are everybody's
+        logs.append(theirs[:n] - ours[:n])
+    value, low, high = (100.0 * each for each in geometric_mean(*logs))
     sure = "" if high < 100.0 or low > 100.0 else ", a tie"
-    next_best = getattr(others[0].cell, attribute)
-    return f"{text}, {value:.0f} % [{low:.0f}, {high:.0f}] of the cost of {next_best}{sure}"
+    name = getattr(second.cell, attribute)
+    return f"{text}, {value:.0f} % [{low:.0f}, {high:.0f}] of the cost of {name}{sure}"
 
 
 def refusals_of(results: Results) -> list[list[str]]:

@@ -53,7 +53,8 @@ def run(
 
     episodes: a cell (slow controllers have at most 128). keep: a folder in which finished cases
     stay, so that a run that was stopped goes on. quick: a few contests, without the slow
-    contestants. clairvoyant: a file of `sideslip calibrate`, None: the package's, if there is one.
+    contestants and the price of delay. clairvoyant: a file of `sideslip calibrate`, None: the
+    package's, if there is one.
     """
     salt = salt_of()
     played = some_of(contests()) if quick else list(contests())
@@ -82,7 +83,10 @@ def run(
     ladder.note += _beaten(entries, there)
     suite.tables += [ladder, *more]
     share = max(4, round(PRICE_SHARE * episodes))
-    prices, late = price_of_delay(seeds[:share], jobs=jobs, console=console, keep=keep)
+    late: list[Results] = []
+    prices: list[Price] = []
+    if not quick:
+        prices, late = price_of_delay(seeds[:share], jobs=jobs, console=console, keep=keep)
     suite.rows += _price_rows(prices, share, salt)
     suite.tables += _refusals([results, *late])
     illustrate(suite, found, results, prices, seeds[0])

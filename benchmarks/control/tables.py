@@ -75,6 +75,12 @@ class Standing:
         return found
 
     @property
+    def by_failures(self) -> bool:
+        """Whether failures rank in this tier: nominal fails in more than 10 %."""
+        failing = [1.0 - survived(yard.nominal).mean() for yard in self.yards.values()]
+        return bool(failing) and float(np.mean(failing)) > _OFTEN
+
+    @property
     def excluded(self) -> int:
         """Episodes of the compared ones that nominal or the oracle did not survive."""
         everything = sum(len(self.yards[c].kept(len(self.driven[c].costs))) for c in self.pairs)
@@ -125,15 +131,13 @@ def standings(found: Mapping[Cell, Driven], tier: str, yards: Yardsticks) -> lis
         Standing(tier, cells[0], {cell.contest: found[cell] for cell in cells}, yards)
         for cells in mine.values()
     ]
-    failing = [1.0 - survived(yard.nominal).mean() for yard in yards.values()]
-    by_failures = bool(failing) and float(np.mean(failing)) > _OFTEN
-    return sorted(made, key=lambda each: _rank(each, by_failures))
+    return sorted(made, key=_rank)
 
 
-def _rank(standing: Standing, by_failures: bool) -> tuple[float, float]:
+def _rank(standing: Standing) -> tuple[float, float]:
     """Smaller is better; what has no number comes last."""
     value = standing.overall.get("score", Estimate(float("nan"))).value
-    failed = standing.overall["failure_rate"].value if by_failures else 0.0
+    failed = standing.overall["failure_rate"].value if standing.by_failures else 0.0
     return tuple(np.nan_to_num([failed, -value], nan=np.inf).tolist())
 
 

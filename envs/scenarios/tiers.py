@@ -20,7 +20,7 @@ _DRAWN: dict[str, Any] = {
     "mirror": True,
     "front_stiffness": (0.6, 1.4),
     "rear_stiffness": (0.6, 1.4),
-    "camera_delays": (0.022,),  # within a period with the jitter, as the papers' filters need
+    "camera_delays": (0.030,),
     "camera_jitter": 0.010,
     "camera_loss": 0.05,
     "camera_heading": 0.35,
@@ -28,7 +28,7 @@ _DRAWN: dict[str, Any] = {
     "gps_latency": (0.1, 0.3),
     "gyro_bias": (-0.5 * DEGREE, 0.5 * DEGREE),
     "accel_y_bias": (-0.2, 0.2),
-    "bank": (-0.02, 0.02),  # the crossfall of a road that sheds water
+    "bank": (-0.03, 0.03),
 }
 # 2 kW a wheel is assumed: the papers give the COMS's torque alone. The passenger car's 700 N m take
 # 50 kW a wheel at 80 km/h, which is assumed to be there.
