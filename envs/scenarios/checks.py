@@ -147,7 +147,7 @@ def _check_numbers(fields: Fields) -> None:
     if not (is_finite(width) or (isinstance(width, float) and math.isfinite(width))):
         raise ValueError(f"half_width {brief(width)} is not finite")
     for name in ("camera_heading", "camera_offset"):
-        if fields[name] != math.inf:
+        if not (isinstance(fields[name], float) and fields[name] == math.inf):
             _check_number(name, fields[name])
     for name in _POSITIVE:
         if not fields[name] > 0.0:

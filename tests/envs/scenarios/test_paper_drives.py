@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sideslip.envs import SCENARIOS, StabilityEnv
-from sideslip.envs.record import PACKET
+from sideslip.envs.record import FAST, PACKET
 from sideslip.envs.scenarios.papers import ROAD_TESTS
 
 TWINS = [scenario.name for scenario in ROAD_TESTS]
@@ -34,7 +34,7 @@ def test_simulations_without_roll_give_the_bits_they_always_gave(name: str) -> N
         action = np.array([0.3 * np.sin(0.1 * k)], np.float32)
         _, _, failed, ended, info = env.step(action)
         record, over, k = env.record, failed or ended, k + 1
-        digest.update(record.fast.tobytes())
+        digest.update(record.fast[:, : FAST.curvature].tobytes())  # a later column, zero here
         digest.update(record.packets.tobytes())
         digest.update(np.array([info["beta"], info["psi"]]).tobytes())
     assert digest.hexdigest()[:16] == RECORDED[name]
