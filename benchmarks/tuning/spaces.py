@@ -68,12 +68,16 @@ SPACES: dict[str, tuple[Number, ...]] = {
     ),
     "lqr": _LQG,
     "mpc": (Number("horizon", 30, 10, 60, whole=True), *_MPC),
-    "nmpc": _MPC,
+    "nmpc": (
+        Number("horizon", 0.5, 0.2, 1.0),  # s
+        Number("steer_weight", 10.0, 0.3, 1e3, steering=True),
+        *_MPC,
+    ),
     "nominal": _LQG,
     "oracle-parameters": tuple(each for each in _LQG if each.name != "bias_sd"),  # it knows it
 }
 """By contestant; all but the rungs, which bring their own, drive on `exact-kf` with all sensors."""
-SLOW = ("mpc", "nmpc")
+SLOW = ("mpc", "nmpc", "oracle-parameters")
 """Contestants whose worse trials end after a few seeds."""
 
 
