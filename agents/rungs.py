@@ -14,7 +14,6 @@ import gymnasium as gym
 from ..envs.arguments import check_choice
 from ..envs.scenarios.scenario import Scenario
 from ..envs.sensors.gps import HDOP_LAWS
-from ..envs.vehicle.vehicle import GRAVITY
 from ..estimators.vector import estimate as vector
 from ..estimators.vector.truth import TruthObservation as VectorTruthObservation
 from ..estimators.wrappers.estimate import EstimateObservation
@@ -46,8 +45,7 @@ def levels_of(scenario: Scenario) -> dict[str, Any]:
     """Options of `exact-kf`: the noise and the disturbances of a scenario.
 
     The course's noise follows the HDOP that comes with each packet, as far as the scenario's does.
-    The accelerometer is read where the body rolls, as the filter then believes. A bank is a bias
-    to it.
+    The accelerometer is read where the body rolls, as the filter then believes.
     """
     noise = dict(scenario.noise)
     share = HDOP_LAWS[scenario.hdop_law]
@@ -59,18 +57,13 @@ def levels_of(scenario: Scenario) -> dict[str, Any]:
     }
     if scenario.roll:
         options["fast"] = ["gyro", "accel_y"]
-        options["accel_bias_sd"] = math.hypot(
-            _spread(scenario, "accel_y_bias"), GRAVITY * _spread(scenario, "bank")
-        )
-    options["bias_sd"] = _spread(scenario, "gyro_bias")
+        options["accel_bias_sd"] = _spread(scenario, "accel_y_bias")
+    options |= {"bias_sd": _spread(scenario, "gyro_bias"), "bank_sd": _spread(scenario, "bank")}
     return options | {option: noise[key] for key, option in _NOISE.items() if key in noise}
 
 
 def without_biases(scenario: Scenario) -> Scenario:
-    """The scenario as a filter meets it that knows the sensors' biases and takes them away.
-
-    The bank stays: to an accelerometer it is a bias too.
-    """
+    """The scenario as a filter meets it that knows the sensors' biases and takes them away."""
     noise = {key: value for key, value in scenario.noise.items() if not key.endswith("_bias")}
     return scenario.replace(noise=noise, gyro_bias=0.0, accel_y_bias=0.0)
 

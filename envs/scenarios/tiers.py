@@ -28,7 +28,8 @@ _DRAWN: dict[str, Any] = {
     "gps_latency": (0.1, 0.3),
     "gyro_bias": (-0.5 * DEGREE, 0.5 * DEGREE),
     "accel_y_bias": (-0.2, 0.2),
-    "bank": (-0.03, 0.03),
+    "bank": (-0.02, 0.02),  # the crossfall of a road that sheds water,
+    "curve_start": -100.0,  # there from the beginning
 }
 # 2 kW a wheel is assumed: the papers give the COMS's torque alone. The passenger car's 700 N m take
 # 50 kW a wheel at 80 km/h, which is assumed to be there.

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from ...envs.record import PACKET_WIDTH
 from ...envs.sensors.slow import SLOW_NAMES
 
-CORE = 10  # states of a model
+CORE = 11  # states of a model
 INPUTS = 4  # that drive it
 FASTS = 3  # measurements of a fast row
 SLOW = len(SLOW_NAMES)  # sensors
@@ -79,6 +79,7 @@ _MODEL = [  # dx = A x + B u on the first `dense` states; those behind them deca
     ("total", _INT),  # states and clones
     ("forces", _INT),  # 1: disturbances are a force and a moment; 0: they push states
     ("pushed", _INT, (CORE,)),  # the state that each one behind pushes; -1: none
+    ("banked", _INT),  # which of those behind is the road's bank; -1: none
     ("rolling", _INT),  # where a bicycle's phi and phi_rate stand; 0: it does not roll
     ("car", _FLOAT, (len(Car._fields),)),
     ("roll_stiffness", _FLOAT),  # K_x / I_x

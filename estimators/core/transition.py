@@ -30,6 +30,8 @@ def _lateral(f: Memory, V: Any) -> None:
         _write_body(f, V)
     if f.accel_row > 0:
         _write_accel(f, V)
+    if f.banked >= 0:  # gravity, which an accelerometer does not feel and the body does not roll by
+        B[0, INPUTS + f.banked] = -GRAVITY / V
 
 
 @jit

@@ -65,6 +65,7 @@ class FilterConfig:
     bias_sd: of the same ones, rad/s: above 0 (default) a state `bias`, a constant drawn with this
         deviation that the gyro measures on top of the yaw rate; with q_bias it walks.
     accel_bias_sd: m/s2, likewise a state `accel_bias` of the lateral accelerometer.
+    bank_sd: rad, likewise a state `bank` of the road, the left side up.
     q_beta, q_gamma, ...: process noise of a state per second, (unit)^2/s; or Q, (n, n) or (n,)
         (default: of `tunings.toml`).
     gyro_noise (rad/s), psi_noise (rad), y_l_noise (m), course_noise (rad at every speed; default
@@ -214,7 +215,7 @@ def _inertial(row: Filter, read: Options) -> tuple[tuple[str, ...], dict[str, fl
     biases = {name: read.not_negative(f"{name}_sd", STATES[name].unit) for name in BIASES}
     biases = {name: sd for name, sd in biases.items() if sd > 0.0}
     for name in biases:
-        if BIASES[name] not in fast:
+        if BIASES[name] not in (*fast, ""):
             raise ValueError(f"{read.name}: {name}_sd needs {BIASES[name]} among fast, got {fast}")
     return fast, biases
 

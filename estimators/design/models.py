@@ -52,6 +52,7 @@ STATES = {
     "N_d": State("N m", 100.0, 1e5),
     "bias": State("rad/s", 0.0, 10.0),
     "accel_bias": State("m/s2", 0.0, 50.0),
+    "bank": State("rad", 0.0, 1.0),
 }
 """All states of all models, by name."""
 FOREIGN_STATE = State("-", 0.0, 1e6)
@@ -87,8 +88,9 @@ class Model:
 ORDER = ("beta", "gamma", "psi", "y_l")
 BODY = ("phi", "phi_rate")  # of a bicycle whose accelerometer or roll rate is measured
 INERTIAL = ("gyro", "accel_y", "roll_rate")  # the fast sensors of a bicycle, in their order
-BIASES = {"bias": "gyro", "accel_bias": "accel_y"}
-"""States that are constants, each measured on top by a fast sensor."""
+BIASES = {"bias": "gyro", "accel_bias": "accel_y", "bank": ""}
+"""States that are constants: what a fast sensor measures on top, and the road's bank, which no
+accelerometer feels."""
 WALK = (("d1", "beta"), ("d2", "gamma"))  # dakf-stability (8)-(9), (14)
 WALK_ALL = (*WALK, ("d3", "psi"))  # dual-rate (4): one for every state of (37)
 DISTURBANCES = ("none", "walk", "walk-all", "forces")
@@ -176,6 +178,7 @@ def write_model(
     for j, (_, pushed) in enumerate(model.disturbances):
         f.pushed[j] = names.index(pushed)
     f.pushed[n - len(model.biases) - dense : n - dense] = -1
+    f.banked = names.index("bank") - dense if "bank" in model.biases else -1
     f.rolling = names.index("phi") if model.kind == LATERAL and "phi" in names else 0
     f.car[:] = [getattr(vehicle, name) for name in Car._fields]
     body = roll(vehicle)
@@ -207,7 +210,7 @@ def _write_signals(f: Memory, model: Model, vehicle: Vehicle, noise: Mapping[str
         f.r_fast[i] = noise[name] ** 2
         if name in state_of:
             f.C_fast[i, names.index(state_of[name])] = 1.0
-    for bias in model.biases:
+    for bias in filter(BIASES.get, model.biases):
         f.C_fast[model.fast.index(BIASES[bias]), names.index(bias)] = 1.0
     if model.kind == LATERAL and "accel_y" in model.fast:
         f.accel_row = model.fast.index("accel_y")

@@ -39,18 +39,21 @@ def continuous(behind: Any, V: float, rolls: bool) -> Any:
         if name in ("F_d", "N_d"):
             to, push = (0, 1.0 / (COMS.mass * V)) if name == "F_d" else (1, 1.0 / COMS.yaw_inertia)
             rows[to, j] = push
+        elif name == "bank":
+            rows[0, j] = -9.81 / V
         elif name not in ("bias", "accel_bias"):
             rows[PUSHED[name], j] = 1.0
     S = COMS.sprung_mass * COMS.roll_arm
     phi, phi_rate = np.eye(rows.shape[1])[4:6]
+    bank = np.array([*np.zeros(at), *(name == "bank" for name in behind)])
     if rolls:
         M = COMS.mass * V
         both = np.array([[M, -S], [-S * V, COMS.roll_inertia]])
-        felt = S * (V * np.eye(rows.shape[1])[1] + 9.81 * phi)
+        felt = S * (V * np.eye(rows.shape[1])[1] + 9.81 * (phi + bank))
         pull = felt - COMS.roll_stiffness * phi - COMS.roll_damping * phi_rate
         rows[0], rows[5] = np.linalg.solve(both, np.array([M * rows[0], pull]))
         rows[4] = phi_rate
-    rows[6] = V * (rows[0] + np.eye(rows.shape[1])[1]) + 9.81 * phi
+    rows[6] = V * (rows[0] + np.eye(rows.shape[1])[1]) + 9.81 * (phi + bank)
     return rows
 
 

@@ -16,7 +16,15 @@ from tests.estimators.dense import GYRO, Posterior, arrivals, inputs, speeds
 pytestmark = pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning")
 
 PRIOR = {"beta": 0.02, "gamma": 0.05, "psi": 0.05, "y_l": 0.3, "F_d": 50.0, "N_d": 20.0}
-PRIOR |= {"d1": 0.1, "d2": 1.0, "phi": 0.02, "phi_rate": 0.05, "bias": 0.01, "accel_bias": 0.2}
+PRIOR |= {
+    "d1": 0.1,
+    "d2": 1.0,
+    "phi": 0.02,
+    "phi_rate": 0.05,
+    "bias": 0.01,
+    "accel_bias": 0.2,
+    "bank": 0.02,
+}
 INERTIAL = ("gyro", "accel_y", "roll_rate")
 HDOP = ((1.0, 1.0), (2.0, 1.5), (5.0, 4.0))
 EXACT = 1e-10  # of the posterior's standard deviation
@@ -105,7 +113,12 @@ CASES = {
         "exact-kf",
         {"camera": CAMERA, "gps": GPS},
         7.0,
-        options={"fast": ["gyro", "accel_y", "roll_rate"], "bias_sd": 0.01, "accel_bias_sd": 0.2},
+        options={
+            "fast": ["gyro", "accel_y", "roll_rate"],
+            "bias_sd": 0.01,
+            "accel_bias_sd": 0.2,
+            "bank_sd": 0.02,
+        },
     ),
     "accelerometer, measured speed": Case(
         "exact-kf", {"camera": CAMERA}, options={"fast": ["gyro", "accel_y"]}
@@ -116,7 +129,7 @@ CASES = {
         {"camera": CAMERA},
         options={"fast": ["gyro", "accel_y"], "accel_bias_sd": 0.2, "disturbances": "none"},
     ),
-    "bias, gps": Case("exact-kf", {"gps": FAST_GPS}, options={"bias_sd": 0.01}),
+    "bias, gps": Case("exact-kf", {"gps": FAST_GPS}, options={"bias_sd": 0.01, "bank_sd": 0.02}),
     "walk, accelerometer, bias": Case(
         "dakf",
         {"gps": GPS},

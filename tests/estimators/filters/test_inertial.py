@@ -114,6 +114,17 @@ def test_an_accelerometers_bias_is_no_sideslip_to_the_filter_that_has_a_state_fo
     assert errors[1] < 0.5 * errors[0], errors
 
 
+def test_a_banks_sideslip_is_seen_by_the_filter_that_has_a_state_for_it() -> None:
+    """A crossfall of 0.03 all along leaves the mean of beta's error to a filter without one."""
+    scenario = {"base": "random-steering", "duration": 6.0, "bank": 0.03, "curve_start": -100.0}
+    errors = []
+    for sd in (0.0, 0.03):
+        options: Any = {"slow": ["camera", "gps"], "fast": ["gyro", "accel_y"], "bank_sd": sd}
+        beta, found = drive(scenario, 24, 600, "exact-kf", **options)
+        errors.append(abs(np.mean((found - beta)[200:])))
+    assert errors[1] < 0.5 * errors[0], errors
+
+
 def test_all_states_are_outputs_and_a_row_has_the_bits_of_a_single_env() -> None:
     one = EstimateObservation(gym.make(FUSION), "exact-kf", outputs=STATES, options=ALL)
     many = vector.EstimateObservation(
