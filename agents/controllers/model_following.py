@@ -15,10 +15,10 @@ import numpy as np
 from ...envs.backend.decorators import jit
 from ...envs.backend.primitives import maximum
 from ...envs.backend.rebuild import plain
-from ...envs.task.reference import REFERENCES, reference, target_of
+from ...envs.task.reference import LAGGED, REFERENCES, ZERO_SLIP, reference, target_of
 from ...envs.ticks import TICK
 from ...envs.vehicle.vehicle import Vehicle
-from ..design.nominal_car import drift, inputs_for, nominal_car, plant_at, plant_of
+from ..design.nominal_car import drift, inputs_for, keeping, nominal_car, plant_at, plant_of
 from ..env_facts import AnyEnv
 from .base import Array, Controller, entries_of, integrated
 
@@ -81,14 +81,21 @@ def _model_following_law(
         plant = plant_at(car, v)
         before = state[n, LAST.driver] if state[n, LAST.known] > 0.0 else driver
         old, new = reference(before, v, target, kind), reference(driver, v, target, kind)
+        moves = ((new[0] - old[0]) / dt, (new[1] - old[1]) / dt)  # of the references
+        if kind == LAGGED:
+            away = (1.0 - target.rest) / TICK
+            moves = (away * (new[0] - beta_ref), away * (new[1] - gamma_ref))
+        if kind == ZERO_SLIP:  # the yaw rate is free: the one that keeps beta_ref
+            gamma_ref = keeping(plant, beta_ref, driver)
+            moves = (moves[0], (gamma_ref - keeping(plant, beta_ref, before)) / dt)
         moved = drift(plant, beta_ref, gamma_ref)
         p_beta = K[0] * (beta_ref - x[n, IN.beta_hat])
         p_gamma = K[1] * (gamma_ref - x[n, IN.gamma_hat])
         # (28) by the references' derivatives, P of (31), and (26) at once: B^-1 is linear
         delta_f, N_z = inputs_for(
             plant,
-            (new[0] - old[0]) / dt - moved[0] + p_beta - rejection * x[n, IN.d1_hat],
-            (new[1] - old[1]) / dt - moved[1] + p_gamma - rejection * x[n, IN.d2_hat],
+            moves[0] - moved[0] + p_beta - rejection * x[n, IN.d1_hat],
+            moves[1] - moved[1] + p_gamma - rejection * x[n, IN.d2_hat],
         )
         delta_f, N_z = delta_f + state[n, LAST.delta_f], N_z + state[n, LAST.N_z]  # (33)
         steer = min(max(delta_f, driver - authority), driver + authority)

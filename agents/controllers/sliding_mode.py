@@ -5,20 +5,22 @@ from typing import Any
 
 from ...envs.backend.decorators import jit
 from ...envs.backend.primitives import maximum
-from ...envs.task.reference import REFERENCES, ZERO_SLIP, reference, target_of
+from ...envs.task.reference import LAGGED, REFERENCES, ZERO_SLIP, reference, target_of
 from ...envs.ticks import TICK
-from ..design.nominal_car import drift, nominal_car, plant_at
+from ..design.nominal_car import drift, keeping, nominal_car, plant_at
 from ..env_facts import AnyEnv
 from .base import Array, Controller, entries_of, positive
 from .model_following import SLOWEST
 
-Inputs = namedtuple("Inputs", "wheel_left wheel_right steer_command steer beta_hat gamma_hat")
+Inputs = namedtuple(
+    "Inputs", "wheel_left wheel_right steer_command steer beta_ref gamma_ref beta_hat gamma_hat"
+)
 """Columns of the law's inputs; gamma_hat is the gyro where the observation has no estimate."""
 Memory = namedtuple("Memory", "beta_ref gamma_ref known")
 """The references of the last decision, for their derivatives, and whether there was one."""
 
 
-IN = Inputs(*range(6))
+IN = Inputs(*range(8))
 LAST = Memory(*range(3))
 
 
@@ -33,11 +35,14 @@ def surface(plant: Any, pole: Any) -> Any:
 
 
 @jit
-def _goal(driver: Any, delta: Any, v: Any, plant: Any, target: Any, kind: int) -> Any:
-    """(beta_ref, gamma_ref); where the yaw rate is free, that which keeps beta_ref."""
-    beta, gamma = reference(driver, v, target, kind)
+def _goal(x: Any, v: Any, plant: Any, target: Any, kind: int) -> Any:
+    """(beta_ref, gamma_ref) of a row: a lagged reference is the observation's, and where the yaw
+    rate is free it is the one that keeps beta_ref."""
+    if kind == LAGGED:
+        return x[IN.beta_ref], x[IN.gamma_ref]
+    beta, gamma = reference(x[IN.steer_command], v, target, kind)
     if kind == ZERO_SLIP:
-        gamma = -(plant.a11 * beta + plant.b11 * delta) / plant.a12
+        gamma = keeping(plant, beta, x[IN.steer])
     return beta, gamma
 
 
@@ -62,7 +67,7 @@ def _sliding_mode_law(
         plant = plant_at(car, v)
         beta, gamma, delta = x[n, IN.beta_hat], x[n, IN.gamma_hat], x[n, IN.steer]
         xi = surface(plant, pole)
-        beta_ref, gamma_ref = _goal(x[n, IN.steer_command], delta, v, plant, target, kind)
+        beta_ref, gamma_ref = _goal(x[n], v, plant, target, kind)
         moves_beta, moves_gamma = 0.0, 0.0  # the references' derivatives
         if state[n, LAST.known] > 0.0:
             moves_beta = (beta_ref - state[n, LAST.beta_ref]) / dt

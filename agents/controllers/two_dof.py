@@ -14,7 +14,7 @@ from ...envs.backend.decorators import jit
 from ...envs.backend.primitives import absolute, maximum, select
 from ...envs.ticks import TICK
 from ...envs.vehicle.vehicle import COMS, Vehicle
-from ..design.nominal_car import CAR, nominal_car
+from ..design.nominal_car import CAR, nominal_car, plant_at
 from ..design.pi import COMS_PI, PLACEMENTS, POLE, design_pi, sample_pi
 from ..env_facts import AnyEnv
 from .base import Array, Controller, integrated
@@ -22,6 +22,7 @@ from .base import Array, Controller, integrated
 SLOWEST = 2.0  # m/s: gains below it are those of this speed
 SPEEDS = np.arange(SLOWEST, 61.0, 0.5)  # m/s
 CAMERA_PERIOD = 0.033  # s
+FEEDFORWARDS = ("reference", "zero-slip")
 
 
 Inputs = namedtuple("Inputs", "wheel_left wheel_right steer_command beta_hat beta_ref")
@@ -35,15 +36,29 @@ LAST = Memory(*range(3))
 
 
 @jit
+def _denominator(car: Any, V: Any) -> Any:
+    """-a12 m V^2, kept from zero, where the yaw moment has no static effect on the slip."""
+    mV2, excess = car[CAR.m] * V * V, car[CAR.l_f] * car[CAR.C_f] - car[CAR.l_r] * car[CAR.C_r]
+    denominator, least = mV2 + 2.0 * excess, 0.05 * (mV2 + 2.0 * absolute(excess))
+    if absolute(denominator) < least:
+        denominator = select(denominator < 0.0, -least, least)
+    return denominator
+
+
+@jit
 def _static_gain(car: Any, V: Any) -> Any:
     m, l_f, l_r, C_f, C_r = car[CAR.m], car[CAR.l_f], car[CAR.l_r], car[CAR.C_f], car[CAR.C_r]
     mV2 = m * V * V
     numerator = 4.0 * l_r * (l_f + l_r) * C_f * C_r - 2.0 * l_f * C_f * mV2
-    denominator = mV2 + 2.0 * (l_f * C_f - l_r * C_r)
-    least = 0.05 * (mV2 + 2.0 * absolute(l_f * C_f - l_r * C_r))
-    if absolute(denominator) < least:
-        denominator = select(denominator < 0.0, -least, least)
-    return numerator / denominator  # tie-vision (24)
+    return numerator / _denominator(car, V)  # tie-vision (24)
+
+
+@jit
+def _slip_gain(car: Any, V: Any) -> Any:
+    """N m/rad: the yaw moment that holds a sideslip angle, beside (24)'s that makes it zero."""
+    plant, m = plant_at(car, V), car[CAR.m]
+    yaw_rate = plant.a11 * m * V * V / _denominator(car, V)  # that keeps it, -a11 / a12
+    return -(plant.a21 + plant.a22 * yaw_rate) / plant.b22
 
 
 def feedforward_gain(vehicle: Vehicle, speed: float) -> float:
@@ -96,6 +111,7 @@ def _two_dof_law(
     state: Any,
     action: Any,
     most: Any,
+    follows: int,
     car: Any,
     k_p: Any,
     k_i: Any,
@@ -112,6 +128,8 @@ def _two_dof_law(
         v = 0.5 * (x[n, IN.wheel_left] + x[n, IN.wheel_right])
         error = x[n, IN.beta_ref] - x[n, IN.beta_hat]
         forward = _static_gain(car, maximum(v, SLOWEST)) * x[n, IN.steer_command]
+        if follows:
+            forward += _slip_gain(car, maximum(v, SLOWEST)) * x[n, IN.beta_ref]
         integral = state[n, LAST.integral]
         wanted = forward + _scheduled(k_p, v) * error + integral
         limit = most[n] * full_scale
@@ -137,8 +155,10 @@ class Feedforward(Controller):
 
 
 class TwoDof(Controller):
-    """Feedforward (24) plus a PI on beta_ref - beta_hat, tie-vision section V.
+    """Feedforward plus a PI on beta_ref - beta_hat, tie-vision section V.
 
+    feedforward: "reference" holds beta_ref in the steady turn of the nominal car, "zero-slip" is
+    (24) whatever the reference is; where beta_ref is zero they are the same.
     rate: "control" updates at every decision of the env, "camera" every 33 ms (held between;
     for a control period that is no divisor of it, the next decision). gain: a factor on the PI.
     pole (rad/s), placement: of `design_pi`. sampled: place the poles of the loop as sampled at
@@ -160,8 +180,12 @@ class TwoDof(Controller):
         placement: str = PLACEMENTS[0],
         sampled: bool = False,
         grip: float | None = None,
+        feedforward: str = FEEDFORWARDS[0],
     ) -> None:
         super().__init__(env, grip)
+        if feedforward not in FEEDFORWARDS:
+            known = ", ".join(FEEDFORWARDS)
+            raise ValueError(f"feedforward is one of {known}, got {feedforward!r}")
         if rate not in ("control", "camera"):
             raise ValueError(f"rate is 'control' or 'camera', got {rate!r}")
         period = self.control_period * TICK
@@ -170,7 +194,8 @@ class TwoDof(Controller):
         table = _pi_table(self.nominal, gain, pole, placement, dt if sampled else None)
         self.k_p, self.k_i = np.ascontiguousarray(table.T)
         car = nominal_car(self.nominal)
-        self._design = car, self.k_p, self.k_i, self.full_scale, wait, dt
+        follows = int(feedforward == FEEDFORWARDS[0])
+        self._design = follows, car, self.k_p, self.k_i, self.full_scale, wait, dt
 
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
         _two_dof_law(inputs, state, action, self._most(inputs), *self._design)

@@ -65,6 +65,12 @@ def drift(plant: Any, beta: Any, gamma: Any) -> Any:
 
 
 @jit
+def keeping(plant: Any, beta: Any, delta: Any) -> Any:
+    """The yaw rate at which a sideslip angle stays as it is under a steering angle."""
+    return -(plant.a11 * beta + plant.b11 * delta) / plant.a12
+
+
+@jit
 def inputs_for(plant: Any, first: Any, second: Any) -> Any:
     """B^-1 [first, second]: steering angle and yaw moment of this effect, dakf-stability (26)."""
     delta_f = first / plant.b11

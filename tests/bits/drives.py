@@ -119,11 +119,16 @@ def states_of(filter: str, sensors: Any) -> tuple[str, ...]:
     return make_estimator(filter, sensors=sensors).names
 
 
+_PAPERS = {"two-dof": {"feedforward": "zero-slip"}}  # options of agents in their papers' form
+
+
 def _estimated(name: str, filter: str, agent: str | None, **more: Any) -> str:
     env: Any = gym.make(name, **more)
     sensors = env.unwrapped.slow_sensors
     env = EstimateObservation(env, filter, outputs=states_of(filter, sensors))
-    return single(env, None if agent is None else sideslip.make_agent(agent, env))
+    if agent is None:
+        return single(env)
+    return single(env, sideslip.make_agent(agent, env, **_PAPERS.get(agent, {})))
 
 
 def _bare(name: str, steps: int = STEPS, **more: Any) -> str:

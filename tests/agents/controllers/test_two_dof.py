@@ -163,3 +163,26 @@ def test_the_integral_does_not_wind_up() -> None:
         action, state = agent.predict(obs, state)
     assert action == pytest.approx([1.0])
     assert state is not None and abs(state[0, 0]) < COMS.yaw_moment_limit
+
+
+@pytest.mark.parametrize("kmh", [15.0, 25.0, 40.0])
+def test_forward_to_the_reference_the_nominal_car_holds_it(kmh: float) -> None:
+    """The moment's part without an error, in the bicycle's steady turn: its slip is beta_ref."""
+    env = EstimateObservation(
+        gym.make("sideslip/YawFusion-v0", reference="model"), "exact-kf", std=False
+    )
+    names = [entry.name for entry in env.layout]
+    model, delta, v = bicycle(COMS, kmh * KMH), 0.01, kmh * KMH
+    for beta in (0.0, 2e-3, -1e-3):
+        obs = np.zeros(len(names), np.float32)
+        values = {"wheel_left": v, "wheel_right": v, "steer_command": delta}
+        for name, value in (values | {"beta_ref": beta, "beta_hat": beta}).items():
+            obs[names.index(name)] = value
+        share, _ = make_agent("two-dof", env).predict(obs)
+        turn = np.linalg.solve(model.A, -model.B @ [delta, share[0] * COMS.yaw_moment_limit])
+        assert turn[0] == pytest.approx(beta, abs=1e-8)
+        papers, _ = make_agent("two-dof", env, feedforward="zero-slip").predict(obs)
+        turn = np.linalg.solve(model.A, -model.B @ [delta, papers[0] * COMS.yaw_moment_limit])
+        assert turn[0] == pytest.approx(0.0, abs=1e-8)
+    with pytest.raises(ValueError, match="feedforward is one of reference, zero-slip"):
+        make_agent("two-dof", env, feedforward="none")
