@@ -14,43 +14,36 @@ from rich.console import Console
 
 from .. import __version__
 from ..agents.rollout import steps_of
-from ..agents.tuned import tuned
 from ..envs.record import Array
 from ..envs.scenarios.draws import KMH
+from .control.build import make_cars
+from .control.cells import REFERENCE_FILTER, Cell
+from .control.contests import YAW, Contest
 from .harness.parallel import run_cases
 from .harness.results import Row, ShareMap, Suite, Table
 from .harness.stats import interval
-from .tuning.contests import Contest, cars_of
 
 NAME = "recovery"
-ENV_ID = "sideslip/YawFusion-v0"
-CONTROLLERS = ("none", "two-dof", "esc", "sliding-mode", "lqr", "nominal", "oracle-state-lqr")
+READING = ("two-dof", "esc", "sliding-mode", "lqr")
+CONTROLLERS = ("none", *READING, "nominal", "oracle-state-lqr")
 CAUGHT = 0.05  # rad
 SEEDS, QUICK_SEEDS = 16, 4
 POINTS, QUICK_POINTS = (13, 11), (5, 5)  # of the grid: sideslip angles, yaw rates
 MOST = (0.45, 1.0)  # rad and rad/s, where the grid ends
 FIRST_SEED = 2**28
 
-_COMMON = {"base": "recovery", "initial_beta": 0.0, "initial_gamma": 0.0, "half_width": 1e6}
-CARS: dict[str, tuple[Contest, str]] = {
+_SCENARIO = {"base": "recovery", "initial_beta": 0.0, "initial_gamma": 0.0, "half_width": 1e6}
+CARS: dict[str, tuple[Contest, dict[str, Any]]] = {
     f"{car} at {kmh:g} km/h": (
-        Contest(
-            ENV_ID,
-            {
-                "vehicle": car,
-                "reference": reference,
-                "scenario": _COMMON | {"speed": kmh * KMH, "friction": friction},
-            },
-            car,
-        ),
-        kind,
+        Contest("", YAW, car, reference, "recovery"),
+        _SCENARIO | {"speed": kmh * KMH, "friction": friction},
     )
-    for car, kmh, reference, friction, kind in (
-        ("passenger-car", 80.0, "limited", (0.6, 0.9), "car-yaw"),
-        ("coms", 40.0, "model", (0.7, 1.0), "coms-model"),
+    for car, kmh, reference, friction in (
+        ("passenger-car", 80.0, "limited", (0.6, 0.9)),
+        ("coms", 40.0, "model", (0.7, 1.0)),
     )
 }
-"""The contest of each car, and the class whose tuned options are used."""
+"""The contest of each car, whose class has the tuned options, and the scenario."""
 
 _TEXT = (
     "The share of cars that are saved over the sideslip angle and yaw rate they start with: no "
@@ -79,15 +72,15 @@ def grid(points: tuple[int, int]) -> tuple[Array, Array]:
 
 def saved(case: Case) -> Array:
     """(yaw rates, sideslip angles, seeds) 1 where the car was saved."""
-    contest, kind = CARS[case.car]
+    contest, scenario = CARS[case.car]
     beta, gamma = grid(case.points)
     starts = [(g, b) for g in gamma for b in beta]
-    scenario: Mapping[str, Any] = contest.env_options["scenario"]
     v_x, each = scenario["speed"], range(case.seeds)
     states = [{"v_y": v_x * math.tan(b), "gamma": g} for g, b in starts for _ in each]
     seeds = [FIRST_SEED + i for i in each] * len(starts)
-    options = tuned(kind, case.controller)
-    env, agent = cars_of(contest, case.controller, options, len(states))
+    reads = REFERENCE_FILTER if case.controller in READING else ""
+    cell = Cell(contest, reads, case.controller, {"scenario": scenario})
+    env, agent = make_cars(cell, len(states))
     lost, last = np.zeros(len(states), np.bool_), np.zeros(len(states))
     for step in steps_of(env, agent, seeds, {"state": states}):
         lost |= step.running & (step.info["failure"] != 0)
@@ -127,7 +120,7 @@ def _tabled(suite: Suite, car: str, mine: Mapping[str, Array]) -> None:
         number, more = interval(share), interval(share - shares["none"])
         cells.append([name, *number.text(1e2, ".1f"), *more.text(1e2, ".1f")])
         where = {"scenario": car, "controller": name, "n": len(share)}
-        common = {"suite": NAME, "salt": "fixed", "env_version": f"{ENV_ID} {__version__}"}
+        common = {"suite": NAME, "salt": "fixed", "env_version": f"{YAW} {__version__}"}
         suite.rows.append(Row.of("saved_rate", number, **where, **common))
     header = ("controller", "saved / %", "95 % interval", "above none / %", "95 % interval")
     starts = next(iter(mine.values())).shape

@@ -142,7 +142,6 @@ def tune_controller(
     from ...agents.tuned import FILE
     from ..control.seeds import tuning_seeds
     from ..tuning import controllers
-    from ..tuning.contests import contests_of
     from ..tuning.file import put_tuned
     from ..tuning.spaces import KINDS
     from ..tuning.task import STORAGE
@@ -152,7 +151,7 @@ def tune_controller(
     if write:
         logs.append(controllers.LOGS)
     for each in kind or KINDS:
-        task = controllers.contestant(name, each, contests_of(each), tuning_seeds(seeds))
+        task = controllers.contestant(name, each, tuning_seeds(seeds))
         try:
             found = controllers.tune(task, trials, storage or STORAGE, seed, jobs, console)
         except ValueError as error:

@@ -15,7 +15,6 @@ from ...agents import make_agent
 from ...agents.learned.files import is_policy, load_policy
 from ...agents.rollout import steps_of
 from ...agents.rungs import FILTER, levels_of, make_rung
-from ...agents.tuned import tuned
 from ...envs.scenarios.manoeuvres import scenario_from
 from ...envs.task.observation import Entry
 from ...estimators.filters import FILTERS
@@ -80,7 +79,7 @@ def estimate_options(cell: Cell) -> dict[str, Any]:
         name, options = SETUPS[cell.estimator]
         if name == FILTER:
             levels = levels_of(scenario_from(cell.env_options["scenario"]))
-            options = levels | tuned(cell.contest.kind, cell.controller)["filter"] | options
+            options = levels | cell.best["filter"] | options
             unused = set() if "gps" in options["slow"] else {"hdop_table"}
             if "accel_y" not in options["fast"]:
                 unused |= {"accel_y_noise", "accel_bias_sd"}
@@ -92,9 +91,8 @@ def estimate_options(cell: Cell) -> dict[str, Any]:
 def make_cars(cell: Cell, cars: int) -> tuple[VectorEnv[Any, Any, Any], Any]:
     """(vector env of `cars` rows with the cell's estimator, its agent), both as they are tuned."""
     contest, options = cell.contest, cell.env_options
-    best = tuned(contest.kind, cell.controller)
     if cell.rung:
-        return make_rung(cell.rung, contest.env_id, cars, options=best, **options)
+        return make_rung(cell.rung, contest.env_id, cars, options=cell.best, **options)
     env: Any = gym.make_vec(contest.env_id, num_envs=cars, **options)
     if cell.estimator == TRUTH:
         env = TrueState(env)
@@ -109,7 +107,7 @@ def agent_options(cell: Cell) -> dict[str, Any]:
     more: dict[str, Any] = {}
     if cell.controller == "model-following":
         more["rejection"] = cell.estimator == "dakf"
-    return more | tuned(cell.contest.kind, cell.controller)["controller"]
+    return more | cell.best["controller"]
 
 
 class _Timed:

@@ -4,6 +4,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from ...agents.tuned import Options, tuned
 from .contests import NOMINAL, PARAMETERS, STATE, STATES, STEERING, TIERS, YAW, Contest, oracle_of
 
 TRUTH, REFERENCE_CONTROLLER = "truth", "lqr"
@@ -54,14 +55,20 @@ class Cell:
 
     estimator: a name of `SETUPS` or of `make_estimator`, "truth", or "" where the controller reads
     none or brings its own. controller: a name of `make_agent`, or a rung. options: of the env
-    beside the contest's, a scenario that has no name among them; cells are equal whatever theirs
-    are.
+    beside the contest's, a scenario that has no name among them; tuned: options of filter and
+    controller instead of the best known; cells are equal whatever both are.
     """
 
     contest: Contest
     estimator: str
     controller: str
     options: dict[str, Any] = field(default_factory=dict, compare=False)
+    tuned: Options | None = field(default=None, compare=False)
+
+    @property
+    def best(self) -> Options:
+        """The options of its filter and its controller: `tuned`, or those of `agents.tuned`."""
+        return tuned(self.contest.kind, self.controller) if self.tuned is None else self.tuned
 
     @property
     def label(self) -> str:

@@ -1,8 +1,8 @@
 """Question: which options make a contestant of the matrix cheapest, over a class's contests?
 
-Every contestant gets the same number of trials on the same tuning seeds. What is made small is the
-mean of log(J / J_nominal) over contests and seeds, J_nominal that of the untuned `nominal`, clipped
-to +-3; a failure counts log 20.
+Every contestant gets the same number of trials on the same tuning seeds. What is made small is
+minus the mean of `scores.gains` over contests and seeds: log(J / J_nominal), J_nominal that of the
+untuned `nominal`, clipped to +-3, where a failure counts log 20.
 """
 
 import hashlib
@@ -19,22 +19,25 @@ import numpy as np
 from rich.console import Console
 
 from ... import __version__
-from ...agents.rungs import NOMINAL
+from ...agents.rungs import NOMINAL, RUNGS
 from ...agents.tuned import Options
 from ...envs.backend.cache import source_stamp
+from ...envs.record import Array
+from ..control.cells import REFERENCE_FILTER, Cell
+from ..control.contests import Contest, candidates, contests
+from ..control.episodes import Chunk, Driven, drive
+from ..control.scores import gains
 from ..harness.parallel import cores
 from ..harness.results import Suite, Table, write_text
-from .contests import Array, Contest, drive
 from .spaces import SLOW, Number, options_of, space
 from .task import STORAGE
 
 TRIALS = 60
 LOGS = Path(__file__).with_name("logs")
 """The studies whose options the package ships."""
-FAILED = math.log(20.0)
 STAGES = (4, 8)
 """Seeds after which the better half of a slow contestant's trials goes on."""
-_FLOOR, _CLIP = 0.001, 3.0
+_UNTUNED: Options = {"filter": {}, "controller": {}}
 
 
 @dataclass(frozen=True)
@@ -69,31 +72,38 @@ class Contestant:
         return options_of(self.numbers, {name: float(f"{v:.3g}") for name, v in found.items()})
 
 
-def contestant(
-    name: str, kind: str, contests: Sequence[Contest], seeds: Sequence[int]
-) -> Contestant:
+def contestant(name: str, kind: str, seeds: Sequence[int]) -> Contestant:
     """The question; ValueError for an unknown name or class, no contests and no seeds."""
-    numbers = space(name, kind)
-    if not contests or not seeds:
-        raise ValueError(f"{kind}: {len(contests)} contests, {len(seeds)} seeds; both are needed")
-    return Contestant(name, kind, tuple(contests), tuple(seeds), numbers)
+    numbers, found = space(name, kind), contests_of(name, kind)
+    if not found or not seeds:
+        raise ValueError(f"{kind}: {len(found)} contests, {len(seeds)} seeds; both are needed")
+    return Contestant(name, kind, tuple(found), tuple(seeds), numbers)
+
+
+def contests_of(name: str, kind: str) -> list[Contest]:
+    """The scored contests of a class; of a rung, by which those are chosen, all candidates."""
+    return [each for each in (candidates() if name in RUNGS else contests()) if each.kind == kind]
+
+
+def driven(contest: Contest, name: str, options: Options, seeds: tuple[int, ...]) -> Driven:
+    """A contestant's episodes with some options."""
+    estimator = "" if name in RUNGS else REFERENCE_FILTER
+    return drive(Chunk(Cell(contest, estimator, name, tuned=options), seeds))
 
 
 @lru_cache(maxsize=64)
 def _nominal(contest: Contest, seeds: tuple[int, ...]) -> Array:
-    return drive(contest, NOMINAL, {}, seeds)[0]
+    return driven(contest, NOMINAL, _UNTUNED, seeds).costs
 
 
 def objective(task: Contestant, found: dict[str, float], count: int) -> float:
     """The mean over contests and the first seeds, infinite where nothing can be designed."""
     options, seeds, logs = task.options(found), task.seeds[:count], []
     for contest in task.contests:
-        try:
-            costs, failed = drive(contest, task.name, options, seeds)
-        except (ValueError, ArithmeticError, np.linalg.LinAlgError):
+        mine = driven(contest, task.name, options, seeds)
+        if mine.error:
             return math.inf
-        own = np.log((costs + _FLOOR) / (_nominal(contest, seeds) + _FLOOR))
-        logs.append(np.where(failed, FAILED, np.clip(own, -_CLIP, _CLIP)))
+        logs.append(-gains(_nominal(contest, seeds), mine))
     value = float(np.mean(logs))
     return value if math.isfinite(value) else math.inf
 
@@ -134,7 +144,8 @@ def tune(
     if trials < 1:
         raise ValueError(f"trials must be at least 1, got {trials}")
     for contest in task.contests:  # what cannot be driven at all; kernels are compiled once
-        drive(contest, task.name, task.options(task.start), task.seeds[:1])
+        if error := driven(contest, task.name, task.options(task.start), task.seeds[:1]).error:
+            raise ValueError(f"{task.name} in {contest.name}: {error}")
     study = open_study(task, storage, "tpe", seed)
     if not study.trials:
         study.enqueue_trial(task.start)

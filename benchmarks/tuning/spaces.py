@@ -32,9 +32,10 @@ class Number(NamedTuple):
 
 _TIME = Number("disturbance_time", 0.3, 0.03, 3.0, ("filter",))  # s
 _LEVELS = (
-    Number("force_sd", 50.0, 10.0, 1e4, ("filter",)),  # N
-    Number("moment_sd", 20.0, 5.0, 1e4, ("filter",)),  # N m
+    Number("force_sd", 50.0, 10.0, 3e3, ("filter",)),  # N
+    Number("moment_sd", 20.0, 5.0, 3e3, ("filter",)),  # N m
     Number("bias_sd", 0.01, 1e-4, 0.05, ("filter",)),  # rad/s
+    Number("accel_bias_sd", 0.2, 0.01, 2.0, ("filter",)),  # m/s2
     Number("accel_y_noise", 0.1, 0.02, 2.0, ("filter",)),  # m/s2
 )
 _GRIP = Number("grip", 0.7, 0.3, 1.0)

@@ -90,7 +90,8 @@ def test_levels_are_the_scenarios() -> None:
 
 
 def test_biases_are_taken_away_for_the_oracle_alone() -> None:
-    biased = {"base": "straight", "noise": {"gyro_bias": 0.3, "gyro": 1e-9}, "speed": 7.0}
+    biased = {"base": "straight", "noise": {"gyro_bias": 0.2, "gyro": 1e-9}, "speed": 7.0}
+    biased |= {"gyro_bias": 0.1, "accel_y_bias": (0.1, 0.2)}
     for rung, wanted in (("nominal", 0.3), ("oracle-parameters", 0.0)):
         env, _ = make_rung(rung, FUSION, scenario=biased)
         obs, _ = env.reset(seed=0)

@@ -17,12 +17,12 @@ CAR, COMS = CARS
 
 def test_feedback_saves_cars_that_nothing_saves() -> None:
     """The uncontrolled COMS above its critical slip is lost in places where lqr catches it."""
-    points = (5, 5)
+    points = (9, 7)
     for car in CARS:
-        none, lqr = (saved(Case(car, name, points, 3)) for name in ("none", "lqr"))
-        assert none.shape == lqr.shape == (5, 5, 3)
+        none, lqr = (saved(Case(car, name, points, 4)) for name in ("none", "lqr"))
+        assert none.shape == lqr.shape == (7, 9, 4)
         assert none.mean() < lqr.mean(), car
-        assert (lqr[2, 2] == 1.0).all() and (none[2, 2] == 1.0).all()  # straight ahead, at rest
+        assert (lqr[3, 4] == 1.0).all() and (none[3, 4] == 1.0).all()  # straight ahead, at rest
 
 
 def test_a_slide_that_turns_further_out_is_lost_and_one_that_turns_back_is_saved() -> None:

@@ -76,13 +76,13 @@ def test_the_standard_deviation_is_that_of_estimates_in_noise() -> None:
     rng = np.random.default_rng(1)
     t = np.arange(0.0, 200.0, 0.02)
     steer = rng.standard_normal(len(t))
-    errors, told = [], []
+    errors, claimed = [], []
     for _ in range(60):
         found = iso7401.measured(t, steer, 2.0 * steer + rng.standard_normal(len(t)))
         errors.append(found.H - 2.0)
-        told.append(found.sd)
+        claimed.append(found.sd)
     each = np.sqrt(np.mean(np.real(errors) ** 2, axis=0) + np.mean(np.imag(errors) ** 2, axis=0))
-    ratio = each / math.sqrt(2.0) / np.mean(told, axis=0)
+    ratio = each / math.sqrt(2.0) / np.mean(claimed, axis=0)
     assert np.median(ratio) == pytest.approx(1.0, abs=0.15)
 
 

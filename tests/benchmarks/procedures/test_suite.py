@@ -17,9 +17,9 @@ def test_every_contestant_drives_every_procedure_that_has_a_verdict() -> None:
     for procedure in ("fmvss-126", "iso-3888-1", "iso-3888-2"):
         mine = {(case.car, case.contestant) for case in cases if case.procedure == procedure}
         assert mine == {(car, k) for car in CARS for k in range(len(CONTESTANTS))}
-    told = {case.car: case.seeds for case in cases if case.procedure == "outside"}
-    assert set(told) == set(OUTSIDE_PLANTS)
-    assert {len(seeds) for seeds in told.values()} == {20}
+    driven = {case.car: case.seeds for case in cases if case.procedure == "outside"}
+    assert set(driven) == set(OUTSIDE_PLANTS)
+    assert {len(seeds) for seeds in driven.values()} == {20}
 
 
 def test_without_the_extra_outside_plants_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:

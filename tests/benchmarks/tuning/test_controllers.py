@@ -11,16 +11,16 @@ import pytest
 pytest.importorskip("optuna")
 
 from sideslip.agents.tuned import FILE, read_tuned, tuned
+from sideslip.benchmarks.control.contests import Contest
+from sideslip.benchmarks.control.episodes import NUMBERS, Driven
 from sideslip.benchmarks.control.seeds import tuning_seeds
 from sideslip.benchmarks.tuning import controllers, spaces
-from sideslip.benchmarks.tuning.contests import Contest, contests_of, drive
-from sideslip.benchmarks.tuning.controllers import Contestant, objective, tune
+from sideslip.benchmarks.tuning.controllers import Contestant, contests_of, driven, objective, tune
 from sideslip.benchmarks.tuning.file import put_tuned
 from sideslip.benchmarks.tuning.spaces import KINDS, SPACES, Number, options_of
 from tests.benchmarks.conftest import Run
 
-YAW = "sideslip/YawFusion-v0"
-SHORT = Contest(YAW, {"scenario": {"base": "slalom", "duration": 1.5}}, "short")
+SHORT = Contest(scenario="sine-with-dwell")
 SEEDS = tuple(tuning_seeds(2))
 
 
@@ -48,17 +48,21 @@ def test_a_planted_bad_weight_is_found_and_left(tmp_path: Path) -> None:
 
 def test_the_objective_is_the_mean_log_of_paired_costs() -> None:
     gain = task(Number("gain", 1.0, 0.1, 10.0))
-    costs, _ = drive(SHORT, "two-dof", {"controller": {"gain": 3.0}}, SEEDS)
-    nominal, _ = drive(SHORT, "nominal", {}, SEEDS)
+    nothing: dict[str, dict[str, Any]] = {"filter": {}, "controller": {}}
+    costs = driven(SHORT, "two-dof", nothing | {"controller": {"gain": 3.0}}, SEEDS).costs
+    nominal = driven(SHORT, "nominal", nothing, SEEDS).costs
     wanted = np.clip(np.log((costs + 1e-3) / (nominal + 1e-3)), -3.0, 3.0).mean()
     assert objective(gain, {"gain": 3.0}, 2) == pytest.approx(wanted, rel=1e-12)
 
 
 def test_a_failure_costs_twenty_times_nominal(monkeypatch: pytest.MonkeyPatch) -> None:
-    fates = {"two-dof": (np.array([0.5, 900.0]), np.array([False, True]))}
-    monkeypatch.setattr(
-        controllers, "drive", lambda c, name, *_: fates.get(name, (np.ones(2), np.zeros(2)))
-    )
+    def fake(contest: Contest, name: str, *_: Any) -> Driven:
+        numbers = np.zeros((2, len(NUMBERS)))
+        numbers[:, NUMBERS.index("cost")] = [0.5, 900.0] if name == "two-dof" else 1.0
+        numbers[:, NUMBERS.index("failure")] = [0.0, 1.0] if name == "two-dof" else 0.0
+        return Driven(numbers, 0.0)
+
+    monkeypatch.setattr(controllers, "driven", fake)
     controllers._nominal.cache_clear()
     found = objective(task(Number("gain", 1.0, 0.1, 10.0)), {"gain": 1.0}, 2)
     controllers._nominal.cache_clear()
@@ -80,7 +84,7 @@ def test_of_a_slow_contestant_the_worse_half_stops_early(
         return abs(math.log(found["grip"] / 0.5))
 
     monkeypatch.setattr(controllers, "objective", fake)
-    monkeypatch.setattr(controllers, "drive", lambda *_: None)
+    monkeypatch.setattr(controllers, "driven", lambda *_: Driven(np.zeros((1, 1)), 0.0))
     slow = task(Number("grip", 0.9, 0.3, 1.0), name="mpc", seeds=tuple(tuning_seeds(16)))
     log = tune(slow, 16, storage(tmp_path), jobs=1)
     counted = [asked.count(count) for count in (4, 8, 16)]
@@ -113,8 +117,8 @@ def test_a_stopped_search_goes_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Pat
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_class_has_contests_and_every_start_lies_within(kind: str) -> None:
-    assert len(contests_of(kind)) >= 5
     for name in SPACES:
+        assert len(contests_of(name, kind)) >= 5
         numbers = spaces.space(name, kind)
         assert all(0.0 < each.low <= each.start <= each.high for each in numbers)
         steers = any(each.steering for each in numbers)
@@ -192,7 +196,7 @@ def test_the_command_writes_options_and_log(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("sideslip.benchmarks.tuning.contests.contests_of", lambda _: (SHORT,))
+    monkeypatch.setattr(controllers, "contests_of", lambda *_: [SHORT])
     few = ("--class", "coms-model", "--trials", 2, "--seeds", 1, "--jobs", 1)
     status, out, _ = run("tune", "controller", "two-dof", *few, "--out", "t.toml", "--log", "logs")
     assert status == 0 and "untuned nominal" in " ".join(out.split())

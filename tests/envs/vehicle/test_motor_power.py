@@ -21,15 +21,15 @@ pytestmark = pytest.mark.plain
 WEAK = COMS.replace(motor_power=2000.0)
 CAR, FREE = car_of(WEAK), car_of(COMS)
 HOLD = Pace(speed=7.0, hold=1.0, acceleration=0.0, start=0.0, end=FOREVER, k_p=2.0, k_i=0.5)
-speeds = st.floats(-40.0, 40.0)
+speeds, either = st.floats(-40.0, 40.0), st.sampled_from([0.0, 1.0])
 
 
-@given(speeds, st.floats(-1e3, 1e3), st.floats(-20.0, 20.0), st.sampled_from([0.0, 1.0]))
+@given(speeds, st.floats(-1e3, 1e3), st.floats(-20.0, 20.0), either, either)
 def test_no_wheel_takes_or_gives_more_than_its_power(
-    v: float, N_z: float, error: float, yaw_first: float
+    v: float, N_z: float, asked: float, hold: float, yaw_first: float
 ) -> None:
     """P = T omega, omega = v / r, whatever moment and acceleration are asked for."""
-    pace = HOLD._replace(speed=v + error)
+    pace = HOLD._replace(speed=v + asked, hold=hold, acceleration=asked * (1.0 - hold))
     T_l, T_r, _, _ = torques(N_z, 0.0, v, 0.0, pace, CAR, yaw_first)
     for torque in (T_l, T_r):
         assert abs(torque * v / WEAK.wheel_radius) <= 2000.0 * (1.0 + 1e-14)  # roundings
