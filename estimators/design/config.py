@@ -59,13 +59,11 @@ class FilterConfig:
     disturbances: of a bicycle, "none", "walk" (d1 and d2 push beta and gamma), "walk-all" (d3
         pushes psi) or "forces" (an Ornstein-Uhlenbeck force and moment).
     leak: 1/s, by which disturbances decay on top of that.
-    fast: of a bicycle with a covariance of its own (exact-kf, course-kf, dakf), what it measures in
-        every row, the gyro among it (default): "gyro", "accel_y", "roll_rate". With more than the
-        gyro its body rolls: states phi and phi_rate.
-    bias_sd: of the same ones, rad/s: above 0 (default) a state `bias`, a constant drawn with this
-        deviation that the gyro measures on top of the yaw rate; with q_bias it walks.
-    accel_bias_sd: m/s2, likewise a state `accel_bias` of the lateral accelerometer.
-    bank_sd: rad, likewise a state `bank` of the road, the left side up.
+    fast: of exact-kf, course-kf and dakf, what is measured in every row: "gyro" (default), and any
+        of "accel_y" and "roll_rate", with which the body rolls: states phi and phi_rate.
+    bias_sd (rad/s), accel_bias_sd (m/s2), bank_sd (rad): of the same, above 0 (default) a state
+        `bias`, `accel_bias` or `bank`, a constant of this deviation that the sensor adds, or by
+        which the road leans, the left side up; with q_bias, ... it walks.
     q_beta, q_gamma, ...: process noise of a state per second, (unit)^2/s; or Q, (n, n) or (n,)
         (default: of `tunings.toml`).
     gyro_noise (rad/s), psi_noise (rad), y_l_noise (m), course_noise (rad at every speed; default
@@ -213,11 +211,10 @@ def _inertial(row: Filter, read: Options) -> tuple[tuple[str, ...], dict[str, fl
         return row.fast, {}
     fast = read.some_of("fast", row.fast, INERTIAL)
     biases = {name: read.not_negative(f"{name}_sd", STATES[name].unit) for name in BIASES}
-    biases = {name: sd for name, sd in biases.items() if sd > 0.0}
-    for name in biases:
-        if BIASES[name] not in (*fast, ""):
+    for name, sd in biases.items():
+        if sd > 0.0 and BIASES[name] not in (*fast, ""):
             raise ValueError(f"{read.name}: {name}_sd needs {BIASES[name]} among fast, got {fast}")
-    return fast, biases
+    return fast, {name: sd for name, sd in biases.items() if sd > 0.0}
 
 
 def _models(
@@ -266,8 +263,7 @@ def _prior(
     states: Sequence[str], noise: Mapping[str, float], biases: Mapping[str, float], read: Options
 ) -> dict[str, float]:
     """Standard deviations of all states at the start."""
-    found: dict[str, float] = {state: STATES[state].prior for state in states}
-    found |= biases
+    found = {state: STATES[state].prior for state in states} | dict(biases)
     if "force" in noise:
         found |= {"F_d": noise["force"], "N_d": noise["moment"]}
     prior = read.value("prior", {})

@@ -127,7 +127,7 @@ def test_logs_that_cannot_be_filtered(log: Any) -> None:
         filter_.run(Record(record.fast, record.packets, dt=0.01))
     with pytest.raises(ValueError, match=r"built for the camera .* the reset has"):
         filter_.run(Log(record, {"camera": SlowSensor(0.05)}))
-    with pytest.raises(ValueError, match=r"fast rows have shape \(k, 11\), got \(1, 3\)"):
+    with pytest.raises(ValueError, match=r"fast rows have shape \(k, 12\), got \(1, 3\)"):
         filter_.predict(np.zeros(3))
     with pytest.raises(ValueError, match=r"packet has shape \(11,\), got \(3,\)"):
         filter_.update(np.zeros(3))
