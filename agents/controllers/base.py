@@ -8,11 +8,16 @@ import numpy as np
 import numpy.typing as npt
 
 from ...envs.backend.decorators import jit
+from ...envs.backend.primitives import ARRAYS
+from ...envs.backend.rebuild import plain
+from ...envs.engine.packing import car_of
+from ...envs.vehicle.actuators import torque_limit
 from ...envs.vehicle.vehicle import GRAVITY, Vehicle
 from ..env_facts import AnyEnv, facts_of
 
 Array = npt.NDArray[np.float64]
 
+_torque_limit = plain(torque_limit, ARRAYS)
 FRICTION = "true_friction"  # the entry whose friction a grip limit goes by, where it is there
 
 
@@ -69,13 +74,16 @@ class Controller(ABC):
         return inputs[:, -1] if self._true_friction else np.full(len(inputs), self.nominal.friction)
 
     def _most(self, inputs: Array) -> Array:
-        """(N,) the largest yaw moment as a share of full scale: what `grip` leaves of it."""
+        """(N,) the largest yaw moment as a share of full scale: what the motors' power at the
+        measured speed (columns 0 and 1, the front wheels) and `grip` leave of it."""
+        car, most = self.vehicle, np.ones(len(inputs))
+        if car.motor_power > 0.0:
+            most = _torque_limit(inputs[:, :2].mean(axis=1), car_of(car)) / car.motor_torque
         if self.grip is None:
-            return np.ones(len(inputs))
-        car = self.vehicle
+            return most
         load = car.mass * GRAVITY * car.front_arm / (2.0 * car.wheelbase)  # N, of a rear tyre
         per_friction = self.grip * load * car.rear_track / self.full_scale
-        return np.minimum(per_friction * self._friction(inputs), 1.0)
+        return np.minimum(per_friction * self._friction(inputs), most)
 
     @abstractmethod
     def _law(self, inputs: Array, state: Array, action: Array) -> None:

@@ -89,6 +89,16 @@ def test_no_steering_is_added_that_only_slides_the_front_tyres() -> None:
             assert abs(slip) <= limit + 1e-6 or abs(slip) <= abs(undriven) + 1e-6
 
 
+@pytest.mark.parametrize("name", ["two-dof", "esc", "lqr"])
+def test_no_more_is_asked_than_the_motors_power_gives(name: str) -> None:
+    """P / omega of a wheel at the measured speed: an integral does not wind up beyond it."""
+    strong = {"base": "coms", "motor_power": 2000.0}
+    env = EstimateObservation(gym.make(YAW, vehicle=strong), "exact-kf")
+    action, _ = make_agent(name, env).predict(harsh(env))
+    torque = 2000.0 * COMS.wheel_radius / 7.0
+    assert abs(action[0]) == pytest.approx(torque / COMS.motor_torque, rel=1e-4)
+
+
 def test_bad_input() -> None:
     for grip in (0.0, -1.0, float("nan")):
         with pytest.raises(ValueError, match="grip is a positive number"):
