@@ -25,7 +25,7 @@ from .harness.stats import interval
 
 NAME = "recovery"
 READING = ("two-dof", "esc", "sliding-mode", "lqr")
-CONTROLLERS = ("none", *READING, "nominal", "oracle-state-lqr")
+CONTROLLERS = ("none", *READING, "nominal", "oracle-state-lqr", "oracle-state-nmpc")
 CAUGHT = 0.05  # rad
 SEEDS, QUICK_SEEDS = 16, 4
 POINTS, QUICK_POINTS = (13, 11), (5, 5)  # of the grid: sideslip angles, yaw rates
@@ -49,8 +49,8 @@ _TEXT = (
     "The share of cars that are saved over the sideslip angle and yaw rate they start with: no "
     f"failure within 5 s, and below {CAUGHT} rad at the end. Nobody steers; the yaw moment alone "
     "acts. The seed draws tyres and friction. Filters start at zero, as after a cold start: they "
-    "have to find the slide first; oracle-state-lqr knows it. The clairvoyant's basin is not "
-    "shown: a plan of one start takes minutes."
+    "have to find the slide first; the two oracles know it, and the car. The clairvoyant's basin "
+    "is not shown: a plan of one start takes minutes."
 )
 
 

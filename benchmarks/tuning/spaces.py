@@ -36,6 +36,7 @@ _LEVELS = (
     Number("moment_sd", 20.0, 5.0, 3e3, ("filter",)),  # N m
     Number("bias_sd", 0.01, 1e-4, 0.05, ("filter",)),  # rad/s
     Number("accel_bias_sd", 0.2, 0.01, 2.0, ("filter",)),  # m/s2
+    Number("bank_sd", 0.01, 1e-4, 0.1, ("filter",)),  # rad
     Number("accel_y_noise", 0.1, 0.02, 2.0, ("filter",)),  # m/s2
 )
 _GRIP = Number("grip", 0.7, 0.3, 1.0)
