@@ -33,14 +33,14 @@ def storage(folder: Path) -> str:
 
 
 def test_a_planted_bad_weight_is_found_and_left(tmp_path: Path) -> None:
-    """A PI a hundred times too strong swings from limit to limit: the search leaves it."""
-    planted = task(Number("gain", 100.0, 0.1, 200.0))
+    """An LQR that may use a hundredth of the tyres' grip does nothing: the search leaves it."""
+    planted = task(Number("grip", 0.01, 0.01, 1.0), name="lqr")
     log = tune(planted, 12, storage(tmp_path), jobs=1)
     assert len(log["trials"]) == 12
-    assert log["trials"][0]["numbers"] == {"gain": 100.0}  # the start is the first trial
+    assert log["trials"][0]["numbers"] == {"grip": 0.01}  # the start is the first trial
     assert log["start"] == log["trials"][0]["objective"]
     assert log["best"]["objective"] < log["start"] - 0.5
-    assert log["best"]["numbers"]["gain"] < 30.0
+    assert log["best"]["numbers"]["grip"] > 0.1
     best = log["options"]["controller"]
     assert objective(planted, best, 2) == pytest.approx(log["best"]["objective"], abs=1e-4)
     assert "cost" in controllers.suite_of(planted, log).text
