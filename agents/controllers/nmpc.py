@@ -18,7 +18,7 @@ from ...envs.vehicle.tyres import SLOW, TYRE_LAWS, shifts
 from ...envs.vehicle.vehicle import GRAVITY, Vehicle
 from ..design.gain_schedule import interpolated
 from ..design.gauss_newton import MOST_VARIABLES, improved
-from ..design.prediction import Model, Start, blocks_of, changed_tyres, model_of
+from ..design.prediction_model import Model, Start, blocks_of, changed_tyres, model_of
 from ..env_facts import AnyEnv, configs_of
 from .base import Array, positive
 from .lqr import IN, Lqr

@@ -8,7 +8,8 @@ import numpy as np
 from ...envs.backend.arrays import lane_count
 from ...envs.backend.decorators import jit
 from ...envs.backend.simd import LANES
-from .prediction import RESIDUALS, TERMINAL, Model, Start, roll_out
+from .prediction import RESIDUALS, TERMINAL, roll_out
+from .prediction_model import Model, Start
 
 MOST_VARIABLES = LANES - 1  # one lane is the plan itself
 LIMIT = 2.0  # of a variable: from one limit of an input to the other

@@ -11,7 +11,8 @@ from gymnasium.vector import SyncVectorEnv
 from sideslip.agents import Nmpc, make_agent
 from sideslip.agents.controllers.nmpc import problem_of
 from sideslip.agents.design.gauss_newton import LIMIT, damped_step, improved, lanes_of, roll_all
-from sideslip.agents.design.prediction import blocks_of, roll_out
+from sideslip.agents.design.prediction import roll_out
+from sideslip.agents.design.prediction_model import blocks_of
 from sideslip.agents.rungs import make_rung
 from sideslip.envs.backend.on_casadi import SYMBOLS, symbolic
 from sideslip.estimators.wrappers.truth import TruthObservation

@@ -1,0 +1,116 @@
+"""What nonlinear predictive control knows of the car, and where a prediction starts."""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ...envs.backend.decorators import jit
+from ...envs.engine.packing import car_of
+from ...envs.engine.tick import Kind
+from ...envs.record import Array
+from ...envs.task.cost import BETA_SCALE, EFFORT_WEIGHT, GAMMA_SCALE, STEER_SCALE
+from ...envs.task.reference import ZERO_SLIP
+from ...envs.ticks import TICK
+from ...envs.vehicle.actuators import Lag, lag_of
+from ...envs.vehicle.dynamics import Car, Road
+from ...envs.vehicle.vehicle import Vehicle
+
+
+class Model(NamedTuple):
+    """What all predictions share: numbers alone."""
+
+    car: Car  # the nominal one
+    road: Road  # straight and flat
+    kind: Kind
+    motor: Lag  # of a step
+    steering: Lag
+    motor_work: tuple[float, float]  # mean and spread over a step of what is left of a deviation
+    steering_work: tuple[float, float]
+    step: float  # s
+    full_scale: float  # N m
+    authority: float  # rad
+    slew: float  # rad a step
+    stop: float  # rad
+    yaw_first: float
+    keep: float  # what a step leaves of the disturbances
+    ref_rest: float  # and of a lagged reference's deviation
+    per_beta: float  # square roots of the cost's weights
+    per_gamma: float
+    per_share: float
+    per_steer: float
+
+
+class Start(NamedTuple):
+    """Where a prediction starts."""
+
+    car: Any
+    motion: Any
+    T_l: Any
+    T_r: Any
+    delta_f: Any
+    slewing: Any  # rad, the added steering that was asked for last
+    driver: Any  # rad, held
+    a_x: Any  # m/s2, held
+    refs: Any  # (beta, gamma) now
+    steady: Any  # and where a lagged reference goes
+    push: Any
+    most: Any  # share of full scale that the yaw moment may take
+
+
+def work_of(time_constant: float, ticks: int) -> tuple[float, float]:
+    """Mean and standard deviation over a step's ticks of what is left of a deviation."""
+    tick = lag_of(time_constant, TICK)
+    left = tick.mean * tick.end ** np.arange(ticks)
+    return float(left.mean()), float(left.std())
+
+
+def model_of(
+    vehicle: Vehicle,
+    kind: Kind,
+    ticks: int,
+    lags: bool,
+    disturbance_time: float,
+    ref_rest: float,
+    steer_weight: float,
+    full_scale: float,
+    authority: float,
+    yaw_first: bool,
+) -> Model:
+    """The model of a car in steps of some ticks; the cost is that of `sampled_model`."""
+    step = ticks * TICK
+    motor, steering = (vehicle.motor_lag, vehicle.steering_lag) if lags else (0.0, 0.0)
+    return Model(
+        car_of(vehicle),
+        Road(0.0, 0.0, 1.0),
+        kind,
+        lag_of(motor, step),
+        lag_of(steering, step),
+        work_of(motor, ticks),
+        work_of(steering, ticks),
+        step,
+        full_scale,
+        authority,
+        vehicle.steering_rate * step,
+        vehicle.steering_stop,
+        float(yaw_first),
+        math.exp(-step / disturbance_time),
+        ref_rest**ticks,
+        1.0 / BETA_SCALE,
+        0.0 if kind.reference == ZERO_SLIP else 1.0 / GAMMA_SCALE,
+        math.sqrt(EFFORT_WEIGHT),
+        math.sqrt(steer_weight * EFFORT_WEIGHT) / STEER_SCALE,
+    )
+
+
+def blocks_of(steps: int, count: int) -> Array:
+    """Lengths of at most `count` blocks of a horizon of so many steps, growing to its end."""
+    ends = np.unique(np.rint(np.geomspace(1.0, steps, count)).astype(np.int64))
+    return np.diff(ends, prepend=0)
+
+
+@jit
+def changed_tyres(car: Any, C_f: Any, C_r: Any, mu: Any) -> Any:
+    """The car with other stiffnesses and another friction."""
+    tyres, road, other = (C_f, C_r), (mu,), (mu,)
+    return Car(*(car[:4] + tyres + car[6:10] + road + car[11:19] + other + car[20:]))
