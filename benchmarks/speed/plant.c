@@ -3,7 +3,8 @@
  * One tick is what `plant.py` compiles: the actuators' lag, two loads, Fiala tyres, roll, and the
  * classical Runge-Kutta method, operation by operation in the order of `envs`. Blocks of cars,
  * structures of arrays, so that the compiler makes vectors of it; BLOCK, the cars in one, is a
- * macro of its command line. Constants of a call are computed once a block.
+ * macro of its command line. Constants of a call are computed once a block. What the id's cars and
+ * roads do not have is left out: load that moves between the axles, roads laid tick by tick.
  *
  * Compiled with -O3 -march=native -ffp-contract=off; more flags stand in `c_plant.py`.
  */
@@ -15,8 +16,9 @@
 /* Fields in the order of the arrays (blocks, fields, BLOCK). */
 #define CAR(DO) \
     DO(m) DO(I) DO(l_f) DO(l_r) DO(C_f) DO(C_r) DO(d_f) DO(d_r) DO(r) DO(T_max) DO(mu) DO(l_pre) \
-    DO(S) DO(I_x) DO(K_x) DO(C_x) DO(h) DO(ahead) DO(left) DO(mu_r)
-#define ROAD(DO) DO(curvature) DO(start) DO(ramp) DO(across) DO(along)
+    DO(S) DO(I_x) DO(K_x) DO(C_x) DO(h) DO(ahead) DO(left) DO(mu_r) \
+    DO(P) DO(h_x)
+#define ROAD(DO) DO(curvature) DO(start) DO(ramp) DO(across) DO(along) DO(turn)
 #define PUSH(DO) DO(F_d) DO(N_d) DO(N_x)
 #define INPUTS(DO) DO(delta) DO(T_l) DO(T_r)
 #define MOTION(DO) \
