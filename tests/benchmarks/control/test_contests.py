@@ -53,6 +53,12 @@ def found(contest: Contest, levels: dict[str, float], **failed: int) -> Measured
     return judged(Results(made), contest)
 
 
+def test_every_tier_asks_its_question_in_five_manoeuvres_or_more() -> None:
+    for tier in ("1", "2a", "2b"):
+        assert len({each.scenario for each in contests() if each.tier == tier}) >= 5
+    assert len([each for each in contests() if each.tier == "2c"]) >= 5
+
+
 def test_a_contest_is_scored_where_the_rungs_lie_apart() -> None:
     both = {STATES[0]: 1.0, STATES[1]: 0.5}
     wide = found(ONE, {NOMINAL: 2.0, **both})

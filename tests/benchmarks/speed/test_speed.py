@@ -73,7 +73,9 @@ def test_the_plant_in_c_is_ours() -> None:
     """To rounding, over half a second of cars that slide, roll, brake and turn."""
     mine = plant.cars_of(32, seed=3)
     mine.motions[:, 1] += np.linspace(-3.0, 3.0, 32).reshape(-1, LANES)  # m/s of v_y: tyres slide
-    mine.roads[0] = np.array([[0.01], [0.5], [2.0], [0.3], [0.2], [0.0]])  # the others: straight, flat
+    mine.roads[0] = np.array(
+        [[0.01], [0.5], [2.0], [0.3], [0.2], [0.0]]
+    )  # the others: straight, flat
     theirs = mine.twin()
     plant.ours(mine, 500)
     plant.in_c()(theirs, 500)
