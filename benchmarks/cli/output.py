@@ -4,6 +4,7 @@ import platform
 import shlex
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -100,9 +101,33 @@ def print_suite(console: Console, suite: Suite) -> None:
     console.rule(f"[bold]{suite.title}")
     console.print(escape(suite.text) + "\n", highlight=False)
     for table in suite.tables:
-        console.print(_rich(table))
+        for part in _parts(table, console.width):
+            console.print(_rich(part))
         if table.note:
             console.print(f"[dim]{escape(table.note)}[/]\n", highlight=False)
+
+
+def _parts(table: Table, width: int) -> list[Table]:
+    """The table as it fits into so many columns of text: some columns each, the first in all."""
+    columns = list(zip(table.header, *table.cells, strict=True))
+    widths = [max(map(len, column)) + 2 for column in columns]
+    groups: list[list[int]] = [[0]]
+    used = first = min(widths[0], _NAME + 2) + 2
+    for i in range(1, len(columns)):
+        if used + widths[i] > width and len(groups[-1]) > 1:
+            groups.append([0])
+            used = first
+        groups[-1].append(i)
+        used += widths[i]
+    return [
+        replace(
+            table,
+            title=table.title if not k else f"{table.title} (continued)",
+            header=[table.header[i] for i in group],
+            cells=[[row[i] for i in group] for row in table.cells],
+        )
+        for k, group in enumerate(groups)
+    ]
 
 
 def _rich(table: Table) -> RichTable:

@@ -14,13 +14,14 @@ from gymnasium.vector.utils import batch_space
 from ...agents import make_agent
 from ...agents.learned.files import is_policy, load_policy
 from ...agents.rollout import steps_of
-from ...agents.rungs import FILTER, levels_of, make_rung
+from ...agents.rungs import FILTER, GRIP, STEER_WEIGHT, levels_of, make_rung
 from ...envs.scenarios.manoeuvres import scenario_from
 from ...envs.task.observation import Entry
 from ...estimators.filters import FILTERS
 from ...estimators.vector.estimate import EstimateObservation
 from ..harness.drives import quietly
-from .cells import SETUPS, TRUTH, Cell
+from .cells import REFERENCE_CONTROLLER, SETUPS, TRUTH, Cell
+from .contests import STEERING
 
 STEPS = 200  # of a decision's time
 
@@ -107,6 +108,10 @@ def agent_options(cell: Cell) -> dict[str, Any]:
     more: dict[str, Any] = {}
     if cell.controller == "model-following":
         more["rejection"] = cell.estimator == "dakf"
+    if cell.controller == REFERENCE_CONTROLLER:  # nominal's own design
+        more["grip"] = GRIP
+        if cell.contest.env_id == STEERING:
+            more["steer_weight"] = STEER_WEIGHT
     return more | cell.best["controller"]
 
 
