@@ -108,9 +108,16 @@ def print_suite(console: Console, suite: Suite) -> None:
 
 
 def _parts(table: Table, width: int) -> list[Table]:
-    """The table as it fits into so many columns of text: some columns each, the first in all."""
+    """The table as it fits into so many columns of text: some columns each, the first in all;
+    texts wrap."""
+    from ..report.html import numeric
+
     columns = list(zip(table.header, *table.cells, strict=True))
-    widths = [max(map(len, column)) + 2 for column in columns]
+    most = [max(map(len, column)) for column in columns]
+    widths = [
+        (each if numeric(column[1:]) else min(each, _LEAST)) + 2
+        for each, column in zip(most, columns, strict=True)
+    ]
     groups: list[list[int]] = [[0]]
     used = first = min(widths[0], _NAME + 2) + 2
     for i in range(1, len(columns)):

@@ -26,3 +26,12 @@ def test_nothing_of_a_wide_table_is_cut(width: int) -> None:
     assert (parts == 1) == (width == 400)
     for entry in (*HEADER[1:], *ROWS[0][1:], *ROWS[1][1:]):
         assert entry in text
+
+
+def test_long_texts_wrap_and_are_no_part_of_their_own() -> None:
+    suite = Suite("wordy", "Words", "")
+    suite.tables.append(Table("Errors", ("tier", "what"), [["1", "its error grows " * 9]]))
+    written = io.StringIO()
+    print_suite(Console(file=written, width=80), suite)
+    assert "(continued)" not in written.getvalue()
+    assert written.getvalue().count("grows") == 9
