@@ -2,6 +2,7 @@
 
 import math
 from abc import ABC, abstractmethod
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from ...envs.backend.primitives import ARRAYS
 from ...envs.backend.rebuild import plain
 from ...envs.engine.packing import car_of
 from ...envs.vehicle.actuators import torque_limit
+from ...envs.vehicle.dynamics import Car
 from ...envs.vehicle.vehicle import GRAVITY, Vehicle
 from ..env_facts import AnyEnv, facts_of
 
@@ -69,6 +71,10 @@ class Controller(ABC):
     vehicle: Vehicle
     """The car that the controller is designed for."""
 
+    @cached_property
+    def _car(self) -> Car:
+        return car_of(self.vehicle)
+
     def _friction(self, inputs: Array) -> Array:
         """(N,) the friction that a grip limit goes by."""
         return inputs[:, -1] if self._true_friction else np.full(len(inputs), self.nominal.friction)
@@ -78,7 +84,7 @@ class Controller(ABC):
         measured speed (columns 0 and 1, the front wheels) and `grip` leave of it."""
         car, most = self.vehicle, np.ones(len(inputs))
         if car.motor_power > 0.0:
-            most = _torque_limit(inputs[:, :2].mean(axis=1), car_of(car)) / car.motor_torque
+            most = _torque_limit(inputs[:, :2].mean(axis=1), self._car) / car.motor_torque
         if self.grip is None:
             return most
         load = car.mass * GRAVITY * car.front_arm / (2.0 * car.wheelbase)  # N, of a rear tyre
@@ -93,6 +99,9 @@ class Controller(ABC):
         failed. The action's first column is the yaw moment as a share of full scale, its second,
         where the env has one, the added steering as a share of the vehicle's authority.
         """
+
+    def _not_finite(self, rows: Any, state: Array) -> None:  # noqa: B027
+        """Note the rows (N,) whose inputs are not finite, in the state (N, memory) or elsewhere."""
 
     def predict(
         self,
@@ -121,6 +130,7 @@ class Controller(ABC):
             inputs[bad] = 0.0
             self._law(inputs, memory, action)
             memory[bad], action[bad] = before, np.nan
+            self._not_finite(bad, memory)
         else:
             self._law(inputs, memory, action)
         shares = np.clip(action, -1.0, 1.0).astype(np.float32)

@@ -5,7 +5,6 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.sparse import csc_matrix
 
 from ...envs.ticks import TICK
@@ -106,19 +105,9 @@ class Mpc(Lqr):
         nearest = _nearest(speed)
         return _program(self.nominal, nearest, self.prediction, self.horizon, self.authority)
 
-    def predict(
-        self,
-        observation: npt.NDArray[np.float32],
-        state: Array | None = None,
-        episode_start: npt.NDArray[np.bool_] | None = None,
-        deterministic: bool = True,
-    ) -> tuple[npt.NDArray[np.float32], Array]:
-        """As every controller's; rows without a solution have NaN, `status` has the reason."""
-        shares, memory = super().predict(observation, state, episode_start, deterministic)
-        for i, row in enumerate(shares.reshape(-1, self.width)):
-            if np.isnan(row).any() and self.status[i].startswith("solved"):
-                self.status[i] = NOT_FINITE
-        return shares, memory
+    def _not_finite(self, rows: Any, state: Array) -> None:
+        for i in np.flatnonzero(rows):
+            self.status[i] = NOT_FINITE
 
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
         self.status, self.solve_time = [], []

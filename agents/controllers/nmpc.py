@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from ...envs.backend.decorators import jit
 from ...envs.backend.elementary import sincos
@@ -208,19 +207,8 @@ class Nmpc(Lqr):
         self._rolling = names.issuperset(rolling)
         return rolling if self._rolling else ()
 
-    def predict(
-        self,
-        observation: npt.NDArray[np.float32],
-        state: Array | None = None,
-        episode_start: npt.NDArray[np.bool_] | None = None,
-        deterministic: bool = True,
-    ) -> tuple[npt.NDArray[np.float32], Array]:
-        """As every controller's; `status` of the state has the reason for a NaN."""
-        shares, memory = super().predict(observation, state, episode_start, deterministic)
-        rows = shares.reshape(-1, self.width)
-        bad = np.isnan(rows).any(axis=1) & (memory[:, LAST.status] != DIVERGED)
-        memory[bad, LAST.status] = NOT_FINITE
-        return shares, memory
+    def _not_finite(self, rows: Any, state: Array) -> None:
+        state[rows, LAST.status] = NOT_FINITE
 
     def status(self, state: Array) -> list[str]:
         """Of each row of a state, what became of its last decision: of `STATUSES`."""

@@ -196,12 +196,15 @@ def _first(what: str, found: Sequence[Standing], attribute: str) -> str:
     return f"{text}, {value:.0f} % [{low:.0f}, {high:.0f}] of the cost of {name}{sure}"
 
 
-def refusals_of(results: Results) -> list[list[str]]:
+def refusals_of(results: Results, late: float = 0.0) -> list[list[str]]:
     """A line for every cell that could not be driven, or whose episodes ended by a failure that is
-    not the car's (a NaN, an action that is none): tier, contest, contestant, what happened."""
-    lines = []
+    not the car's (a NaN, an action that is none): tier, contest, contestant, what happened.
+
+    late: s by which the sensors were, of the price of delay.
+    """
+    lines, more = [], f", sensors {1e3 * late:.0f} ms late" if late else ""
     for cell, result in results.found.items():
-        where = [cell.contest.tier, cell.contest.name, cell.label]
+        where = [cell.contest.tier, cell.contest.name + more, cell.label]
         if result.error:
             lines.append([*where, f"not driven: {result.error}"])
             continue

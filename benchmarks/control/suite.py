@@ -88,7 +88,7 @@ def run(
     if not quick:
         prices, late = price_of_delay(seeds[:share], jobs=jobs, console=console, keep=keep)
     suite.rows += _price_rows(prices, share, salt)
-    suite.tables += _refusals([results, *late])
+    suite.tables += _refusals(results, late)
     illustrate(suite, found, results, prices, seeds[0])
     spent = np.nansum([c.seconds for each in (results, there, *late) for c in each.found.values()])
     suite.text = f"{answer(found)}\n\n{_TEXT} Driven in {spent / 60.0:.1f} CPU-minutes."
@@ -145,8 +145,10 @@ def _learned() -> list[str]:
     ]
 
 
-def _refusals(all_results: Sequence[Results]) -> list[Table]:
-    lines = [line for results in all_results for line in refusals_of(results)]
+def _refusals(results: Results, late: Sequence[Results]) -> list[Table]:
+    lines = refusals_of(results)
+    for delay, each in zip(DELAYS, late, strict=False):
+        lines += refusals_of(each, delay)
     if not lines:
         return []
     header = ("tier", "contest", "controller and estimator", "what happened")

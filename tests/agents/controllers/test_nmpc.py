@@ -144,6 +144,8 @@ def test_what_is_not_finite_has_a_name() -> None:
     actions, state = agent.predict(np.stack([good, bad, wild]))
     assert np.isfinite(actions[0]).all() and np.isnan(actions[1:]).all()
     assert agent.status(state) == ["solved", "the observation is not finite", "diverged"]
+    _, state = agent.predict(np.stack([good, bad, bad]), state)
+    assert agent.status(state)[2] == "the observation is not finite"  # no longer the one before
     actions, state = agent.predict(np.stack([good] * 3), state)
     assert np.isfinite(actions).all() and agent.status(state) == ["solved"] * 3
 
