@@ -1,9 +1,11 @@
 """The estimator object: a filter's compiled memory behind a small face."""
 
 import itertools
+import pickle
 import warnings
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -30,6 +32,24 @@ CHECKED_SPEEDS = (3.0, 7.0, 14.0)  # m/s, where a filter without a fixed speed i
 _EMPTY = np.zeros((0, 0))
 _NO_NIS = np.zeros(0)
 _NO_PACKETS = np.zeros((0, PACKET_WIDTH))
+
+
+@dataclass(frozen=True)
+class _Task:
+    """What a table of gains depends on: key has all of it."""
+
+    key: bytes
+    f: Memory = field(compare=False)
+    schedule: Schedule = field(compare=False)
+    speed: float = field(compare=False)
+    config: FilterConfig = field(compare=False)
+
+
+@lru_cache(maxsize=64)  # the same filter drives in many envs
+def _designed(task: _Task) -> tuple[Array, Array]:
+    """The table of gains and the map of the error, to be read alone."""
+    table, G = design(task.f, task.schedule, task.speed, task.config)
+    return table, error_map(task.f, table, G, task.schedule)
 
 
 class Estimator:
@@ -103,11 +123,11 @@ class Estimator:
 
     def _designed(self, f: Memory, schedule: Schedule, speed: float) -> tuple[Array, Array]:
         """The table of gains at a speed and the map of the error; ValueError if that grows."""
+        rest = schedule, speed, self.config
         try:
-            table, G = design(f, schedule, speed, self.config)
+            table, M = _designed(_Task(pickle.dumps((f.tobytes(), *rest)), f, *rest))
         except ValueError as error:
             raise ValueError(f"{self.name}: {error}") from None
-        M = error_map(f, table, G, schedule)
         radius = spectral_radius(M)
         if radius > 1.0 + MARGINAL and not self.config.allow_unstable:
             raise ValueError(

@@ -67,8 +67,12 @@ class Cell:
 
     @property
     def best(self) -> Options:
-        """The options of its filter and its controller: `tuned`, or those of `agents.tuned`."""
-        return tuned(self.contest.kind, self.controller) if self.tuned is None else self.tuned
+        """The options of its filter and its controller: `tuned`, or those of `agents.tuned`, where
+        the reference controller, `nominal`'s design on any filter, has the rung's."""
+        if self.tuned is not None:
+            return self.tuned
+        name = NOMINAL if self.controller == REFERENCE_CONTROLLER else self.controller
+        return tuned(self.contest.kind, name)
 
     @property
     def label(self) -> str:

@@ -78,7 +78,8 @@ SPACES: dict[str, tuple[Number, ...]] = {
     "nominal": _LQG,
     "oracle-parameters": tuple(each for each in _LQG if each.name != "bias_sd"),  # it knows it
 }
-"""By contestant; all but the rungs, which bring their own, drive on `exact-kf` with all sensors."""
+"""By contestant; all but the rungs, which bring their own, drive on `exact-kf` with all sensors.
+In the matrix `lqr` has what was found for `nominal`, which is the same design."""
 SLOW = ("mpc", "nmpc", "oracle-parameters")
 """Contestants whose worse trials end after a few seeds."""
 
