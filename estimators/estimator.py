@@ -48,8 +48,8 @@ class _Task:
 @lru_cache(maxsize=64)  # the same filter drives in many envs
 def _designed(task: _Task) -> tuple[Array, Array]:
     """The table of gains and the map of the error, to be read alone."""
-    table, G = design(task.f, task.schedule, task.speed, task.config)
-    return table, error_map(task.f, table, G, task.schedule)
+    table, there = design(task.f, task.schedule, task.speed, task.config)
+    return table, error_map(there, table, task.schedule)
 
 
 class Estimator:

@@ -36,15 +36,15 @@ def unobservable(M: Array, names: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(found)
 
 
-def error_map(f: Memory, table: Array, G: Array, schedule: Schedule) -> Array:
+def error_map(f: Memory, table: Array, schedule: Schedule) -> Array:
     """The error after one cycle over that before it, (size, size); what else a rule carries on
     (the estimated error e, the last innovation, stored predictions) stands behind it.
 
-    table (rows, columns), G (dense, n): from `periodic.design`.
+    table (rows, columns) and f: from `periodic.design`, at one speed.
     """
     size, s = int(f.total), int(f.first_slow)
     F = np.eye(size)
-    F[: f.n, : f.n] = transition_matrix(f, G)
+    F[: f.n, : f.n] = transition_matrix(f, f.G[: f.dense, : f.n])
     if f.between == DUAL_RATE:
         return _dual_rate_map(f, table, F, schedule)
     late = f.late in (STORED, CONSTANT) and s >= 0

@@ -96,11 +96,21 @@ def table_shape(f: Memory, schedule: Schedule) -> tuple[int, int]:
 
 def design(
     f: Memory, schedule: Schedule, speed: float, config: FilterConfig
-) -> tuple[Array, Array]:
-    """The table of gains (rows, columns) at a speed in m/s, and the transition G (dense, n) there.
+) -> tuple[Array, Memory]:
+    """The table of gains (rows, columns) at a speed in m/s, and the filter's memory with the
+    transition G and the rows C_fast that it has there.
 
     f: left as it is.
     """
+    table, copy = _settled(f, schedule, speed, config)
+    there: Memory = np.array([f]).view(np.recarray)[0]
+    there.G[:], there.C_fast[:] = copy.G, copy.C_fast  # an accelerometer's row has the speed
+    return table, there
+
+
+def _settled(
+    f: Memory, schedule: Schedule, speed: float, config: FilterConfig
+) -> tuple[Array, Memory]:
     filters: Filters = np.array([f])
     copy = filters.view(np.recarray)[0]
     copy.periodic = copy.measured = copy.origin = copy.joint = copy.between = 0
@@ -121,7 +131,7 @@ def design(
             _write_shares(copy, G, schedule, config, table)
         else:
             place(copy, G, config.poles, table)
-        return table, G
+        return table, copy
     lags = np.array(schedule.lags, np.int64) * int(f.late == CLONE)
     cycles = max(2, int(LONGEST / float(copy.step)) // schedule.cycle)
     before = np.zeros((int(f.total), int(f.total)))
@@ -130,7 +140,7 @@ def design(
         C = measured_rows(f, 0)
         R = np.diag([*copy.r_fast[: copy.fasts], *copy.r[s, : copy.rows[s]]])
         _pseudo_gains(copy, schedule, table, inverse(config.inverse, C, before, R))
-    return table, copy.G[: copy.dense, : copy.n].copy()
+    return table, copy
 
 
 def _stir(f: Memory) -> None:

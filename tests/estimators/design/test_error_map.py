@@ -1,6 +1,7 @@
 """What diverges is refused with its number; what cannot be seen is named."""
 
 import re
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from sideslip.envs.vehicle.vehicle import COMS
 from sideslip.estimators import UnobservableWarning, make_estimator
 from sideslip.estimators.design.error_map import error_map, spectral_radius
 from sideslip.estimators.design.periodic import design
+from sideslip.estimators.estimator import CHECKED_SPEEDS
 from tests.estimators.simulation import CAMERA, FIG6, GPS, Drive, simulate
 
 ALL = [
@@ -62,8 +64,8 @@ def test_the_error_map_is_what_the_compiled_filter_does() -> None:
         filter_ = make_estimator(name, vehicle=COMS, sensors=sensors, speed=7.0)
         filter_.P  # noqa: B018  designs the table
         f, schedule = filter_.filters[0], filter_._schedules[0]
-        table, G = design(f, schedule, 7.0, filter_.config)
-        M = error_map(f, table, G, schedule)
+        table, there = design(f, schedule, 7.0, filter_.config)
+        M = error_map(there, table, schedule)
         N, n = int(f.total), int(f.n)
         cycle = schedule.cycle
         rows = np.zeros((5 * cycle, FAST_WIDTH))
@@ -142,3 +144,21 @@ def test_a_filter_with_two_slow_sensors_is_checked_with_the_first_alone() -> Non
     alone = make_estimator("exact-kf", sensors=both, slow="camera", speed=7.0)
     assert fused.unobservable == alone.unobservable == ()
     assert fused.spectral_radius == alone.spectral_radius
+
+
+def test_a_filter_is_checked_with_the_rows_of_the_speed() -> None:
+    """An accelerometer's row depends on the speed: the map at 3 m/s is that of a filter of 3 m/s,
+    whose settled gains let no error grow, whatever the car."""
+    options: dict[str, Any] = {"fast": ["gyro", "accel_y"], "bank_sd": 0.01, "slow": "camera"}
+    car = replace(COMS, rear_stiffness=1.4 * COMS.rear_stiffness)
+    arguments = options | {"vehicle": car, "sensors": {"camera": CAMERA}}
+    anywhere = make_estimator("exact-kf", **arguments)
+    for speed in CHECKED_SPEEDS:
+        alone = make_estimator("exact-kf", speed=speed, **arguments)
+        maps = []
+        for each in (anywhere, alone):
+            schedule = each._schedules[0]
+            table, there = design(each.filters[0], schedule, speed, each.config)
+            maps.append(error_map(there, table, schedule))
+        np.testing.assert_allclose(maps[0], maps[1], rtol=1e-9, atol=1e-12)
+        assert alone.spectral_radius < 1.0
