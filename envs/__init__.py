@@ -12,7 +12,8 @@ from .stability import StabilityEnv
 from .task.failures import FAILURES
 from .task.observation import Entry
 from .vector import StabilityVectorEnv
-from .vehicle.vehicle import COMS, PASSENGER_CAR, VEHICLES, Vehicle, critical_speed, vehicle_from
+from .vehicle.vehicle import COMS, PASSENGER_CAR, Vehicle, critical_speed
+from .vehicle.vehicles import VEHICLES, vehicle_from
 
 __all__ = [
     "COMS",

@@ -1,5 +1,6 @@
 """Arguments of environments, for one or for rows, checked; and how messages write them."""
 
+import difflib
 import operator
 import reprlib
 import textwrap
@@ -55,10 +56,18 @@ def mapping_of(name: str, value: Any) -> Mapping[str, Any]:
     return value
 
 
+def unknown_names(what: str, values: Iterable[Any], known: Iterable[str]) -> str:
+    """A message about names that are not known: what the first may have meant, or what there is."""
+    got, names = list(values), list(known)
+    close = difflib.get_close_matches(got[0][:80], names, 1) if isinstance(got[0], str) else []
+    hint = f"did you mean {close[0]!r}?" if close else f"known: {listed(names)}"
+    return f"unknown {what} {listed(map(brief, got))}; {hint}"
+
+
 def check_choice(what: str, value: Any, known: Iterable[str]) -> None:
-    """ValueError for a value that is none of the known names."""
+    """ValueError for a value that is none of the known names, with the nearest of them."""
     if not isinstance(value, str) or value not in known:
-        raise ValueError(f"unknown {what} {brief(value)}; known: {listed(known)}")
+        raise ValueError(unknown_names(what, [value], known))
 
 
 def count_of(num_envs: Any) -> int:

@@ -26,7 +26,8 @@ from .task.info import REPORT, info_of
 from .task.observation import Entry
 from .ticks import TICK
 from .vehicle.dynamics import Motion
-from .vehicle.vehicle import Vehicle, vehicle_from
+from .vehicle.vehicle import Vehicle
+from .vehicle.vehicles import VehicleSource, vehicle_from
 
 
 class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
@@ -80,12 +81,12 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
 
     ## Arguments
     All JSON-able. sensors: "vision", "vision-uneven", "gps" or "fusion" (camera and GPS). scenario:
-    a name or a mapping. vehicle: the true one; nominal: that of estimators and controllers
-    (default: vehicle). control_period: ticks of 1 ms. reference: "zero-slip", "model" (its steady
-    state), "limited" (by friction) or "lagged" (so limited, understeering, through a lag of 0.1 s).
-    fast: "summary" or "all". slow, by name ("camera", "gps"): fields of `SlowSensor` that replace
-    the id's. yaw_first: yaw moment before acceleration where
-    both pass the motors' limit. steering: the action may steer too.
+    as `scenario_from` takes it. vehicle: the true one, as `vehicle_from` takes it; nominal: that of
+    estimators and controllers (default: vehicle). control_period: ticks of 1 ms. reference:
+    "zero-slip", "model" (its steady state), "limited" (by friction) or "lagged" (so limited,
+    understeering, through a lag of 0.1 s). fast: "summary" or "all". slow, by name ("camera",
+    "gps"): fields of `SlowSensor` that replace the id's. yaw_first: yaw moment before acceleration
+    where both pass the motors' limit. steering: the action may steer too.
     """
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012  Gymnasium's convention
@@ -94,8 +95,8 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
         self,
         sensors: str = "vision",
         scenario: str | Mapping[str, Any] | Scenario = "random-steering",
-        vehicle: str | Mapping[str, Any] | Vehicle = "coms",
-        nominal: str | Mapping[str, Any] | Vehicle | None = None,
+        vehicle: VehicleSource = "coms",
+        nominal: VehicleSource | None = None,
         control_period: int = 10,
         reference: str = "zero-slip",
         fast: str = "summary",

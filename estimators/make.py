@@ -7,7 +7,8 @@ from typing import Any, overload
 
 from ..envs.sensors.link import SlowSensor
 from ..envs.ticks import TICK
-from ..envs.vehicle.vehicle import COMS, Vehicle, vehicle_from
+from ..envs.vehicle.vehicle import COMS
+from ..envs.vehicle.vehicles import VehicleSource, vehicle_from
 from .design.assemble import alone, assemble
 from .design.config import configure
 from .estimator import Estimator
@@ -27,7 +28,7 @@ def make_estimator(name: EstimatorFactory, **arguments: Any) -> Estimator | Fore
 def make_estimator(
     name: str | EstimatorFactory,
     *,
-    vehicle: Vehicle | str | Mapping[str, Any] = COMS,
+    vehicle: VehicleSource = COMS,
     sensors: Mapping[str, SlowSensor] | None = None,
     dt: float = TICK,
     speed: float | None = None,
@@ -37,9 +38,9 @@ def make_estimator(
 
     name: of `FILTERS`; or a registered name, an entry point "package.module:Name" or a factory,
     which is called with the arguments below: what it builds comes as a `ForeignEstimator`.
-    vehicle: the filter's, a preset or a mapping. sensors: the slow sensors that are there, by name
-    ("camera", "gps"). dt: seconds of a tick. speed: m/s if it is held; None measures it with the
-    front wheels. options: of a filter of `FILTERS`, those that `FilterConfig` lists.
+    vehicle: the filter's, as `vehicle_from` takes it. sensors: the slow sensors that are there, by
+    name ("camera", "gps"). dt: seconds of a tick. speed: m/s if it is held; None measures it with
+    the front wheels. options: of a filter of `FILTERS`, those that `FilterConfig` lists.
 
     Raises
     ------

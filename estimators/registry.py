@@ -1,10 +1,11 @@
 """Factories by name: those of the package, and those that users register as with Gymnasium."""
 
-import difflib
 import importlib
 import operator
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
+
+from ..envs.arguments import unknown_names
 
 Factory = Callable[..., Any]
 
@@ -52,10 +53,7 @@ class Registry:
             return factory
         if ":" in factory:
             return imported(factory)
-        names = [*self._factories, *others]
-        close = difflib.get_close_matches(name, names, 1)
-        hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(names)}"
-        raise ValueError(f"unknown {self._kind} {name!r}; {hint}")
+        raise ValueError(unknown_names(self._kind, [name], [*self._factories, *others]))
 
     def __contains__(self, name: object) -> bool:
         return name in self._factories

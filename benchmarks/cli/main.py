@@ -33,6 +33,7 @@ Mapping = Annotated[
     list[str] | None,
     typer.Option("--map", help="NAME_UNIT=COLUMN of the log (yaw_rate_degps=r); repeatable."),
 ]
+Vehicle = Annotated[str | None, typer.Option(help="The car: a name or a TOML or JSON file.")]
 Jobs = Annotated[int | None, typer.Option("--jobs", "-j", min=1, help="Processes.")]
 
 
@@ -70,7 +71,7 @@ def list_names() -> None:
     from ...agents import AGENTS
     from ...agents.learned.files import shipped
     from ...envs.scenarios.manoeuvres import SCENARIOS
-    from ...envs.vehicle.vehicle import VEHICLES
+    from ...envs.vehicle.vehicles import VEHICLES
     from ...estimators.make import ESTIMATORS
 
     for title, names in {
@@ -118,7 +119,7 @@ def bench(
     suites: Annotated[list[str] | None, typer.Argument(help="Suites; default: all.")] = None,
     quick: Quick = False,
     log: Annotated[Path | None, typer.Option(help="Replay this recorded drive too.")] = None,
-    vehicle: Annotated[Path | None, typer.Option(help="The vehicle of the recorded drive.")] = None,
+    vehicle: Vehicle = None,
     mapping: Mapping = None,
     html: Html = None,
     json: Json = None,
@@ -161,7 +162,7 @@ def bench(
 @app.command()
 def replay(
     log: Annotated[Path, typer.Argument(help="A recorded drive, CSV or Parquet.")],
-    vehicle: Annotated[Path | None, typer.Option(help="The car: TOML or JSON.")] = None,
+    vehicle: Vehicle = None,
     mapping: Mapping = None,
     course_rate: Annotated[float, typer.Option(help="Hz of the emulated course.")] = 10.0,
     course_noise: Annotated[float, typer.Option(help="deg, standard deviation.")] = 0.5,

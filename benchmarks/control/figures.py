@@ -8,7 +8,7 @@ import numpy as np
 from ...agents import make_agent
 from ...agents.rollout import Rollout, rollout
 from ...envs.record import Array
-from ...envs.vehicle.vehicle import VEHICLES
+from ...envs.vehicle.vehicles import VEHICLES
 from ..harness.drives import make_env
 from ..harness.explorer import Explorer, Panel
 from ..harness.results import Suite

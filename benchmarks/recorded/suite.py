@@ -13,14 +13,14 @@ from ...envs.record import Log
 from ...envs.recordings.columns import parse_mapping
 from ...envs.recordings.log_file import read_log
 from ...envs.vehicle.vehicle import Vehicle
+from ...envs.vehicle.vehicles import VehicleSource, vehicle_from
 from ..harness.drives import SETTLED
 from ..harness.results import Row, Suite, Table
 from ..harness.stats import Estimate
 from .emulate import path
 from .run import ESTIMATORS, GYRO_ONLY, Result, Settings, drives_of, run_estimators
-from .vehicles import read_vehicle
 
-__all__ = ["Settings", "corners", "read_vehicle", "replay", "replay_file"]
+__all__ = ["Settings", "corners", "replay", "replay_file"]
 
 CORNERS = ((0.7, 0.7), (0.7, 1.3), (1.3, 0.7), (1.3, 1.3))
 FITTED, NOMINAL = "ferrari-250lm-fitted", "ferrari-250lm-nominal"
@@ -83,21 +83,21 @@ def corners(log: Log, vehicle: Vehicle, **settings: Any) -> Suite:
 
 def replay_file(
     log: str | Path,
-    vehicle: str | Path | None = None,
+    vehicle: VehicleSource | None = None,
     *,
     mapping: Sequence[str] | None = None,
     **settings: Any,
 ) -> Suite:
     """Read a drive and its vehicle, replay it, and where it has truth the vehicle's corners too.
 
-    vehicle: a TOML or JSON file, or the name of one that comes with the package. None: the Ferrari
+    vehicle: of `vehicle_from`: a name or a TOML or JSON file. None: the Ferrari
     250 LM of the Stanford log, with the fitted tyres x 0.7, and the corners of the nominal one.
     mapping: texts such as "steer_rad=Delta". settings: of `replay`. Raises what `read_log`,
-    `read_vehicle` and `replay` do.
+    `vehicle_from` and `replay` do.
     """
     drive = read_log(log, parse_mapping(mapping or ()))
     if vehicle is None:
-        fitted, nominal = read_vehicle(FITTED), read_vehicle(NOMINAL)
+        fitted, nominal = vehicle_from(FITTED), vehicle_from(NOMINAL)
         suite = replay(drive, fitted, **{"stiffness_factor": FACTOR} | settings)
         suite.text += (
             "\n\nNo vehicle was named, so the estimators assume the Ferrari 250 LM of the "
@@ -105,7 +105,7 @@ def replay_file(
             "`--vehicle FILE`."
         )
     else:
-        nominal = read_vehicle(vehicle)
+        nominal = vehicle_from(vehicle)
         suite = replay(drive, nominal, **settings)
     if "beta" in drive.truth:
         wrong = corners(drive, nominal, **settings)

@@ -19,7 +19,8 @@ from ..sensors.slow import SENSOR_SETS, with_changes
 from ..task.observation import Entry, observation_layout
 from ..ticks import TICK, ticks
 from ..vehicle.dynamics import Motion
-from ..vehicle.vehicle import Vehicle, vehicle_from
+from ..vehicle.vehicle import Vehicle
+from ..vehicle.vehicles import vehicle_from
 from .packing import EpisodeConfig, episode_config
 
 

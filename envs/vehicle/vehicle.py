@@ -2,11 +2,10 @@
 
 import dataclasses
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from ..arguments import LARGEST, brief, check_choice, is_finite, listed
+from ..arguments import LARGEST, brief, is_finite
 
 GRAVITY = 9.81
 
@@ -179,78 +178,3 @@ PASSENGER_CAR = Vehicle(  # a compact electric car with two 700 N m in-wheel mot
     roll_stiffness=90000.0,  # 3.9 degrees of roll at 1 g
     roll_damping=4000.0,  # a quarter of the critical damping
 )
-
-VEHICLES: dict[str, Vehicle] = {"coms": COMS, "passenger-car": PASSENGER_CAR}
-
-_LATERAL = (
-    "mass",
-    "yaw_inertia",
-    "front_arm",
-    "rear_arm",
-    "front_stiffness",
-    "rear_stiffness",
-)
-_STIFFNESS_KEYS = {
-    f"{axle}_stiffness{suffix}": (f"{axle}_stiffness", factor)
-    for axle in ("front", "rear")
-    for suffix, factor in (("_per_tyre", 1.0), ("_axle", 0.5))
-}
-
-
-def vehicle_from(source: "str | Vehicle | Mapping[str, Any]") -> Vehicle:
-    """A vehicle from a preset's name, a mapping of parameters, or a vehicle itself.
-
-    A mapping may name a preset to start from under `"base"`. Raises ValueError for an unknown
-    preset, TypeError for an unknown or missing parameter and for another type.
-    """
-    if isinstance(source, Vehicle):
-        return source
-    if isinstance(source, str):
-        check_choice("vehicle", source, VEHICLES)
-        return VEHICLES[source]
-    if not isinstance(source, Mapping):
-        raise TypeError(f"a vehicle is a name or a mapping of parameters, got {brief(source)}")
-    values = dict(source)
-    base = values.pop("base", None)
-    known = {entry.name for entry in dataclasses.fields(Vehicle)}
-    unknown = sorted(set(values) - known, key=str)
-    if unknown:
-        raise TypeError(f"unknown vehicle parameter {listed(map(brief, unknown))}")
-    if base is not None:
-        return vehicle_from(base).replace(**values)
-    return Vehicle(**values)
-
-
-def vehicle_from_file_values(values: Mapping[str, Any], where: str) -> Vehicle:
-    """A vehicle from a file's keys, where the stiffness keys must name their convention.
-
-    `front_stiffness_per_tyre` or `front_stiffness_axle` (two tyres together), and so for the
-    rear. A file may start from a preset under `base`; without one it must give what the lateral
-    motion depends on (mass, inertia, arms, stiffnesses), and the rest (tracks, wheel radius, ...)
-    is the passenger car's.
-
-    Raises ValueError if a stiffness has no convention or a needed key is missing, TypeError for
-    an unknown key.
-    """
-    read: dict[str, Any] = {"base": "passenger-car"}
-    for key, value in values.items():
-        if key in ("front_stiffness", "rear_stiffness"):
-            raise ValueError(f"{where}: {key!r} must say {key}_per_tyre or {key}_axle")
-        if key in _STIFFNESS_KEYS:
-            name, factor = _STIFFNESS_KEYS[key]
-            if name in read:
-                raise ValueError(f"{where}: {name} is given twice")
-            if not is_finite(value):
-                kind = ValueError if isinstance(value, int | float) else TypeError
-                raise kind(f"{where}: {key}: expected a number, got {brief(value)}")
-            read[name] = value * factor
-        else:
-            read[key] = value
-    try:
-        vehicle = vehicle_from(read)
-    except (TypeError, ValueError) as error:
-        raise type(error)(f"{where}: {error}") from None
-    missing = [name for name in _LATERAL if name not in read]
-    if missing and "base" not in values:
-        raise ValueError(f"{where}: missing {', '.join(missing)} (or name a preset under 'base')")
-    return vehicle

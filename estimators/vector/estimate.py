@@ -13,7 +13,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
 from ...envs.task.observation import Entry
-from ...envs.vehicle.vehicle import Vehicle
+from ...envs.vehicle.vehicles import VehicleSource
 from ..wrappers.arguments import Arguments, Setup, Source
 from ..wrappers.estimate import EstimateObservation as Single
 from ..wrappers.outputs import BETA, NEES, outputs_of
@@ -57,7 +57,7 @@ class EstimateObservation(
         outputs: Sequence[str] = ("beta", "gamma"),
         std: bool = True,
         replace: bool = False,
-        vehicle: str | Mapping[str, Any] | Vehicle | None = None,
+        vehicle: VehicleSource | None = None,
         options: Mapping[str, Any] | None = None,
         name: str | None = None,
     ) -> None:

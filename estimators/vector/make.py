@@ -1,20 +1,20 @@
 """Batches of estimators from a name or a factory."""
 
 import functools
+import os
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from ...envs.ticks import TICK
-from ...envs.vehicle.vehicle import COMS, Vehicle, vehicle_from
+from ...envs.vehicle.vehicle import COMS, Vehicle
+from ...envs.vehicle.vehicles import VehicleSource, vehicle_from
 from ..filters import FILTERS
 from ..protocol import EstimatorFactory, ForeignEstimator, label_of
 from ..wrappers.arguments import Setup, build
 from .batch import BatchEstimator, Sensors
 from .foreign import ForeignBatch
-
-Car = Vehicle | str | Mapping[str, Any]
 
 
 def batch_of(
@@ -36,7 +36,7 @@ def make_batch(
     name: str | EstimatorFactory,
     count: int,
     *,
-    vehicle: Car | Sequence[Car] = COMS,
+    vehicle: VehicleSource | Sequence[VehicleSource] = COMS,
     sensors: Sensors | Sequence[Sensors] | None = None,
     dt: float = TICK,
     speed: float | Sequence[float | None] | None = None,
@@ -49,7 +49,7 @@ def make_batch(
     """
     if count < 1:
         raise ValueError(f"{label_of(name)}: a batch has at least one filter, got {count}")
-    cars = _each("vehicle", vehicle, count, (Vehicle, str, Mapping))
+    cars = _each("vehicle", vehicle, count, (Vehicle, str, os.PathLike, Mapping))
     clocks = _each("sensors", sensors or {}, count, (Mapping,))
     speeds = _each("speed", speed, count, (int, float, np.number, type(None)))
     setups = [Setup(vehicle_from(c), s, v) for c, s, v in zip(cars, clocks, speeds, strict=True)]

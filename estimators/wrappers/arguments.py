@@ -5,7 +5,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, NoReturn
 
 from ...envs.sensors.link import SlowSensor
-from ...envs.vehicle.vehicle import Vehicle, vehicle_from
+from ...envs.vehicle.vehicle import Vehicle
+from ...envs.vehicle.vehicles import VehicleSource, vehicle_from
 from ..estimator import Estimator
 from ..make import make_estimator
 from ..protocol import EstimatorFactory, EstimatorLike, ForeignEstimator, label_of
@@ -59,7 +60,7 @@ class Arguments:
         outputs: Sequence[str],
         std: bool,
         replace: bool,
-        vehicle: str | Mapping[str, Any] | Vehicle | None,
+        vehicle: VehicleSource | None,
         options: Mapping[str, Any] | None,
         name: str | None,
         slow_sensors: Iterable[str],

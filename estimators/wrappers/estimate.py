@@ -10,7 +10,7 @@ from gymnasium.utils import RecordConstructorArgs
 from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker
 
 from ...envs.task.observation import Entry
-from ...envs.vehicle.vehicle import Vehicle
+from ...envs.vehicle.vehicles import VehicleSource
 from ..estimator import Estimator
 from .arguments import AnyEstimator, Arguments, Setup, Source, setup_of
 from .kernel import observe_entry
@@ -67,7 +67,7 @@ class EstimateObservation(
         outputs: Sequence[str] = ("beta", "gamma"),
         std: bool = True,
         replace: bool = False,
-        vehicle: str | Mapping[str, Any] | Vehicle | None = None,
+        vehicle: VehicleSource | None = None,
         options: Mapping[str, Any] | None = None,
         name: str | None = None,
     ) -> None:

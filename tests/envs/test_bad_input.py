@@ -21,10 +21,10 @@ ARGUMENTS: list[tuple[Arguments, type[Exception], str]] = [
         ValueError,
         "unknown sensors 'radar'; known: vision, ",
     ),
-    ({"scenario": "slalon"}, ValueError, "unknown scenario 'slalon'; known: random-steering"),
+    ({"scenario": "slalon"}, ValueError, "unknown scenario 'slalon'; did you mean 'slalom'"),
     ({"scenario": {"speeed": 1.0}}, TypeError, "unknown scenario field 'speeed'"),
     ({"scenario": {"duration": -1.0}}, ValueError, "'custom': duration -1.0"),
-    ({"vehicle": "comms"}, ValueError, "unknown vehicle 'comms'; known: coms"),
+    ({"vehicle": "comms"}, ValueError, "unknown vehicle 'comms'; did you mean 'coms'"),
     (
         {"vehicle": {"base": "coms", "mass": 0.0}},
         ValueError,
@@ -41,7 +41,7 @@ ARGUMENTS: list[tuple[Arguments, type[Exception], str]] = [
     (
         {"reference": "slip"},
         ValueError,
-        "unknown reference 'slip'; known: zero-slip",
+        "unknown reference 'slip'; did you mean 'zero-slip'",
     ),
     ({"fast": "some"}, ValueError, "fast is 'summary' or 'all', got 'some'"),
     ({"on_bad_action": "shrug"}, ValueError, "on_bad_action is 'raise' or 'fail', got 'shrug'"),

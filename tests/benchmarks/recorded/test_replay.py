@@ -12,10 +12,10 @@ from sideslip.benchmarks.harness.results import Suite, read_json, write_json
 from sideslip.benchmarks.recorded.emulate import Emulation, heading
 from sideslip.benchmarks.recorded.run import ESTIMATORS, GYRO_ONLY
 from sideslip.benchmarks.recorded.suite import corners, replay, replay_file
-from sideslip.benchmarks.recorded.vehicles import read_vehicle
 from sideslip.envs.record import Log
 from sideslip.envs.recordings.log_file import read_log
 from sideslip.envs.vehicle.vehicle import PASSENGER_CAR
+from sideslip.envs.vehicle.vehicles import vehicle_from
 from sideslip.estimators import make_estimator
 
 from .slalom import ROWS, VEHICLE, columns, saved
@@ -185,7 +185,7 @@ def test_the_stanford_drive_reaches_its_numbers() -> None:
     """Told the fitted car x 0.7: PAPERS section 4 has 1.11 deg gyro only, multirate 0.50-0.53."""
     suite = replay(
         read_log(STANFORD),
-        read_vehicle("ferrari-250lm-fitted"),
+        vehicle_from("ferrari-250lm-fitted"),
         stiffness_factor=0.7,
         estimators=["multirate-kf"],
         seeds=3,

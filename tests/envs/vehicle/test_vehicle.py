@@ -1,14 +1,12 @@
 """Vehicles: Table I, the critical speed, and what is refused."""
 
 import dataclasses
-import json
 import math
 from typing import Any
 
 import pytest
 
-from sideslip.envs import COMS, PASSENGER_CAR, VEHICLES, Vehicle, critical_speed, vehicle_from
-from sideslip.envs.vehicle.vehicle import vehicle_from_file_values
+from sideslip.envs import COMS, PASSENGER_CAR, VEHICLES, Vehicle, critical_speed
 
 pytestmark = pytest.mark.plain
 
@@ -77,64 +75,6 @@ def test_scaled_scales_the_stiffness_only() -> None:
     apart = COMS.scaled(0.7, 1.3)
     assert (apart.front_stiffness, apart.rear_stiffness) == (4200.0, 7800.0)
     assert apart.replace(front_stiffness=6000.0, rear_stiffness=6000.0) == COMS
-
-
-@pytest.mark.parametrize("vehicle", VEHICLES.values(), ids=VEHICLES)
-def test_round_trip_through_json(vehicle: Vehicle) -> None:
-    assert vehicle_from(json.loads(json.dumps(vehicle.to_dict()))) == vehicle
-    assert vehicle_from(vehicle.name) is vehicle
-    assert vehicle_from(vehicle) is vehicle
-
-
-def test_a_mapping_may_start_from_a_preset() -> None:
-    assert vehicle_from({"base": "coms", "mass": 400.0}) == COMS.replace(mass=400.0)
-    assert vehicle_from({"base": COMS}) == COMS
-
-
-def test_unknown_vehicle_and_parameter_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"unknown vehicle 'comms'; known: coms, passenger-car"):
-        vehicle_from("comms")
-    with pytest.raises(TypeError, match="unknown vehicle parameter 'masss'"):
-        vehicle_from({"base": "coms", "masss": 1.0})
-    with pytest.raises(TypeError, match="yaw_inertia"):
-        vehicle_from({"mass": 380.0})
-    with pytest.raises(TypeError, match="masss"):
-        COMS.replace(masss=1.0)
-
-
-def test_a_file_names_its_stiffness_convention() -> None:
-    per_tyre = {"front_stiffness_per_tyre": 2e4, "rear_stiffness_per_tyre": 3e4}
-    axle = {"front_stiffness_axle": 4e4, "rear_stiffness_axle": 6e4}
-    expected = PASSENGER_CAR.scaled(2e4 / 55000.0, 3e4 / 60000.0)
-    for values in (per_tyre, axle):
-        read = vehicle_from_file_values({"base": "passenger-car", **values}, "car.json")
-        assert read.front_stiffness == pytest.approx(expected.front_stiffness, rel=1e-15)
-        assert read.rear_stiffness == pytest.approx(expected.rear_stiffness, rel=1e-15)
-        assert read.mass == PASSENGER_CAR.mass
-    assert vehicle_from_file_values({"base": "coms"}, "car.json") == COMS
-
-
-def test_bad_vehicle_files_are_refused_with_their_name() -> None:
-    for key in ("front_stiffness", "rear_stiffness"):
-        with pytest.raises(ValueError, match=rf"car\.json: '{key}' must say {key}_per_tyre or"):
-            vehicle_from_file_values({key: 4e4}, "car.json")
-    with pytest.raises(
-        ValueError, match=r"car\.json: missing mass, yaw_inertia, front_arm, rear_arm"
-    ):
-        vehicle_from_file_values(
-            {"front_stiffness_axle": 4e4, "rear_stiffness_axle": 5e4}, "car.json"
-        )
-    twice = {"front_stiffness_axle": 4e4, "front_stiffness_per_tyre": 2e4}
-    with pytest.raises(ValueError, match=r"car\.json: front_stiffness is given twice"):
-        vehicle_from_file_values(twice, "car.json")
-    with pytest.raises(TypeError, match=r"car\.json: unknown vehicle parameter 'colour'"):
-        vehicle_from_file_values({"colour": "red"}, "car.json")
-    with pytest.raises(ValueError, match=r"car\.json: Vehicle\.mass: -1\.0 kg"):
-        vehicle_from_file_values({"mass": -1.0}, "car.json")
-    with pytest.raises(ValueError, match=r"car\.json: unknown vehicle 'tank'"):
-        vehicle_from_file_values({"base": "tank"}, "car.json")
-    with pytest.raises(TypeError, match=r"car\.json: .*front_stiffness_axle"):
-        vehicle_from_file_values({"front_stiffness_axle": "stiff"}, "car.json")
 
 
 def test_a_body_that_falls_over_or_has_no_inertia_cannot_roll() -> None:

@@ -1,0 +1,96 @@
+"""Vehicles by name, from files and from mappings: one reader for whatever takes a vehicle."""
+
+import dataclasses
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from ..arguments import brief, check_choice, is_finite, unknown_names
+from ..documents import is_path, read_document
+from .vehicle import COMS, PASSENGER_CAR, Vehicle
+
+VehicleSource = str | os.PathLike[str] | Mapping[str, Any] | Vehicle
+"""What `vehicle_from` takes."""
+
+_LATERAL = ("mass", "yaw_inertia", "front_arm", "rear_arm", "front_stiffness", "rear_stiffness")
+_STIFFNESS = ("front_stiffness", "rear_stiffness")
+_CONVENTIONS = {"_per_tyre": 1.0, "_axle": 0.5}  # tyres' share of the number
+_FIELDS = [entry.name for entry in dataclasses.fields(Vehicle)]
+
+
+def vehicle_from(source: VehicleSource) -> Vehicle:
+    """A vehicle from its name in `VEHICLES`, a TOML or JSON file, or a mapping of parameters.
+
+    Keys are those of `Vehicle`. A cornering stiffness is `front_stiffness_per_tyre` or
+    `front_stiffness_axle` (both tyres together), and so for the rear; a mapping's
+    `front_stiffness` is per tyre, as in `Vehicle`, a file's is refused. What is left out is that
+    of the vehicle under `base` (a name or another file); without one it is the passenger car's,
+    except for mass, inertia, arms and stiffnesses, which must be there. A file without a `name`
+    has that of the file.
+
+    Raises FileNotFoundError; ValueError for an unknown name, a file that cannot be read, a missing
+    parameter, a stiffness of no convention or of two, and a value out of place; TypeError for an
+    unknown parameter, one that is no number, and another kind of source. Messages name the file.
+    """
+    if isinstance(source, Vehicle):
+        return source
+    if isinstance(source, Mapping):
+        return _vehicle_of(dict(source))
+    if is_path(source):
+        return _vehicle_in(Path(source))
+    if not isinstance(source, str):
+        raise TypeError(
+            "a vehicle is a name, the path of a TOML or JSON file or a mapping of parameters, "
+            f"got {brief(source)}"
+        )
+    check_choice("vehicle", source, VEHICLES)
+    return VEHICLES[source]
+
+
+def _vehicle_in(path: Path) -> Vehicle:
+    values = read_document(path, "vehicle")
+    try:
+        for name in _STIFFNESS:
+            if name in values:
+                raise ValueError(f"{name} must name its convention: {_key(name)}")
+        return _vehicle_of({"name": path.stem} | values)
+    except RecursionError:
+        raise ValueError(f"{path}: its base leads back to it") from None
+    except (TypeError, ValueError) as error:
+        raise type(error)(f"{path}: {error}") from None
+
+
+def _key(name: str) -> str:
+    """A parameter's key, both where a stiffness has two."""
+    return " or ".join(map(name.__add__, _CONVENTIONS)) if name in _STIFFNESS else name
+
+
+def _vehicle_of(values: dict[str, Any]) -> Vehicle:
+    """A vehicle of a mapping, whose stiffnesses become those of a tyre."""
+    based = "base" in values
+    base = vehicle_from(values.pop("base", PASSENGER_CAR.replace(name="vehicle")))
+    for name in _STIFFNESS:
+        there = [key for key in (name, *map(name.__add__, _CONVENTIONS)) if key in values]
+        if len(there) > 1:
+            raise ValueError(f"{' and '.join(there)} exclude each other: one convention an axle")
+        for convention, share in _CONVENTIONS.items():
+            if name + convention in values:
+                value = values.pop(name + convention)
+                values[name] = value * share if is_finite(value) else value  # refused by `Vehicle`
+    if unknown := [key for key in values if key not in _FIELDS]:
+        keys = [*_FIELDS, "base", *(name + each for name in _STIFFNESS for each in _CONVENTIONS)]
+        raise TypeError(unknown_names("vehicle parameter", unknown, keys))
+    missing = [name for name in _LATERAL if name not in values]
+    if missing and not based:
+        raise ValueError(
+            f"missing {', '.join(map(_key, missing))} (or name a vehicle under 'base')"
+        )
+    return base.replace(**values)
+
+
+VEHICLES: dict[str, Vehicle] = {"coms": COMS, "passenger-car": PASSENGER_CAR}
+"""Every vehicle that has a name: two presets, and those of recorded drives, from files."""
+
+for _path in sorted((Path(__file__).parent / "presets").glob("*.toml")):
+    VEHICLES[_path.stem] = _vehicle_in(_path)

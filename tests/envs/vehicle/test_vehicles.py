@@ -1,0 +1,141 @@
+"""One reader of vehicles: names, files and mappings; each refuses what is out of place."""
+
+import json
+from pathlib import Path
+
+import gymnasium as gym
+import pytest
+
+from sideslip.envs import COMS, PASSENGER_CAR, VEHICLES, Vehicle, vehicle_from
+from sideslip.envs.documents import write_document
+
+pytestmark = pytest.mark.plain
+
+TOML = """\
+name = "mine"
+mass = 1500
+yaw_inertia = 2400
+front_arm = 1.2
+rear_arm = 1.5
+front_stiffness_axle = 110000.0
+rear_stiffness_per_tyre = 60000.0
+"""
+
+
+def test_a_file_is_toml_or_json(tmp_path: Path) -> None:
+    toml, other = tmp_path / "mine.toml", tmp_path / "mine.json"
+    toml.write_text(TOML)
+    lines = [line.partition(" = ") for line in TOML.splitlines()]
+    values = {key: json.loads(value) for key, _, value in lines}
+    other.write_text(json.dumps(values))
+    expected = PASSENGER_CAR.replace(name="mine")
+    assert vehicle_from(toml) == vehicle_from(str(other)) == vehicle_from(values) == expected
+    toml.write_text(TOML.partition("\n")[2])
+    assert vehicle_from(toml).name == "mine"  # the file's
+    other.write_text('{"base": "mine.toml", "mass": 1600}')  # beside it
+    assert vehicle_from(other) == expected.replace(mass=1600)
+
+
+@pytest.mark.parametrize("vehicle", VEHICLES.values(), ids=VEHICLES)
+def test_round_trip(tmp_path: Path, vehicle: Vehicle) -> None:
+    assert vehicle_from(json.loads(json.dumps(vehicle.to_dict()))) == vehicle
+    assert vehicle_from(vehicle.name) is vehicle_from(vehicle) is vehicle
+    keys = {f"{axle}_stiffness": f"{axle}_stiffness_per_tyre" for axle in ("front", "rear")}
+    values = {keys.get(key, key): value for key, value in vehicle.to_dict().items()}
+    for ending in ("toml", "json"):
+        write_document(tmp_path / f"car.{ending}", values)
+        assert vehicle_from(tmp_path / f"car.{ending}") == vehicle
+
+
+def test_a_mapping_may_start_from_another_vehicle() -> None:
+    assert vehicle_from({"base": "coms", "mass": 400.0}) == COMS.replace(mass=400.0)
+    assert vehicle_from({"base": COMS}) == COMS
+    axle = {"front_stiffness_axle": 9000.0, "rear_stiffness": 5000.0}
+    assert vehicle_from({"base": "coms"} | axle).front_stiffness == 4500.0
+    assert vehicle_from({"base": "coms"} | axle).rear_stiffness == 5000.0
+
+
+@pytest.mark.parametrize(
+    ("values", "error", "message"),
+    [
+        ("comms", ValueError, "unknown vehicle 'comms'; did you mean 'coms'"),
+        ({"base": "coms", "masss": 1.0}, TypeError, "parameter 'masss'; did you mean 'mass'"),
+        ({"mass": 380.0}, ValueError, "missing yaw_inertia, front_arm, .* or front_stiffness_axle"),
+        ({"front_stiffness": 1e4, "front_stiffness_axle": 2e4}, ValueError, "exclude each other"),
+        (5, TypeError, "a vehicle is a name, the path of"),
+    ],
+)
+def test_what_is_no_vehicle(values: object, error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message):
+        vehicle_from(values)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("content", "error", "message"),
+    [
+        ("", ValueError, "holds nothing"),
+        ("mass = ", ValueError, "expected TOML, but"),
+        (
+            TOML.replace("_axle", ""),
+            ValueError,
+            "front_stiffness must name its convention: front_stiffness_per_tyre or front_stiff",
+        ),
+        (
+            TOML + "front_stiffness_per_tyre = 55000.0",
+            ValueError,
+            "front_stiffness_per_tyre and front_stiffness_axle exclude each other",
+        ),
+        (TOML.replace("1500", "-1500"), ValueError, "mass: -1500 kg is not positive"),
+        (TOML.replace("1500", '"heavy"'), TypeError, "mass: expected a number, got 'heavy'"),
+        (TOML + "wings = 2\n", TypeError, "unknown vehicle parameter 'wings'"),
+        (TOML.replace("1500", "1" * 300), ValueError, "Vehicle.mass: 1111"),
+        (TOML.replace("1500", "1" * 5000), ValueError, "expected TOML, but Exceeds"),
+        (TOML.replace("110000.0", "1" * 400), ValueError, "front_stiffness: 111"),
+        (TOML.replace("1500", "1e-300"), ValueError, "mass: 1e-300 kg is not positive"),
+        (TOML.replace("1500", "true"), TypeError, "mass: expected a number, got True"),
+        ("mass = " + "[" * 3000 + "]" * 3000, ValueError, "nested too deeply"),
+        (TOML.replace("mass", "mass" + ".mass" * 3000), TypeError, "mass: expected a number"),
+        (f'"{"key " * 999}" = "text"', TypeError, "unknown vehicle parameter 'key key"),
+        ("".join(f"k{i} = 1\n" for i in range(999)), TypeError, "unknown vehicle parameter 'k0'"),
+        (TOML.replace('"mine"', "5"), TypeError, "name: expected a text, got 5"),
+        ("base = [1]", TypeError, "a vehicle is a name"),
+        ('base = "tank"', ValueError, "unknown vehicle 'tank'"),
+        ('base = "mine.toml"', ValueError, "its base is the file itself"),
+    ],
+    ids=range(20),
+)
+def test_a_bad_file_is_refused(
+    tmp_path: Path, content: str, error: type[Exception], message: str
+) -> None:
+    file = tmp_path / "mine.toml"
+    file.write_text(content)
+    with pytest.raises(error, match=message) as caught:
+        vehicle_from(file)
+    assert str(file) in str(caught.value) and len(str(caught.value)) < 700
+
+
+def test_a_file_that_is_none(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"nowhere\.toml: there is no such vehicle file"):
+        vehicle_from(tmp_path / "nowhere.toml")
+    with pytest.raises(ValueError, match=r"ends in \.toml or \.json"):
+        vehicle_from(tmp_path)
+    (tmp_path / "folder.toml").mkdir()
+    with pytest.raises(ValueError, match="found a folder"):
+        vehicle_from(tmp_path / "folder.toml")
+
+
+@pytest.mark.smoke
+def test_the_vehicles_of_the_stanford_log_come_with_the_package() -> None:
+    """Figures of the recording's source: axle stiffness is twice a tyre's."""
+    nominal, fitted = map(vehicle_from, ("ferrari-250lm-nominal", "ferrari-250lm-fitted"))
+    assert (nominal.mass, nominal.yaw_inertia) == (982.0, 1605.0)
+    assert (nominal.front_stiffness, nominal.rear_stiffness) == (0.35e5, 0.6e5)
+    assert (fitted.front_stiffness, fitted.rear_stiffness) == (2.165e4, 4.29e4)
+    assert fitted.yaw_inertia == 1340.0
+
+
+def test_an_env_takes_what_the_reader_takes(tmp_path: Path) -> None:
+    file = tmp_path / "mine.toml"
+    file.write_text(TOML)
+    env = gym.make("sideslip/YawVision-v0", vehicle=str(file)).unwrapped
+    assert env.config.vehicle.name == "mine"  # type: ignore[attr-defined]
