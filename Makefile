@@ -4,6 +4,10 @@ WORKERS ?= 2
 
 BIN := .venv/bin
 PYTEST := $(BIN)/python -m pytest --confcutdir=tests
+# Work is stolen: each worker has a part of the rooms to itself, so few kernels are compiled in both.
+TOGETHER := -n $(WORKERS) --dist worksteal
+# In the same run: alone, the few examples would import and compile everything once more.
+DOCTESTS := --doctest-modules tests src/sideslip
 # Pip's build environments are pinned as well (the second name is pip 25.3's and later).
 INSTALL := PIP_CONSTRAINT=constraints.txt PIP_BUILD_CONSTRAINT=constraints.txt \
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
@@ -23,20 +27,18 @@ bench-full: .venv/ready-bench ## the same on all seeds: about two CPU-hours; goe
 	$(BIN)/sideslip bench --html report.html --json results.json --keep .bench $(if $(LOG),--log "$(LOG)")
 
 test: .venv/ready-all ## the tests, the examples in docstrings, and the marked tests without compilation
-	$(PYTEST) -n $(WORKERS) -m "not long"
-	$(PYTEST) --doctest-modules src/sideslip
-	NUMBA_DISABLE_JIT=1 $(PYTEST) -n $(WORKERS) -m "plain and not long"
+	$(PYTEST) $(TOGETHER) -m "not long" $(DOCTESTS)
+	NUMBA_DISABLE_JIT=1 $(PYTEST) $(TOGETHER) -m "plain and not compiled and not long"
 
 test-all: .venv/ready-all ## the same with the long tests
-	$(PYTEST) -n $(WORKERS)
-	$(PYTEST) --doctest-modules src/sideslip
-	NUMBA_DISABLE_JIT=1 $(PYTEST) -n $(WORKERS) -m plain
+	$(PYTEST) $(TOGETHER) $(DOCTESTS)
+	NUMBA_DISABLE_JIT=1 $(PYTEST) $(TOGETHER) -m "plain and not compiled"
 
 test-stock: .venv/ready-all ## the smoke tests without our compiler: numba compiles by itself, as its other versions do
-	SIDESLIP_STOCK_NUMBA=1 $(PYTEST) -n $(WORKERS) -m smoke
+	SIDESLIP_STOCK_NUMBA=1 $(PYTEST) $(TOGETHER) -m smoke
 
 coverage: .venv/ready-all ## lines reached by the tests marked plain, without compilation
-	NUMBA_DISABLE_JIT=1 $(BIN)/coverage run -m pytest --confcutdir=tests -m plain
+	NUMBA_DISABLE_JIT=1 $(BIN)/coverage run -m pytest --confcutdir=tests -m "plain and not compiled"
 	$(BIN)/coverage report
 
 lint: .venv/ready-all ## style, format, direction of imports

@@ -17,6 +17,7 @@ from sideslip.envs import FAILURES, StabilityEnv
 from .helpers import IDS, bits, play, unwrapped
 
 pytestmark = [pytest.mark.plain, pytest.mark.parametrize("name", IDS)]
+COMPILED = pytest.mark.compiled
 
 NUMBERS = ("t", "beta", "gamma", "psi", "beta_ref", "gamma_ref", "steer", "yaw_moment", "cost")
 INFO: dict[str, type] = dict.fromkeys(NUMBERS, float) | {"failure": int, "is_success": bool}
@@ -103,7 +104,10 @@ def test_actions_outside_the_box_are_clipped(name: str) -> None:
 
 
 @pytest.mark.smoke
-@pytest.mark.parametrize("way", ["state", "deepcopy", "pickle", "wrapped"])
+@pytest.mark.parametrize(
+    "way",
+    ["state", *(pytest.param(way, marks=COMPILED) for way in ("deepcopy", "pickle", "wrapped"))],
+)
 def test_a_snapshot_continues_bit_for_bit(name: str, way: str) -> None:
     env = unwrapped(name, scenario="slalom")
     env.reset(seed=4, options={"friction": 0.8})

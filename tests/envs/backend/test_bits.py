@@ -124,6 +124,7 @@ EPISODES: list[dict[str, Any]] = [
 ]
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("name", IDS)
 @pytest.mark.parametrize("arguments", EPISODES, ids=str)
 def test_whole_steps(name: str, arguments: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:

@@ -88,6 +88,7 @@ except ValueError as error:
     print(error)
 """
 EXPECTED = [(0.5 * np.sqrt(10.5)).hex(), "offset is not negative"]
+BLEND = "a = np.zeros(3); blend(a, 0.25, np.arange(3.0)); print(a.tolist())"
 
 
 @pytest.fixture
@@ -125,12 +126,15 @@ def run(folder: Path, code: str = USE, **variables: str) -> tuple[list[str], str
 
 
 def test_a_second_process_loads_what_the_first_compiled(folder: Path) -> None:
-    first, notices = run(folder)
-    assert first == EXPECTED
+    """Expressions of whole arrays too, for which numba writes functions that are of no module."""
+    expected = [*EXPECTED, "[0.0, 0.75, 1.5]"]
+    first, notices = run(folder, USE + BLEND)
+    assert first == expected
     assert notices.count("compiling") == 1  # one line, whatever the number of kernels
     files = {path: path.read_bytes() for path in folder.iterdir()}
-    assert [path.name.partition("-")[0] for path in files] == ["tiny.total"]  # no callee
-    assert run(folder) == (EXPECTED, "")
+    names = sorted(path.name.partition("-")[0] for path in files)
+    assert names == ["tiny.blend", "tiny.total"]  # no callee
+    assert run(folder, USE + BLEND) == (expected, "")
     assert {path: path.read_bytes() for path in folder.iterdir()} == files
 
 
@@ -143,13 +147,6 @@ def test_machine_code_is_found_by_a_name_without_a_process_counts(folder: Path) 
     made.unlink()
     assert run(folder, others + code)[0] == ["9.81"]
     assert run(folder, code) == (["9.81"], "")
-
-
-def test_expressions_of_whole_arrays_come_back(folder: Path) -> None:
-    """Numba writes functions of its own for them, which are of no module."""
-    code = "a = np.zeros(3); blend(a, 0.25, np.arange(3.0)); print(a.tolist())"
-    assert run(folder, code)[0] == ["[0.0, 0.75, 1.5]"]
-    assert run(folder, code) == (["[0.0, 0.75, 1.5]"], "")
 
 
 @pytest.mark.parametrize("left", [0, 31, 1000, -1], ids=["empty", "digest", "cut", "last byte"])

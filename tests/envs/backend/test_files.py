@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from sideslip.envs.backend import files
 from sideslip.envs.backend.files import whole, write_whole
 
 
@@ -87,10 +88,10 @@ def test_a_device_is_written_and_stays() -> None:
 
 
 WRITE = """
-import sys
-from sideslip.envs.backend.files import write_whole
+import runpy, sys
+files = runpy.run_path(sys.argv[2])  # without the package, which takes most of a second to import
 print("before", flush=True)
-write_whole(sys.argv[1], b"rows\\n")
+files["write_whole"](sys.argv[1], b"rows\\n")
 print("after")
 """
 
@@ -99,14 +100,12 @@ print("after")
 @pytest.mark.parametrize("to", ["pipe", "file"])
 def test_standard_output_is_written_where_it_goes(name: str, to: str, path: Path) -> None:
     """What is printed before and after stays, also where the shell sends it to a file."""
-    source = Path(__file__).resolve().parents[3] / "src"
-    command = [sys.executable, "-c", WRITE, name]
-    variables = os.environ | {"PYTHONPATH": str(source)}
+    command = [sys.executable, "-c", WRITE, name, files.__file__]
     if to == "pipe":
-        out = subprocess.run(command, env=variables, capture_output=True, check=True).stdout
+        out = subprocess.run(command, capture_output=True, check=True).stdout
     else:
         with path.open("ab") as file:
-            subprocess.run(command, env=variables, stdout=file, check=True)
+            subprocess.run(command, stdout=file, check=True)
         out = path.read_bytes()
         assert os.listdir(path.parent) == ["file"]
     assert out == b"before\nrows\nafter\n"

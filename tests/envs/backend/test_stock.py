@@ -15,14 +15,14 @@ print("sideslip.envs.backend.compiler" in sys.modules)
 """
 
 
-def run(tmp_path: Path, first: str = "", **variables: str) -> tuple[list[str], str]:
+def run(cache: Path, first: str = "", **variables: str) -> tuple[list[str], str]:
     """The lines that a process prints, and what it writes to standard error."""
     others = {
         name: value
         for name, value in os.environ.items()
         if not name.startswith(("NUMBA_", "SIDESLIP_"))
     }
-    variables = {"PYTHONPATH": str(SOURCE), "XDG_CACHE_HOME": str(tmp_path)} | variables
+    variables = {"PYTHONPATH": str(SOURCE), "XDG_CACHE_HOME": str(cache)} | variables
     done = subprocess.run(
         [sys.executable, "-W", "error", "-c", f"import sys, numba\n{first}\n{USE}"],
         env=others | variables,
@@ -32,6 +32,15 @@ def run(tmp_path: Path, first: str = "", **variables: str) -> tuple[list[str], s
     )
     assert done.returncode == 0, done.stderr
     return done.stdout.splitlines(), done.stderr
+
+
+@pytest.fixture(scope="module")
+def ours(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+    """What the process with our compiler prints."""
+    cache = tmp_path_factory.mktemp("ours")
+    printed, _ = run(cache)
+    assert printed[1] == "True" and list(cache.rglob("*.kernel"))
+    return printed
 
 
 @pytest.mark.parametrize(
@@ -44,10 +53,8 @@ def run(tmp_path: Path, first: str = "", **variables: str) -> tuple[list[str], s
     ],
 )
 def test_numba_by_itself_gives_the_same_bits_and_says_so(
-    first: str, variables: dict[str, str], reason: str, tmp_path: Path
+    ours: list[str], first: str, variables: dict[str, str], reason: str, tmp_path: Path
 ) -> None:
-    ours, _ = run(tmp_path / "ours")
-    assert ours[1] == "True" and list((tmp_path / "ours").rglob("*.kernel"))
     stock, notices = run(tmp_path / "stock", first, **variables)
     assert stock == [ours[0], "False"]
     assert len(notices.splitlines()) == 1 and reason in notices

@@ -87,6 +87,7 @@ def test_neighbouring_seeds_and_episodes_share_nothing() -> None:
     assert len(speeds) == 200
 
 
+@pytest.mark.compiled
 def test_the_disturbance_starts_and_stays_stationary() -> None:
     """50 N and 20 N m at every tick, over many episodes."""
     env = StabilityEnv(scenario="tie-vision-fig7", control_period=50)

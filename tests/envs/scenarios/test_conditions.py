@@ -24,6 +24,7 @@ def drawn(changes: dict[str, Any], seed: int, sensors: str = "fusion") -> Stabil
     return env
 
 
+@pytest.mark.compiled
 def test_the_mean_error_of_an_episode_is_the_drawn_bias() -> None:
     ranges = {"gyro_bias": (-0.01, 0.01), "accel_y_bias": (-0.3, 0.2)}
     loud = {"gyro": 0.005, "accel": 0.1}
@@ -59,6 +60,7 @@ def gps_of(env: StabilityEnv) -> Any:
     return packets[packets[:, PACKET.sensor] == GPS]
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("delays", [(0.0,), (0.02, 0.05)])
 def test_gps_packets_arrive_later_by_one_latency_and_keep_their_stamps(
     delays: tuple[float, ...],

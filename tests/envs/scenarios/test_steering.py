@@ -132,6 +132,7 @@ def test_lane_change_and_step_end_on_the_old_heading(kind: str) -> None:
     assert angle.max() == pytest.approx(-angle.min(), rel=1e-12)
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("kind", ["lane-change", "step"])
 def test_so_the_linear_car_does_too(kind: str) -> None:
     turning = LINEAR | {"steering": kind, "onset": 0.5, "amplitude": 0.05, "duration": 12.0}
@@ -192,6 +193,7 @@ def test_pi_holds_the_integral_while_the_motors_are_at_their_limit() -> None:
         assert acceleration_command(tick, 3.0, 0.0, given_a_x, 2.0)[0] == expected
 
 
+@pytest.mark.compiled
 def test_speed_is_held_against_the_drag_of_a_turn() -> None:
     turning = FULL | {"steering": "step", "amplitude": 0.05, "hold": 100.0, "duration": 40.0}
     env = StabilityEnv(scenario=turning)
@@ -203,6 +205,7 @@ def test_speed_is_held_against_the_drag_of_a_turn() -> None:
     assert v[-1] == pytest.approx(25.0 / 3.6, abs=1e-5)
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("lags", [False, True])
 def test_a_car_starts_from_standstill(lags: bool) -> None:
     start = FULL | {"speed": 0.0, "acceleration": 1.0, "lags": lags}

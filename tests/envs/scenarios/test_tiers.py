@@ -48,6 +48,7 @@ def test_a_table_of_actions_would_need_every_draw(name: str) -> None:
         assert most <= ranges[scenario.tier][1] * unit + 1e-9
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("name", [name for name in NAMES if not name.startswith("limit")])
 def test_a_car_without_control_mostly_gets_through(name: str) -> None:
     """Otherwise survival alone would decide the score, not how well the car is kept."""

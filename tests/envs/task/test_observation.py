@@ -16,6 +16,7 @@ from sideslip.envs.ticks import TICK
 from ..helpers import FULL, IDS, LINEAR, play, unwrapped
 
 pytestmark = pytest.mark.plain
+COMPILED = pytest.mark.compiled
 
 
 def expected(
@@ -54,7 +55,9 @@ def compare(env: StabilityEnv, obs: np.ndarray, by_name: dict[str, float]) -> No
 
 @pytest.mark.smoke
 @pytest.mark.parametrize("name", IDS)
-@pytest.mark.parametrize("n", [1, 10, 33])
+@pytest.mark.parametrize(
+    "n", [pytest.param(1, marks=COMPILED), 10, pytest.param(33, marks=COMPILED)]
+)
 def test_summary_is_last_mean_newest_age_and_fresh(name: str, n: int) -> None:
     env = unwrapped(name, control_period=n, scenario="slalom", reference="limited")
     seen: dict[str, tuple[float, Any]] = {}

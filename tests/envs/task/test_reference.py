@@ -101,6 +101,7 @@ def test_reward_is_minus_the_cost_written_out_from_the_record(kind: str) -> None
         assert moment.reward == -info["cost"]
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("name", IDS)
 def test_the_return_does_not_depend_on_the_control_period(name: str) -> None:
     returns = []

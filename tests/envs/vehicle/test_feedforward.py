@@ -71,6 +71,7 @@ def test_and_goes_there_from_straight_driving(V_x: float) -> None:
     assert abs(state.v_y / V_x) < 1e-9
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("V_x", [SPEEDS[0], SPEEDS[4], SPEEDS[-1]])
 def test_and_so_does_the_environment(V_x: float) -> None:
     held: dict[str, Any] = helpers.LINEAR | {

@@ -11,6 +11,7 @@ from tests.estimators.filters.test_dual_rate import random_system
 pytestmark = pytest.mark.plain
 
 
+@pytest.mark.compiled
 def test_every_step_has_its_standard_deviation() -> None:
     """Against the spread of the error over many runs with noise of the model's kind."""
     s = random_system(1) | {"disturbed": None, "leak": 1.0, "rate": 0.0, "Q_d": 0.0, "ratio": 4}
