@@ -1,6 +1,7 @@
 """Question: what do steering and yaw moment do together? dakf-stability's bandwidth K, and lanes
 held on curved roads from camera and gyro, the aim of uneven-delay."""
 
+from collections.abc import Sequence
 from functools import partial
 from itertools import islice, product
 from typing import Any
@@ -22,7 +23,8 @@ from ..estimators.vector.estimate import EstimateObservation
 from .harness.drives import quietly
 from .harness.parallel import run_cases
 from .harness.results import Row, Suite, Table
-from .harness.stats import Estimate, interval
+from .harness.stats import Estimate, interval, ratio_of_means
+from .harness.verdict import leader, verdict
 from .papers.ledger.tracking import drive, tracking
 
 BANDWIDTHS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)  # rad/s, K_beta = K_gamma
@@ -113,11 +115,46 @@ def run(
     suite = Suite("following", "What steering and yaw moment do together", _TEXT)
     cases = list(product((0.0, *BANDWIDTHS), range(seeds)))
     found = np.array(run_cases(follow, cases, "bandwidth", jobs, console))
-    _bandwidths(suite, found.reshape(len(BANDWIDTHS) + 1, seeds, -1))
+    found = found.reshape(len(BANDWIDTHS) + 1, seeds, -1)
+    _bandwidths(suite, found)
     keep = partial(keep_lane, cars=cars)
     lanes = run_cases(keep, range(len(KEEPERS)), "lanes", jobs, console)
     _lanes(suite, lanes)
+    suite.verdict = answer(found, lanes)
     return suite
+
+
+def answer(found: Array, lanes: Sequence[Array]) -> str:
+    """The verdict. found: as `_bandwidths` has it; lanes: what `keep_lane` finds, of `KEEPERS`."""
+    over = (found[1:, :, :2].mean(axis=1) / found[0, :, :2].mean(axis=0)).mean(axis=1)
+    sure = [i for i in range(len(BANDWIDTHS)) if not found[1 + i, :, 3].any()]
+    best = min(sure, key=over.__getitem__, default=None)
+    follows = (
+        "Following: every bandwidth has runs that fail."
+        if best is None
+        else f"Following: bandwidth K = {BANDWIDTHS[best]:.0f} rad/s errs least, "
+        f"{100.0 * over[best]:.0f} % of no control's."
+    )
+    lost = [f"{K:.0f}" for i, K in enumerate(BANDWIDTHS) if i not in sure]
+    offset = {_keeper(i): each[:, 0] for i, each in enumerate(lanes) if KEEPERS[i][2] is not None}
+    first, *rest = sorted(offset, key=lambda name: offset[name].mean())
+    ratio = {name: interval(offset[first], ratio_of_means, offset[name]) for name in rest}
+    reads = first.partition(" on ")[2]
+    both, alone = (offset[f"{what} on {reads}"].mean() for what in ("both", "steering alone"))
+    change = f"{100.0 * (both / alone - 1.0):+.0f} %"
+    return verdict(
+        "Steering and the motors' yaw moment, by one controller; bandwidth: how fast it corrects.",
+        follows + (f" Runs fail at {', '.join(lost)}." if lost and sure else ""),
+        f"Lanes: {leader(first, ratio, 'offset')}.",
+        f"Why: yaw moment beside steering changes the {offset[first].mean():.2f} m by {change}; "
+        f"nobody steering: {lanes[0][:, 0].mean():.1f} m.",
+        "Not covered: sharper bends, faster cars, and drivers who steer themselves.",
+    )
+
+
+def _keeper(i: int) -> str:
+    what, estimator, _ = KEEPERS[i]
+    return f"{what} on {estimator}" if what != "none" else what
 
 
 _COLUMNS = {  # what `follow` gives, and what the figure calls it
@@ -158,10 +195,12 @@ def _bandwidths(suite: Suite, found: Array) -> None:
 
 def _lanes(suite: Suite, lanes: list[Array]) -> None:
     cells = []
-    for (what, estimator, _), numbers in zip(KEEPERS, lanes, strict=True):
+    for i, numbers in enumerate(lanes):
+        what, estimator, _ = KEEPERS[i]
         most, slip, left = (interval(column) for column in numbers.T)
-        label = f"{what} on {estimator}" if what != "none" else what
-        cells.append([label, *most.text(), f"{1e3 * slip.value:.1f}", f"{100.0 * left.value:.1f}"])
+        cells.append(
+            [_keeper(i), *most.text(), f"{1e3 * slip.value:.1f}", f"{100.0 * left.value:.1f}"]
+        )
         for metric, each in (("offset", most), ("rms_slip", slip), ("departure_rate", left)):
             who = {"estimator": estimator, "controller": what}
             suite.rows.append(_row(ROAD, metric, each, len(numbers), **who))

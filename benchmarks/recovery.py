@@ -22,10 +22,12 @@ from .control.contests import YAW, Contest
 from .harness.parallel import run_cases
 from .harness.results import Row, ShareMap, Suite, Table
 from .harness.stats import interval
+from .harness.verdict import some, verdict
 
 NAME = "recovery"
 READING = ("two-dof", "esc", "sliding-mode", "lqr")
-CONTROLLERS = ("none", *READING, "nominal", "oracle-state-lqr", "oracle-state-nmpc")
+ORACLES = ("oracle-state-lqr", "oracle-state-nmpc")
+CONTROLLERS = ("none", *READING, "nominal", *ORACLES)
 CAUGHT = 0.05  # rad
 SEEDS, QUICK_SEEDS = 16, 4
 POINTS, QUICK_POINTS = (13, 11), (5, 5)  # of the grid: sideslip angles, yaw rates
@@ -97,8 +99,12 @@ def run(quick: bool = False, jobs: int | None = None, console: Console | None = 
     found = dict(zip(cases, run_cases(saved, cases, NAME, jobs, console), strict=True))
     suite = Suite(NAME, "From where the car is still saved", _TEXT)
     beta, gamma = (np.degrees(axis) for axis in grid(points))
-    for car in CARS:
-        mine = {case.controller: each for case, each in found.items() if case.car == car}
+    cars = {
+        car: {case.controller: each for case, each in found.items() if case.car == car}
+        for car in CARS
+    }
+    suite.verdict = answer(cars)
+    for car, mine in cars.items():
         _tabled(suite, car, mine)
         shares = {name: each.mean(axis=2) for name, each in mine.items()}
         labels = ("sideslip angle / deg", "yaw rate / (deg/s)")
@@ -110,6 +116,32 @@ def run(quick: bool = False, jobs: int | None = None, console: Console | None = 
     text = "Colour: the share of seeds on which the car is saved; the line is at one half."
     suite.figures = [(each.title, share_maps(each), text) for each in suite.maps]
     return suite
+
+
+def answer(cars: Mapping[str, Mapping[str, Array]]) -> str:
+    """The verdict. cars: of each car, by controller what `saved` finds."""
+    firsts, knowing = list[str](), list[str]()
+    for car, mine in cars.items():
+        share = {name: each.mean(axis=(0, 1)) for name, each in mine.items()}  # (seeds,)
+        mean = {name: 100.0 * float(each.mean()) for name, each in share.items()}
+        rivals = sorted((name for name in READING if name in mean), key=lambda name: -mean[name])
+        even = [name for name in rivals if not interval(share[rivals[0]] - share[name]).low > 0.0]
+        best = " and ".join(even) if len(even) < 3 else f"{some(even, 1)}, a tie,"
+        rest = [name for name in rivals if name not in even][:1] + ["none"] * ("none" in mean)
+        others = ", ".join(f"{name} {mean[name]:.0f} %" for name in rest)
+        if rivals:
+            firsts.append(f"{car}: {best} {mean[rivals[0]]:.0f} %; {others}.")
+        known = [mean[name] for name in ORACLES if name in mean]
+        knowing += [f"{most:.0f} %" for most in sorted(known)[-1:]]
+    return verdict(
+        "Cars start sliding and turning and nobody steers; saved: going straight again within 5 s.",
+        *firsts,
+        f"Why: controllers that know the exact motion save {' and '.join(knowing)}; filters must "
+        "find it first."
+        if knowing
+        else "",
+        "Not covered: a driver who steers against the slide, and starts beyond the grid.",
+    )
 
 
 def _tabled(suite: Suite, car: str, mine: Mapping[str, Array]) -> None:

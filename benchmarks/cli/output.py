@@ -97,9 +97,11 @@ _LEAST = 22  # letters that the first column keeps on a narrow screen
 
 
 def print_suite(console: Console, suite: Suite) -> None:
-    """The title, the text, and each table with its note."""
-    console.rule(f"[bold]{suite.title}")
-    console.print(escape(suite.text) + "\n", highlight=False)
+    """The title, the verdict, the text, and each table with its note."""
+    console.rule(f"[bold]{escape(suite.title)}")
+    if suite.verdict:
+        console.print(f"[bold]{escape(suite.verdict)}[/]\n", highlight=False)
+    console.print(f"{escape(suite.text)}\n", highlight=False)
     for table in suite.tables:
         for part in _parts(table, console.width):
             console.print(_rich(part))

@@ -20,7 +20,9 @@ from .cells import Cell
 Array = npt.NDArray[np.float64]
 
 NUMBERS = tuple(metric.name for metric in EPISODE)
-SIGNALS = ("beta", "gamma", "beta_ref", "gamma_ref", "yaw_moment", "steer")
+_INFO = ("t", "beta", "gamma", "beta_ref", "gamma_ref", "yaw_moment", "steer", "psi")
+_PLACE = ("X", "Y")
+SIGNALS = (*_INFO[1:], *_PLACE)
 
 
 @dataclass(frozen=True)
@@ -111,18 +113,21 @@ def _drive(chunk: Chunk) -> Driven:
     env, agent = make_cars(chunk.cell, len(chunk.seeds))
     steps = steps_of(env, agent, list(chunk.seeds))
     reset = next(steps)
-    tally, series = _Tally(env.unwrapped, reset), [_signals(reset.info)]
+    tally, series = _Tally(env.unwrapped, reset), [_signals(env, reset)]
     for step in steps:
         if chunk.keep and step.running[0]:
-            series.append(_signals(step.info))
+            series.append(_signals(env, step))
         tally.add(step)
     env.close()
     spent = time.process_time() - begun
     return Driven(tally.numbers(), spent, np.array(series) if chunk.keep else None)
 
 
-def _signals(infos: dict[str, Any]) -> list[float]:
-    return [float(infos[name][0]) for name in ("t", *SIGNALS)]
+def _signals(env: Any, step: Step) -> list[float]:
+    """The time and SIGNALS of the first car."""
+    motion = env.unwrapped.motion[0]
+    place = [float(motion[Motion._fields.index(name)]) for name in _PLACE]
+    return [float(step.info[name][0]) for name in _INFO] + place
 
 
 def control_period(cell: Cell) -> float:

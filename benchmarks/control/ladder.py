@@ -1,19 +1,20 @@
 """The ladder of rungs: its yardsticks, whether it falls, what each step of knowledge costs, and the
 answer."""
 
-from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
 from ...envs.task.failures import FAILURES
 from ..harness.results import Table
-from ..harness.stats import average, chance_of_no_less, geometric_mean, holm
-from .cells import REFERENCE_CONTROLLER, REFERENCE_FILTER, RUNGS, TRUTH
+from ..harness.stats import Estimate, average, chance_of_no_less, geometric_mean, holm
+from ..harness.verdict import leader, some, verdict
+from .cells import REFERENCE_CONTROLLER, REFERENCE_FILTER, RUNGS, TRUTH, Cell
 from .contests import NOMINAL, PARAMETERS, STATE, TITLES, Contest, oracle_of
+from .delay_price import DELAYS, Price
 from .episodes import Array
 from .run import Results
-from .scores import NOTHING, Yardstick, score, survived
+from .scores import NOTHING, Yardstick, survived
 from .tables import Standing
 
 _OF_THE_CAR = ("none", "spin", "off-road")
@@ -143,57 +144,123 @@ def knowledge_table(results: Results, tiers: Mapping[str, Sequence[Contest]],
     return Table("What not knowing costs", header, cells, note, keyed=False)
 
 
-def answer(found: Mapping[str, Sequence[Standing]]) -> str:
-    """A line a tier: the best estimator and the best controller, and by how much."""
-    return "\n\n".join(_answer_of(tier, each) for tier, each in found.items())
+Gains = dict[Contest, Array]
+"""r of a contestant's episodes in the contests that count."""
 
 
-def _answer_of(tier: str, found: Sequence[Standing]) -> str:
-    filters = [
-        each
-        for each in found
-        if each.cell.controller == REFERENCE_CONTROLLER and each.cell.estimator != TRUTH
+def answer(
+    found: Mapping[str, Sequence[Standing]],
+    prices: Sequence[Price] = (),
+    ahead: Mapping[Contest, Array] | None = None,
+) -> str:
+    """The verdict over all tiers: the best estimator, the best controller, and why.
+
+    ahead: (n,) log(J_oracle-state / J_clairvoyant) of calibrated contests.
+    """
+    filters, others = _estimators(found), _controllers(found)
+    none = others.get("none", {})
+    best = next(iter(_ranked(others)), "")
+    over = _over(others[best], none) if none and best != "none" else None
+    text = f", {100.0 * over.value:.0f} % of no control's" if over else ""
+    episodes = max((len(r) for each in others.values() for r in each.values()), default=0)
+    return verdict(
+        "Estimators infer how the car slides, controllers make torque of it; cost: squared error.",
+        f"Best estimator: {_first(filters)}.",
+        f"Best controller: {_first(others)}{text}.",
+        _why(found, prices, ahead or {}),
+        f"{_elsewhere(found)}Not covered: other cars and roads, and less than {episodes} "
+        "episodes a contest can tell.",
+    )
+
+
+def _estimators(found: Mapping[str, Sequence[Standing]]) -> dict[str, Gains]:
+    """What each estimator under the reference controller gains, the truth left out."""
+    return _gains(found, "estimator", lambda cell: (
+        cell.controller == REFERENCE_CONTROLLER and cell.estimator != TRUTH))  # fmt: skip
+
+
+def _controllers(found: Mapping[str, Sequence[Standing]]) -> dict[str, Gains]:
+    """What each controller on the reference filter, or on none, gains, the rungs left out."""
+    return _gains(found, "controller", lambda cell: (
+        cell.controller not in RUNGS and cell.estimator in ("", REFERENCE_FILTER)))  # fmt: skip
+
+
+def _gains(
+    found: Mapping[str, Sequence[Standing]], attribute: str, among: Callable[[Cell], bool]
+) -> dict[str, Gains]:
+    made: dict[str, Gains] = {}
+    for each in (each for standings in found.values() for each in standings if among(each.cell)):
+        mine = made.setdefault(getattr(each.cell, attribute), {})
+        mine |= {contest: r for contest, (r, _) in each.pairs.items()}
+    return {name: each for name, each in made.items() if each}
+
+
+def _over(one: Gains, other: Gains) -> Estimate:
+    """One's cost over the other's on the contests and seeds of both; NaN where there are none."""
+    both = [(r, other[contest]) for contest, r in one.items() if contest in other]
+    return geometric_mean(*(b[: len(a)] - a[: len(b)] for a, b in both))
+
+
+def _ranked(those: Mapping[str, Gains]) -> dict[str, dict[str, Estimate]]:
+    """Each one's cost over its rivals', the best first: who costs more than the fewest, of these
+    who costs least of nominal's. Rivals that share no contest are left out, the closest first."""
+    over = {
+        name: {other: _over(mine, theirs) for other, theirs in those.items() if other != name}
+        for name, mine in those.items()
+    }
+    beaten = {name: sum(each.value > 1.0 for each in over[name].values()) for name in those}
+    gained = {name: np.mean([r.mean() for r in mine.values()]) for name, mine in those.items()}
+    order = sorted(those, key=lambda name: (beaten[name], -gained[name]))
+    return {
+        name: dict(sorted(
+            ((other, each) for other, each in over[name].items() if np.isfinite(each.value)),
+            key=lambda rival: -rival[1].value,
+        ))
+        for name in order
+    }  # fmt: skip
+
+
+def _first(those: Mapping[str, Gains]) -> str:
+    """Who leads, and by how much."""
+    ranked = _ranked(those)
+    return leader(*next(iter(ranked.items())), "cost") if ranked else "nobody has a score"
+
+
+def _elsewhere(found: Mapping[str, Sequence[Standing]]) -> str:
+    """The tiers in which somebody else surely leads."""
+    parts = []
+    for tier, standings in found.items():
+        for of in (_estimators, _controllers):
+            overall, here = _ranked(of(found)), _ranked(of({tier: standings}))
+            first, best = (next(iter(each), "") for each in (overall, here))
+            if best != first and first in here.get(best, {}) and here[best][first].high < 1.0:
+                parts.append(f"{best} in tier {tier}")
+    return f"But {some(parts)}. " if parts else ""
+
+
+def _why(
+    found: Mapping[str, Sequence[Standing]],
+    prices: Sequence[Price],
+    ahead: Mapping[Contest, Array],
+) -> str:
+    """What the rungs save: the price of the model, of sensing, of foresight and of delay."""
+    every = [each for standings in found.values() for each in standings]
+    rung = [r for each in every if each.cell.controller == PARAMETERS for r in each.pairs.values()]
+    steps = (
+        ("the true car and road", [r for r, _ in rung]),
+        ("its exact motion", [own - r for r, own in rung]),
+        ("what is ahead", list(ahead.values())),
+    )
+    texts = [
+        f"{what} {100.0 * (1.0 - geometric_mean(*(-r for r in logs)).value):.0f} %"
+        for what, logs in steps
+        if logs
     ]
-    others = [
-        each
-        for each in found
-        if each.cell.controller not in RUNGS and each.cell.estimator in ("", REFERENCE_FILTER)
-    ]
-    best = [
-        _first(f"estimator (with {REFERENCE_CONTROLLER})", filters, "estimator"),
-        _first(f"controller (on {REFERENCE_FILTER})", others, "controller"),
-    ]
-    return f"Tier {tier}, {TITLES[tier]}: {'; '.join(best)}."
-
-
-def _first(what: str, found: Sequence[Standing], attribute: str) -> str:
-    """The best of a kind, its score, and its cost over that of the next best one, over the contests
-    that more than one of them drove; who did not drive all of these is left out."""
-    driven = Counter(contest for each in found for contest in each.pairs)
-    shared = [contest for contest, count in driven.items() if count > 1]
-    ranked = [(each, score([each.pairs[c] for c in shared])) for each in found
-              if all(contest in each.pairs for contest in shared)]  # fmt: skip
-    ranked = [(each, number) for each, number in ranked if np.isfinite(number.value)]
-    if not ranked:
-        return f"no {what} has a score"
-    if found[0].by_failures:
-        ranked.sort(key=lambda pair: pair[0].overall["failure_rate"].value)
-    else:
-        ranked.sort(key=lambda pair: -pair[1].value)
-    (best, (value, low, high)), *others = ranked
-    text = f"best {what} {getattr(best.cell, attribute)}, score {value:.2f} [{low:.2f}, {high:.2f}]"
-    if not others:
-        return text
-    second = others[0][0]
-    logs = []
-    for contest in shared:
-        ours, theirs = best.pairs[contest][0], second.pairs[contest][0]
-        n = min(len(ours), len(theirs))  # the first seeds are everybody's
-        logs.append(theirs[:n] - ours[:n])
-    value, low, high = (100.0 * each for each in geometric_mean(*logs))
-    sure = "" if high < 100.0 or low > 100.0 else ", a tie"
-    name = getattr(second.cell, attribute)
-    return f"{text}, {value:.0f} % [{low:.0f}, {high:.0f}] of the cost of {name}{sure}"
+    late = [price.over for price in prices if price.cell.controller == REFERENCE_CONTROLLER]
+    if late and np.isfinite(late[0][-1].value):
+        grown = 100.0 * (late[0][-1].value / late[0][0].value - 1.0)
+        texts.append(f"{DELAYS[-1]:g} s of delay costs {grown:.0f} %")
+    return f"Why: to know saves, one after the other, {', '.join(texts)}." if rung else ""
 
 
 def refusals_of(results: Results, late: float = 0.0) -> list[list[str]]:

@@ -89,9 +89,10 @@ def run(
         prices, late = price_of_delay(seeds[:share], jobs=jobs, console=console, keep=keep)
     suite.rows += _price_rows(prices, share, salt)
     suite.tables += _refusals(results, late)
+    suite.verdict = answer(found, prices, foreseen)
     illustrate(suite, found, results, prices, seeds[0])
     spent = np.nansum([c.seconds for each in (results, there, *late) for c in each.found.values()])
-    suite.text = f"{answer(found)}\n\n{_TEXT} Driven in {spent / 60.0:.1f} CPU-minutes."
+    suite.text = f"{_TEXT} Driven in {spent / 60.0:.1f} CPU-minutes."
     return suite
 
 

@@ -89,9 +89,11 @@ class ShareMap:
 class Suite:
     """The result of a benchmark module: rows for machines, tables and figures for people.
 
-    figures: (title, plotly figure, a sentence on what to see). Empty where the extra `report` is
-    not installed or pictures were not asked for. explorers: figures with menus. maps: for the
-    summary's PNG. files: what the report offers to save, (file name, media type, text).
+    verdict: the answer in plain words, at most five lines (`harness.verdict`). answers: figures
+    that answer a question each: (question, plotly figure, the answer in a sentence). figures: the
+    others, (title, figure, what to see). Both are empty where the extra `report` is not installed
+    or pictures were not asked for. explorers: figures with menus. maps: for the summary's PNG.
+    files: what the report offers to save, (file name, media type, text).
     """
 
     name: str
@@ -103,6 +105,8 @@ class Suite:
     explorers: list[Explorer] = field(default_factory=list)
     maps: list[ShareMap] = field(default_factory=list)
     files: list[tuple[str, str, str]] = field(default_factory=list)
+    verdict: str = ""
+    answers: list[tuple[str, Any, str]] = field(default_factory=list)
 
 
 def check_writable(*paths: Path | None) -> None:

@@ -83,6 +83,11 @@ def ratio_of_roots(squares: Array, reference: Array, axis: int = -1) -> Array:
     return np.asarray(root_mean(squares, axis) / root_mean(reference, axis))
 
 
+def ratio_of_means(values: Array, reference: Array, axis: int = -1) -> Array:
+    """The mean over the mean of a reference on the same seeds."""
+    return np.asarray(mean(values, axis) / mean(reference, axis))
+
+
 def average(*strata: Array) -> Estimate:
     """The mean over strata of the means of their numbers (n_i,), with Student's interval.
 

@@ -9,6 +9,8 @@ from ... import __version__
 from ..harness.parallel import run_cases
 from ..harness.results import VERDICTS, Row, Suite, Table
 from ..harness.stats import Estimate
+from ..harness.verdict import some
+from ..harness.verdict import verdict as lines
 from .claims import CLAIMS, FIGURES, SIMULATIONS
 from .ledger.claim import Claim, Found, Measured, Results, find, verdict
 from .ledger.simulations import joined
@@ -42,16 +44,35 @@ def run(seeds: int = SEEDS, jobs: int | None = None, console: Console | None = N
     """Every simulation once, then every claim on what it gave."""
     results = simulate(seeds, jobs, console)
     ledger = [(claim, find(claim, results)) for claim in CLAIMS]
-    counted = Counter(verdict(found) for _, found in ledger)
-    counts = ", ".join(f"{counted[name]} {name}" for name in VERDICTS if counted[name])
-    suite = Suite(
-        NAME, "Which claims of the papers hold", f"{_TEXT}\n\n{len(ledger)} claims: {counts}."
-    )
+    suite = Suite(NAME, "Which claims of the papers hold", _TEXT)
+    suite.verdict = answer(ledger)
     suite.tables = [_verdicts(ledger), _notes(ledger)]
     suite.tables += [_numbers(ledger, paper) for paper in dict.fromkeys(c.paper for c in CLAIMS)]
     suite.rows = [_row(claim, each, verdict(found)) for claim, found in ledger for each in found]
     _draw(suite, results)
     return suite
+
+
+def answer(ledger: Ledger) -> str:
+    """The verdict: how many claims hold, which do not."""
+    judged = [(claim, verdict(found)) for claim, found in ledger]
+    counted = Counter(each for _, each in judged)
+    papers = dict.fromkeys(claim.paper for claim, _ in judged)
+    whole = {
+        paper: [each for claim, each in judged if claim.paper == paper and each != VERDICTS[-1]]
+        for paper in papers
+    }
+    held = [f"{p} {mine.count(VERDICTS[1])} of {len(mine)}" for p, mine in whole.items() if mine]
+    failed = [_where(claim) for claim, each in judged if each == "not reproduced"]
+    missed = sum(each.threshold_met is False for _, found in ledger for each in found)
+    counts = ", ".join(f"{counted[name]} {name}" for name in VERDICTS if counted[name])
+    return lines(
+        f"{len(ledger)} claims of {len(papers)} papers: {counts}.",
+        f"Reproduced: {'; '.join(held)}.",
+        f"Not reproduced: {some(failed, 3)}. Reasons stand in the table Why." if failed else "",
+        f"{missed} of our own thresholds are missed." if missed else "All our thresholds are met.",
+        "Not covered: the papers' own noise and tuning, which none of them prints.",
+    )
 
 
 def simulate(seeds: int, jobs: int | None = None, console: Console | None = None) -> Results:

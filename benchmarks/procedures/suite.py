@@ -10,8 +10,9 @@ from ...envs.outside.plants import OUTSIDE_PLANTS
 from ...envs.vehicle.vehicle import GRAVITY
 from ..harness.parallel import run_cases
 from ..harness.results import Suite
+from ..harness.verdict import some, verdict
 from . import fmvss126, iso3888, iso4138, iso7401, outside, tables
-from .cases import NAME, Case, Sine, Transient
+from .cases import NAME, Case, Done, Sine, Transient, of
 from .contestants import CARS, CONTESTANTS
 
 SHOWN = 5.0  # of A: the sine with dwell in the figures
@@ -83,6 +84,34 @@ def cases_of(quick: bool) -> list[Case]:
     return cases
 
 
+def answer(done: Done) -> str:
+    """The verdict: on each car, who passes the sine with dwell, and how fast the lanes are."""
+    passed, lanes = [], []
+    for car in CARS:
+        mine = {case: found for case, found in done.items() if case.car == car}
+        sines = {name_of(case): found.result for case, found in of(mine, "fmvss-126").items()}
+        whole = [name for name, each in sines.items() if each.passed]
+        least = min(sines, key=lambda name: sines[name].highest)
+        failing = f"; {least} fails above {sines[least].highest:.3g} A" * (least not in whole)
+        passed.append(f"{car}: {some(whole, 4)}{failing}.")
+        runs = of(mine, next(iter(iso3888.TRACKS)))
+        speeds = {name_of(case): 3.6 * iso3888.highest(each) for case, each in runs.items()}
+        most = max(speeds.values())
+        fast = some([name for name, speed in speeds.items() if speed == most])
+        lanes.append(f"{car} {most:.0f} with {fast} (none {speeds['none']:.0f})")
+    return verdict(
+        "FMVSS 126, no spin after a hard swerve of up to 6.5 A (A: the steering of 0.3 g), passes:",
+        *passed,
+        f"Fastest clean lane change, km/h: {'; '.join(lanes)}.",
+        "Not covered: a real car; outside plants, on equations that are not ours, have a table.",
+    )
+
+
+def name_of(case: Case) -> str:
+    """The controller of a case."""
+    return CONTESTANTS[case.contestant].agent
+
+
 def run(quick: bool = False, jobs: int | None = None, console: Console | None = None) -> Suite:
     """Every procedure for both cars and every contestant, and the outside plants."""
     cases = cases_of(quick)
@@ -90,6 +119,7 @@ def run(quick: bool = False, jobs: int | None = None, console: Console | None = 
     there = any(case.procedure == "outside" for case in cases)
     suite = Suite(NAME, "Standard test procedures", _TEXT + (_OUTSIDE if there else _NONE_OUTSIDE))
     tables.add(suite, done)
+    suite.verdict = answer(done)
     try:
         from . import figures as draw
     except ModuleNotFoundError:

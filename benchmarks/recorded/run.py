@@ -93,9 +93,9 @@ class Result:
         """Median, least and most over the seeds, in rad."""
         return _spread(np.sqrt(self.squares[name]))
 
-    def ratio(self, name: str) -> tuple[float, float, float]:
-        """RMSE over that of the gyro-only estimator, seed by seed: median, least and most."""
-        return _spread(np.sqrt(self.squares[name] / self.squares[GYRO_ONLY]))
+    def ratio(self, name: str, other: str = GYRO_ONLY) -> tuple[float, float, float]:
+        """RMSE over another's, seed by seed: median, least and most."""
+        return _spread(np.sqrt(self.squares[name] / self.squares[other]))
 
 
 def _spread(values: Array) -> tuple[float, float, float]:

@@ -17,6 +17,7 @@ from ...envs.vehicle.vehicles import VehicleSource, vehicle_from
 from ..harness.drives import SETTLED
 from ..harness.results import Row, Suite, Table
 from ..harness.stats import Estimate
+from ..harness.verdict import leader, verdict
 from .emulate import path
 from .run import ESTIMATORS, GYRO_ONLY, Result, Settings, drives_of, run_estimators
 
@@ -51,9 +52,32 @@ def replay(log: Log, vehicle: Vehicle, **settings: Any) -> Suite:
     suite = Suite("replay", f"A recorded drive: {log.name}", _text(log, drives, car, how))
     suite.rows = _rows(result, log.name, car, how)
     suite.tables = [_table(result, log.name, car, len(drives))]
+    suite.verdict = answer(result, "gps" in drives[0].slow and "gps" not in log.slow)
     if how.figures:
         suite.figures = _figures(result, log)
     return suite
+
+
+def answer(result: Result, emulated: bool) -> str:
+    """The verdict. emulated: whether the GPS course is made from the truth."""
+    if not result.squares:
+        return verdict(
+            f"Nobody wins: without the true sideslip angle {len(result.traces)} estimators are "
+            "drawn, not scored.",
+            "Not covered: how far off they are. A log with a true sideslip angle would show it.",
+        )
+    first, *rest = sorted(result.squares, key=lambda name: result.rmse(name)[0])
+    over = {name: Estimate(*result.ratio(first, name)) for name in rest}
+    slow = [name for name in result.squares if name != GYRO_ONLY]
+    gain = f"{GYRO_ONLY}, with the gyro alone, errs {DEGREES * result.rmse(GYRO_ONLY)[0]:.2f} deg"
+    return verdict(
+        "An estimator infers the sideslip angle: between where the car points and where it goes.",
+        f"Closest to the recorded angle: {leader(first, over, 'error')}.",
+        f"Its error: {DEGREES * result.rmse(first)[0]:.2f} deg; brackets: range over noises.",
+        f"Why: {gain}; a slow sensor {'helps' if first in slow else 'does not help'} here.",
+        "Not covered: other drives and cars"
+        + ("; the GPS course is made from the truth, with drawn noise." if emulated else "."),
+    )
 
 
 def corners(log: Log, vehicle: Vehicle, **settings: Any) -> Suite:

@@ -1,11 +1,16 @@
 """The suite speed: everything side by side in one run, and the targets."""
 
+from collections.abc import Mapping
+
 from rich.console import Console
 
-from ..harness.results import Suite
+from ..harness.results import Suite, Table
+from ..harness.verdict import some, verdict
 from . import env_steps, first_use, learning, plant, targets
-from .timing import FULL, QUICK
+from .contestants import three
+from .timing import FULL, QUICK, Taken, spread
 
+RIVALS = (env_steps.CARTPOLE, env_steps.LANE)
 RUNS, QUICK_RUNS = 5, 2  # fresh processes
 
 
@@ -28,4 +33,24 @@ def run(quick: bool = False, console: Console | None = None) -> Suite:
         absent |= away
     seconds, away = first_use.add(suite, QUICK_RUNS if quick else RUNS, compiling=not quick)
     targets.add(suite, taken, seconds, absent | away)
+    suite.verdict = answer(taken, suite.tables[0])
     return suite
+
+
+def answer(taken: Mapping[str, Taken], goals: Table) -> str:
+    """The verdict. taken: CPU us of the contestants; goals: the table of targets."""
+    us = {name: spread(each)[0] for name, each in taken.items()}
+    own = us[env_steps.FUSION]
+    over = [f"{three(us[name] / own)} for {name}" for name in RIVALS if name in us]
+    met = [line[0] for line in goals.cells if line[-1] == "met"]
+    missed = [f"{name} ({measured} of {goal})" for name, goal, measured, _, said in goals.cells
+              if said == "not met"]  # fmt: skip
+    least = f"; not met: {some(missed, 1)}" if missed else ""
+    return verdict(
+        f"10 ms of driving cost {three(own)} us on one core, {three(us[env_steps.AT_ONCE])} us "
+        f"a car where {env_steps.COUNT} drive at once.",
+        f"One env-step of ours is 1; it is {' and '.join(over)}." if over else "",
+        f"{len(met)} of {len(goals.cells)} goals are met{least}.",
+        "Why: one compiled call an env-step, cars side by side in the processor's wide registers.",
+        "Not covered: other machines; compare ratios, not microseconds.",
+    )

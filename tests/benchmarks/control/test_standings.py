@@ -1,6 +1,7 @@
 """Standings: failures first, the best first, findings and the answer; what went wrong is said."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -171,11 +172,36 @@ def test_the_ladders_steps_are_ratios_of_costs() -> None:
 
 
 def test_the_answer_names_the_best_and_by_how_much() -> None:
-    said = answer({"1": table(results())})
-    assert f"best estimator (with lqr) {REFERENCE_FILTER}, score 0.6" in said
-    assert "of the cost of dakf" in said and "best controller" in said
-    ratio = re.search(r"(\d+) % \[\d+, \d+\] of the cost of dakf", said)
-    assert ratio is not None and int(ratio[1]) == pytest.approx(67, abs=4)
+    _, estimator, controller, why, rest = answer({"1": table(results())}).splitlines()
+    assert f"estimator: {REFERENCE_FILTER}, with 6" in estimator and "cost of dakf" in estimator
+    assert "controller: lqr, with 33 % [" in controller and "of the cost of esc" in controller
+    assert ", 16 % of no control's" in controller  # 2 / 12
+    assert "true car and road 50 %, its exact motion 7" in why
+    assert "40 episodes a contest" in rest
+
+
+def test_the_answer_calls_a_tie_a_tie_and_names_who_leads_elsewhere() -> None:
+    found, other = results(), results()
+    for contest in (ONE, TWO):
+        found.found[Cell(contest, "dakf", "lqr")] = episodes(2.0)
+        other.found[Cell(contest, REFERENCE_FILTER, "esc")] = episodes(1.5)
+        found.found[Cell(contest, REFERENCE_FILTER, "esc")] = episodes(60.0)
+    _, estimator, *_ = answer({"1": table(found)}).splitlines()
+    assert "estimator: a tie of" in estimator and "dakf" in estimator
+    two = [replace(each, yards=table(found)[0].yards) for each in table(found)]
+    elsewhere = {Contest("2", scenario=c.scenario): c for c in (ONE, TWO)}
+    for each, there in zip(two, [{e.label: e for e in table(other)}] * len(two), strict=True):
+        each.__dict__["pairs"] = {k: there[each.label].pairs[c] for k, c in elsewhere.items()}
+    *_, rest = answer({"1": table(found), "2": two}).splitlines()
+    assert rest.startswith("But esc in tier 2. ")
+
+
+def test_without_an_episode_that_counts_nobody_wins() -> None:
+    found = results()
+    for contest in (ONE, TWO):
+        found.found[Cell(contest, "", STATE)] = episodes(9.0, 40)
+    _, estimator, controller, *_ = answer({"1": table(found)}).splitlines()
+    assert "nobody has a score" in estimator and "nobody has a score" in controller
 
 
 def test_a_metric_of_the_table_has_its_rows_and_its_column() -> None:
