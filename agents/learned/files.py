@@ -16,13 +16,18 @@ from safetensors.numpy import save
 
 from ...envs.backend.files import write_whole
 from .card import Card
+from .memory import GATES, PARTS, Cell, cell_shapes
 from .network import Network
 
-FORMAT = 1
-"""Counts up when an older sideslip could not read, or would misread, a newer file."""
+FORMAT = 2
+"""Counts up when an older sideslip could not read, or would misread, a newer file: since 2 a
+network may have memory and more activations."""
+MOST_BYTES = 2**26
+"""A larger file is not opened; tensors lie in it as they are, so that it bounds their sizes too."""
 ENDING = ".safetensors"
 FOLDER = Path(__file__).resolve().with_name("policies")
-_ARCHITECTURE = ("hidden", "activation", "output", "clip", "action_width")
+_DENSE = ("hidden", "activation", "output", "clip", "action_width")
+_MEMORY: dict[str, Any] = {"history": 1, "cells": []}  # as in a file of format 1, which has none
 
 
 @dataclass(frozen=True)
@@ -36,7 +41,7 @@ class Policy:
     @property
     def reads(self) -> npt.NDArray[np.bool_]:
         """(inputs,) the entries of the card's observation that the network reads."""
-        return self.network.scale > 0.0
+        return self.network.reads
 
     @property
     def salt(self) -> str:
@@ -84,6 +89,8 @@ def save_policy(path: str | Path, network: Network, card: Card) -> None:
         output=network.output,
         clip=network.clip,
         action_width=network.width,
+        history=network.history,
+        cells=[[cell.kind, cell.size] for cell in network.cells],
     )
     metadata = {"format": str(FORMAT), "card": card.to_json(network=architecture)}
     write_whole(target, save(_tensors(network), metadata))
@@ -93,9 +100,13 @@ def load_policy(path: str | Path) -> Policy:
     """A policy from its file, or a shipped one by its name.
 
     Raises FileNotFoundError where there is none, ValueError for a file that is no policy, is cut
-    short, was made by a newer format, or whose card and tensors do not fit together.
+    short, is larger than `MOST_BYTES`, has another format, or whose card and tensors do not fit
+    together.
     """
     found = _found(path)
+    size = found.stat().st_size
+    if size > MOST_BYTES:
+        raise ValueError(f"{found} has {size} bytes, a policy has at most {MOST_BYTES}")
     try:
         with safe_open(found, "numpy") as file:
             metadata = file.metadata() or {}
@@ -126,33 +137,40 @@ def _card_fields(metadata: dict[str, str]) -> dict[str, Any]:
     """The card's JSON object with the architecture, checked as far as the format goes."""
     if not {"format", "card"} <= metadata.keys():
         raise ValueError("safetensors without a card: this is not a policy of sideslip")
-    if not metadata["format"].isdecimal() or int(metadata["format"]) > FORMAT:
+    known = [str(each) for each in range(1, FORMAT + 1)]
+    if metadata["format"] not in known:
         raise ValueError(
-            f"the card has format {metadata['format']}, this sideslip reads up to {FORMAT}: "
-            "a newer sideslip made it"
+            f"the card has format {metadata['format'][:20]}, this sideslip reads "
+            f"{' and '.join(known)}: another sideslip made it"
         )
     try:
         fields = json.loads(metadata["card"])
-    except json.JSONDecodeError as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"the card is no JSON: {error}") from None
     if not isinstance(fields, dict):
         raise ValueError(f"a card is a JSON object, got {type(fields).__name__}")
+    if metadata["format"] == "1" and isinstance(fields.get("network"), dict):
+        fields["network"] |= _MEMORY
     return fields
 
 
 def _network(fields: Any, observation: Any, tensors: dict[str, npt.NDArray[Any]]) -> Network:
-    """The network that the card describes, from tensors of the shapes that it says."""
-    if not isinstance(fields, dict) or set(fields) != set(_ARCHITECTURE):
-        raise ValueError(f"the card's network holds {', '.join(_ARCHITECTURE)}, got {fields!r}")
+    """The network that the card describes, from tensors of the shapes that the card has."""
+    if not isinstance(fields, dict) or set(fields) != {*_DENSE, *_MEMORY}:
+        names = ", ".join((*_DENSE, *_MEMORY))
+        raise ValueError(f"the card's network holds {names}, got {fields!r}")
     if not isinstance(observation, list):
         raise ValueError(f"the card's observation is a list, got {observation!r}")
-    hidden, clip = fields["hidden"], fields["clip"]
+    hidden, cells, clip = fields["hidden"], fields["cells"], fields["clip"]
     sizes = [*hidden, fields["action_width"]] if isinstance(hidden, list) else []
-    if not sizes or not all(type(size) is int and size > 0 for size in sizes):
+    history = fields["history"]
+    if not sizes or not all(type(size) is int and size > 0 for size in (*sizes, history)):
         raise ValueError(f"the card's layer sizes are positive integers, got {fields!r}")
+    if not (isinstance(cells, list) and all(map(_is_cell, cells))):
+        raise ValueError(f"the card's cells are pairs of {', '.join(GATES)} and a size: {cells!r}")
     if not (clip is None or type(clip) in (int, float)):
         raise ValueError(f"clip is above zero or None, got {clip!r}")
-    _check_tensors(tensors, len(observation), sizes)
+    _check_tensors(tensors, _shapes(len(observation), history, cells, sizes))
     return Network(
         tensors["mean"],
         tensors["scale"],
@@ -161,31 +179,61 @@ def _network(fields: Any, observation: Any, tensors: dict[str, npt.NDArray[Any]]
         str(fields["activation"]),
         str(fields["output"]),
         clip,
+        history,
+        [
+            Cell(kind, *(tensors[f"cell_{i}_{part}"] for part in PARTS))
+            for i, (kind, _) in enumerate(cells)
+        ],
     )
 
 
-def _check_tensors(tensors: dict[str, npt.NDArray[Any]], inputs: int, sizes: list[int]) -> None:
-    """ValueError for tensors that are not those of layers of these sizes."""
-    shapes: dict[str, tuple[int, ...]] = {"mean": (inputs,), "scale": (inputs,)}
-    wide = inputs
-    for i, size in enumerate(sizes):
-        shapes |= {f"weight_{i}": (size, wide), f"bias_{i}": (size,)}
+def _is_cell(pair: Any) -> bool:
+    return (
+        isinstance(pair, list)
+        and len(pair) == 2
+        and pair[0] in tuple(GATES)
+        and type(pair[1]) is int
+        and pair[1] > 0
+    )
+
+
+_Shapes = dict[str, tuple[tuple[int, ...], ...]]
+
+
+def _shapes(inputs: int, history: int, cells: list[tuple[str, int]], sizes: list[int]) -> _Shapes:
+    """The shapes that each tensor may have."""
+    wide = inputs * history
+    shapes: _Shapes = dict.fromkeys(("mean", "scale"), ((inputs,), (wide,)))
+    for i, (kind, size) in enumerate(cells):
+        own = cell_shapes(kind, size, wide)
+        shapes |= {f"cell_{i}_{part}": (shape,) for part, shape in own.items()}
         wide = size
+    for i, size in enumerate(sizes):
+        shapes |= {f"weight_{i}": ((size, wide),), f"bias_{i}": ((size,),)}
+        wide = size
+    return shapes
+
+
+def _check_tensors(tensors: dict[str, npt.NDArray[Any]], shapes: _Shapes) -> None:
+    """ValueError for tensors of other names, shapes or types."""
     if shapes.keys() != tensors.keys():
         missing, more = shapes.keys() - tensors.keys(), tensors.keys() - shapes.keys()
         raise ValueError(f"missing tensors: {sorted(missing)}; unexpected ones: {sorted(more)}")
-    for name, shape in shapes.items():
+    for name, allowed in shapes.items():
         kind = np.dtype(np.float64 if name in ("mean", "scale") else np.float32)
         found = tensors[name]
-        if found.shape != shape or found.dtype != kind:
+        if found.shape not in allowed or found.dtype != kind:
             raise ValueError(
                 f"tensor {name} has shape {found.shape} of {found.dtype}, "
-                f"the card says {shape} of {kind}"
+                f"the card has {' or '.join(map(str, dict.fromkeys(allowed)))} of {kind}"
             )
 
 
 def _tensors(network: Network) -> dict[str, npt.NDArray[Any]]:
     tensors: dict[str, npt.NDArray[Any]] = {"mean": network.mean, "scale": network.scale}
+    for i, cell in enumerate(network.cells):
+        for part in PARTS:
+            tensors[f"cell_{i}_{part}"] = np.ascontiguousarray(getattr(cell, part), np.float32)
     for i, (W, b) in enumerate(zip(network.weights, network.biases, strict=True)):
         tensors[f"weight_{i}"] = np.ascontiguousarray(W, np.float32)
         tensors[f"bias_{i}"] = np.ascontiguousarray(b, np.float32)

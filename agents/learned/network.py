@@ -1,17 +1,21 @@
-"""A policy's network: a normalised observation through dense layers, by NumPy alone."""
+"""A policy's network: a normalised observation through cells and dense layers, by NumPy alone."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
+from .memory import PARTS, Array, Cell, sigmoid
 
 ACTIVATIONS: dict[str, Callable[[Array], Array]] = {
     "tanh": np.tanh,
     "relu": lambda x: np.maximum(x, 0.0),
+    "elu": lambda x: np.where(x > 0.0, x, np.expm1(np.minimum(x, 0.0))),
+    "leaky-relu": lambda x: np.maximum(x, 0.01 * x),
+    "silu": lambda x: x * sigmoid(x),
 }
+"""With torch's default arguments."""
 OUTPUTS: dict[str, Callable[[Array], Array]] = {"linear": lambda x: x, "tanh": np.tanh}
 
 
@@ -19,11 +23,14 @@ OUTPUTS: dict[str, Callable[[Array], Array]] = {"linear": lambda x: x, "tanh": n
 class Network:
     """action = output(W_n ... activation(W_0 z + b_0) ... + b_n), z = clip((x - mean) scale).
 
-    mean, scale: (inputs,); an entry of scale 0 is not read. clip: z lies within +-clip, None does
-    not clip. weights: (outputs, inputs) of each layer, biases: (outputs,), both rounded to single
-    precision, in which networks are trained; sums are in double precision, so that a row's result
-    depends on the batch around it by rounding of the sixteenth digit only. activation: a name of
-    `ACTIVATIONS`, between layers. output: of `OUTPUTS`, after the last one.
+    mean, scale: (inputs,), of each frame before it is stacked, or (history inputs,), of the stack;
+    what has scale 0 is not read. clip: z lies within +-clip, None does not clip. weights:
+    (outputs, inputs) of each layer, biases: (outputs,), both rounded to single precision, in which
+    networks are trained; sums are in double precision, so that a row's result depends on the batch
+    around it by rounding of the sixteenth digit only. activation: a name of `ACTIVATIONS`, between
+    layers. output: of `OUTPUTS`, after the last one. history: so many frames, the newest included,
+    stand side by side in z, oldest first, those before the episode zero (the stack of
+    stable-baselines3's VecFrameStack). cells: between z and the first layer.
 
     Raises ValueError for shapes that do not fit, a number that is not finite, an unknown name.
     """
@@ -35,6 +42,8 @@ class Network:
     activation: str = "tanh"
     output: str = "linear"
     clip: float | None = None
+    history: int = 1
+    cells: Sequence[Cell] = ()
 
     def __post_init__(self) -> None:
         for name in ("mean", "scale"):
@@ -42,12 +51,15 @@ class Network:
         for name in ("weights", "biases"):
             single = [np.array(each, np.float32) for each in getattr(self, name)]
             object.__setattr__(self, name, tuple(each.astype(np.float64) for each in single))
+        object.__setattr__(self, "cells", tuple(self.cells))
         for name, known in (("activation", ACTIVATIONS), ("output", OUTPUTS)):
             if getattr(self, name) not in known:
                 value = getattr(self, name)
                 raise ValueError(f"unknown {name} {value!r}; known: {', '.join(known)}")
         if self.clip is not None and not self.clip > 0.0:
             raise ValueError(f"clip is above zero or None, got {self.clip!r}")
+        if self.history < 1:
+            raise ValueError(f"history is at least 1 frame, got {self.history}")
         self._check_shapes()
         self._check_numbers()
 
@@ -57,18 +69,32 @@ class Network:
                 f"a network has a bias a layer, got {len(self.weights)} weights "
                 f"and {len(self.biases)} biases"
             )
-        wide = self.mean.shape
-        if len(wide) != 1 or self.scale.shape != wide:
-            raise ValueError(f"mean and scale are (inputs,), got {wide} and {self.scale.shape}")
+        stacked = self._first.shape[-1]
+        if stacked % self.history:
+            raise ValueError(f"{stacked} inputs are not {self.history} frames of one width")
+        if self.mean.shape not in ((self.inputs,), (stacked,)) or self.scale.shape != (
+            self.mean.shape
+        ):
+            raise ValueError(
+                f"mean and scale are (inputs,) or (history inputs,) with {self.inputs} inputs, "
+                f"got {self.mean.shape} and {self.scale.shape}"
+            )
+        wide = stacked
+        for i, cell in enumerate(self.cells):
+            if cell.weight_in.shape[1] != wide:
+                raise ValueError(f"cell {i} takes {cell.weight_in.shape[1]} inputs, not {wide}")
+            wide = cell.size
         for i, (W, b) in enumerate(zip(self.weights, self.biases, strict=True)):
-            if W.shape != (*b.shape, *wide) or b.ndim != 1:
+            if W.shape != (*b.shape, wide) or b.ndim != 1:
                 raise ValueError(
-                    f"layer {i} takes {wide[0]} inputs, got weights {W.shape} and biases {b.shape}"
+                    f"layer {i} takes {wide} inputs, got weights {W.shape} and biases {b.shape}"
                 )
-            wide = b.shape
+            wide = len(b)
 
     def _check_numbers(self) -> None:
         arrays = {"mean": self.mean, "scale": self.scale}
+        for i, cell in enumerate(self.cells):
+            arrays |= {f"{name} of cell {i}": getattr(cell, name) for name in PARTS}
         for i, (W, b) in enumerate(zip(self.weights, self.biases, strict=True)):
             arrays |= {f"the weights of layer {i}": W, f"the biases of layer {i}": b}
         for name, values in arrays.items():
@@ -78,13 +104,18 @@ class Network:
             raise ValueError("scale is below zero")
 
     @property
+    def _first(self) -> Array:
+        """The weights that take z."""
+        return self.cells[0].weight_in if self.cells else self.weights[0]
+
+    @property
     def inputs(self) -> int:
         """Entries of an observation."""
-        return len(self.mean)
+        return int(self._first.shape[-1]) // self.history
 
     @property
     def hidden(self) -> tuple[int, ...]:
-        """Sizes of the layers between."""
+        """Sizes of the dense layers between."""
         return tuple(len(b) for b in self.biases[:-1])
 
     @property
@@ -92,24 +123,49 @@ class Network:
         """Numbers of an action."""
         return len(self.biases[-1])
 
+    @property
+    def memory(self) -> int:
+        """Numbers that a row remembers: the older frames, then each cell's state."""
+        return (self.history - 1) * self.inputs + sum(cell.memory for cell in self.cells)
+
+    @property
+    def reads(self) -> npt.NDArray[np.bool_]:
+        """(inputs,) the entries of an observation that are read in any frame."""
+        return np.asarray((self.scale.reshape(-1, self.inputs) > 0.0).any(axis=0))
+
     def reading(self, entries: npt.NDArray[np.bool_]) -> "Network":
         """The same network of these entries alone, the others at their mean; entries: (inputs,)."""
-        first, *rest = self.weights
-        return Network(
-            self.mean[entries],
-            self.scale[entries],
-            (first[:, entries], *rest),
-            self.biases,
-            self.activation,
-            self.output,
-            self.clip,
+        columns = np.tile(entries, self.history)
+        own = columns if len(self.mean) == len(columns) else entries
+        cells, weights = list(self.cells), list(self.weights)
+        if cells:
+            cells[0] = replace(cells[0], weight_in=cells[0].weight_in[:, columns])
+        else:
+            weights[0] = weights[0][:, columns]
+        return replace(
+            self, mean=self.mean[own], scale=self.scale[own], weights=weights, cells=cells
         )
 
-    def __call__(self, x: Array) -> Array:
-        """(N, width) of observations (N, inputs)."""
+    def _normalised(self, x: Array) -> Array:
         z = (x - self.mean) * self.scale
-        if self.clip is not None:
-            z = np.clip(z, -self.clip, self.clip)
+        return z if self.clip is None else np.clip(z, -self.clip, self.clip)
+
+    def __call__(self, x: Array, state: Array | None = None) -> Array:
+        """(N, width) of observations (N, inputs).
+
+        state: (N, memory), updated in place; zero, or None, where an episode begins.
+        """
+        if state is None:
+            state = np.zeros((len(x), self.memory))
+        framewise = len(self.mean) == self.inputs
+        at = (self.history - 1) * self.inputs
+        z = np.concatenate([state[:, :at], self._normalised(x) if framewise else x], axis=1)
+        state[:, :at] = z[:, self.inputs :]
+        if not framewise:
+            z = self._normalised(z)
+        for cell in self.cells:
+            z = cell(z, state[:, at : at + cell.memory])
+            at += cell.memory
         bend = ACTIVATIONS[self.activation]
         for W, b in zip(self.weights[:-1], self.biases[:-1], strict=True):
             z = bend(z @ W.T + b)

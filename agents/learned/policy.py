@@ -10,8 +10,9 @@ DEFAULT = "ppo-yaw-vision"
 
 
 class Learned(Controller):
-    """The deterministic action of a policy's network, clipped to [-1, 1]; it remembers nothing.
+    """The deterministic action of a policy's network, clipped to [-1, 1].
 
+    What the network remembers of an episode (frames, cells) is in the state of `predict`.
     It reads the entries of its training by name, so a wider observation serves as well; what never
     varied in training is not read. Where the env steers and the policy does not, the steering is
     left alone. Single and batch agree to rounding in double precision, before the action becomes
@@ -47,8 +48,13 @@ class Learned(Controller):
                 f"the env's action has {facts.width}"
             )
         self.needs = tuple(each for each, _ in entries)
-        super().__init__(env)
+        try:
+            super().__init__(env)
+        except ValueError as error:
+            there, here = (", ".join(names) for names in (dict(card.observation), units))
+            raise ValueError(f"{error}. {name} was trained on {there}; here are {here}") from None
         self.network = self.policy.network.reading(reads)
+        self.memory = self.network.memory
 
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
-        action[:, : self.network.width] = self.network(inputs)
+        action[:, : self.network.width] = self.network(inputs, state)

@@ -146,14 +146,16 @@ def edited(
 
 BAD: dict[str, tuple[Callable[[Any, Any, Any], Any], str]] = {
     "no card": (lambda t, m, c: m.pop("card"), "without a card"),
-    "newer": (lambda t, m, c: m.update(format=str(FORMAT + 1)), "newer sideslip made it"),
+    "newer": (lambda t, m, c: m.update(format=str(FORMAT + 1)), "another sideslip made it"),
+    "no version": (lambda t, m, c: m.update(format="0"), "format 0, this sideslip reads 1 and 2"),
+    "not of its version": (lambda t, m, c: c["network"].pop("cells"), "network holds hidden"),
     "strange format": (lambda t, m, c: m.update(format="two"), "format two"),
     "no JSON": (lambda t, m, c: m.update(card="no json"), "card is no JSON"),
     "missing tensor": (lambda t, m, c: t.pop("weight_1"), r"missing tensors: \['weight_1'\]"),
     "extra tensor": (lambda t, m, c: t.update(more=t["mean"]), r"unexpected ones: \['more'\]"),
     "wrong shape": (
         lambda t, m, c: t.update(weight_0=np.zeros((8, 4), np.float32)),
-        r"weight_0 has shape \(8, 4\).*says \(8, 3\)",
+        r"weight_0 has shape \(8, 4\).*card has \(8, 3\)",
     ),
     "wrong type": (
         lambda t, m, c: t.update(bias_0=np.zeros(8)),
@@ -172,6 +174,18 @@ BAD: dict[str, tuple[Callable[[Any, Any, Any], Any], str]] = {
     "clip of text": (lambda t, m, c: c["network"].update(clip="10"), "clip is above zero"),
     "sizes": (lambda t, m, c: c["network"].update(hidden=[8, -5]), "positive integers"),
     "no sizes": (lambda t, m, c: c["network"].update(hidden=None), "positive integers"),
+    "history": (lambda t, m, c: c["network"].update(history=2.0), "positive integers"),
+    "longer history": (
+        lambda t, m, c: c["network"].update(history=10**12),
+        r"weight_0 has shape \(8, 3\).*card has \(8, 3000000000000\)",
+    ),
+    "cells": (lambda t, m, c: c["network"].update(cells=[["rnn", 3]]), "pairs of gru, lstm and"),
+    "cell of no size": (lambda t, m, c: c["network"].update(cells=[["gru", -3]]), "pairs of gru"),
+    "cell of text": (lambda t, m, c: c["network"].update(cells="gru"), "pairs of gru"),
+    "no cell's tensors": (
+        lambda t, m, c: c["network"].update(cells=[["gru", 3]]),
+        r"missing tensors: \['cell_0_bias_in'",
+    ),
     "no network": (lambda t, m, c: c.pop("network"), "card's network holds hidden"),
     "lacks": (lambda t, m, c: c.pop("env_id"), "lacks env_id"),
     "unknown field": (lambda t, m, c: c.update(colour="red"), "unknown fields: colour"),
@@ -193,6 +207,34 @@ def test_a_bad_file_says_what_is_wrong(file: Path, name: str) -> None:
     with pytest.raises(ValueError, match=said) as told:
         load_policy(file)
     assert str(file) in str(told.value)
+
+
+def of_the_first_format(tensors: Any, metadata: Any, card: Any) -> None:
+    metadata["format"] = "1"
+    del card["network"]["history"], card["network"]["cells"]
+
+
+def test_a_file_of_the_first_format_is_a_network_without_memory(file: Path) -> None:
+    network = load_policy(file).network
+    edited(file, of_the_first_format)
+    again = load_policy(file).network
+    x = np.random.default_rng(1).normal(size=(50, 3))
+    assert np.array_equal(again(x), network(x)) and again.memory == 0
+
+
+def test_a_file_too_large_is_not_opened(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sideslip.agents.learned.files.MOST_BYTES", 1000)
+    with pytest.raises(ValueError, match=r"bytes, a policy has at most 1000"):
+        load_policy(file)
+
+
+def test_a_card_nested_without_end_is_refused(file: Path) -> None:
+    with safe_open(file, "numpy") as read:
+        metadata = dict(read.metadata())
+        tensors = {name: read.get_tensor(name) for name in read.keys()}  # noqa: SIM118
+    save_file(tensors, file, metadata | {"card": "[" * 100_000})
+    with pytest.raises(ValueError, match="card is no JSON"):
+        load_policy(file)
 
 
 @pytest.mark.parametrize("length", [0, 4, 8, 200, 1000])

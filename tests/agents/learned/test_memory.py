@@ -1,0 +1,240 @@
+"""What a policy remembers: torch's cells and VecFrameStack's frames, over whole episodes."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from sideslip.agents import Learned
+from sideslip.agents.learned.card import Card
+from sideslip.agents.learned.files import Policy, load_policy, save_policy
+from sideslip.agents.learned.memory import GATES, PARTS, Cell
+from sideslip.agents.learned.network import ACTIVATIONS, Network
+
+torch = pytest.importorskip("torch")
+torch.set_num_threads(1)
+sb3 = pytest.importorskip("stable_baselines3")
+from stable_baselines3.common.vec_env.stacked_observations import (  # noqa: E402
+    StackedObservations,
+)
+
+ID, ROWS, STEPS = "sideslip/YawVision-v0", 5, 200
+CARD = Card.of(ID)
+WIDE = len(CARD.observation)
+RNG = np.random.default_rng(0)
+
+
+def inputs(wide: int = WIDE) -> np.ndarray:
+    """(steps, rows, wide), and where an episode begins: rows end at different steps."""
+    return np.random.default_rng(1).normal(size=(STEPS, ROWS, wide)).astype(np.float32)
+
+
+STARTS = np.random.default_rng(2).random((STEPS, ROWS)) < 0.02
+STARTS[0] = True
+
+
+def dense(wide: int, history: int = 1, cells: Any = (), **options: Any) -> Network:
+    """A layer with an activation and one without, behind what remembers."""
+    rng = np.random.default_rng(3)
+    into = cells[-1].size if cells else wide * history
+    weights = [rng.normal(size=(6, into)) / into**0.5, 0.3 * rng.normal(size=(1, 6))]
+    biases = [0.1 * rng.normal(size=6), 0.1 * rng.normal(size=1)]
+    numbers = {"mean": 0.1 * rng.normal(size=wide), "scale": rng.uniform(0.5, 2.0, wide)}
+    return Network(
+        weights=weights, biases=biases, history=history, cells=cells, **numbers | options
+    )
+
+
+def torchs(kind: str, layers: int, wide: int = WIDE, size: int = 7) -> Any:
+    torch.manual_seed(4)
+    return {"gru": torch.nn.GRU, "lstm": torch.nn.LSTM}[kind](wide, size, layers)
+
+
+def cells_of(module: Any) -> list[Cell]:
+    kind = type(module).__name__.lower()
+    names = ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
+    return [
+        Cell(kind, *(getattr(module, f"{name}_l{i}").detach().numpy() for name in names))
+        for i in range(module.num_layers)
+    ]
+
+
+def driven(network: Network, x: np.ndarray, starts: np.ndarray = STARTS) -> np.ndarray:
+    """Actions of `Learned.predict`, (steps, rows)."""
+    agent = Learned(gym.make(ID), Policy("mine", network, CARD))
+    state, actions = None, []
+    for obs, start in zip(x, starts, strict=True):
+        action, state = agent.predict(obs, state, start)
+        actions.append(action[:, 0])
+    return np.array(actions)
+
+
+@pytest.mark.parametrize("kind", GATES)
+@pytest.mark.parametrize("layers", [1, 2])
+def test_cells_are_torchs_over_whole_episodes(kind: str, layers: int) -> None:
+    """In double precision to its rounding, in torch's single precision to 1e-6."""
+    module, x = torchs(kind, layers), inputs()
+    network = dense(WIDE, cells=cells_of(module), clip=5.0)
+    z = np.clip((x - network.mean) * network.scale, -5.0, 5.0)
+    for precision, bound in ((torch.float64, 1e-13), (torch.float32, 1e-6)):
+        module = module.to(precision)
+        size = 7 * layers
+        state: Any = torch.zeros(2, layers, ROWS, 7, dtype=precision)
+        ours, worst = np.zeros((ROWS, network.memory)), 0.0
+        assert network.memory == size * (2 if kind == "lstm" else 1)
+        for step, start in enumerate(STARTS):
+            state[:, :, start], ours[start] = 0.0, 0.0
+            with torch.no_grad():
+                taken = torch.from_numpy(z[step]).to(precision)[None]
+                given = (state[0], state[1]) if kind == "lstm" else state[0]
+                output, after = module(taken, given)
+            state = torch.stack(after) if kind == "lstm" else torch.stack([after, after])
+            hidden = output[0].numpy().astype(np.float64)
+            action = network(x[step].astype(np.float64), ours)
+            theirs = np.tanh(hidden @ network.weights[0].T + network.biases[0])
+            theirs = theirs @ network.weights[1].T + network.biases[1]
+            worst = max(worst, float(np.abs(action - theirs).max()))
+        assert worst < bound
+
+
+@pytest.mark.parametrize("kind", GATES)
+def test_the_order_of_the_gates_counts(kind: str) -> None:
+    """So that the test above would see a wrong one."""
+    (cell,) = cells_of(torchs(kind, 1))
+    right = driven(dense(WIDE, cells=[cell]), inputs())
+    order = [1, 0, *range(2, GATES[kind])]
+    swapped = [
+        np.concatenate([np.split(getattr(cell, part), GATES[kind])[i] for i in order])
+        for part in PARTS
+    ]
+    assert np.abs(driven(dense(WIDE, cells=[Cell(kind, *swapped)]), inputs()) - right).max() > 1e-3
+
+
+@pytest.mark.parametrize("framewise", [True, False], ids=["frames scaled", "stack scaled"])
+@pytest.mark.parametrize("history", [2, 4])
+def test_history_is_the_stack_of_vec_frame_stack(history: int, framewise: bool) -> None:
+    """Normalised before it is stacked, or after: zeros before the episode differ."""
+    numbers = dense(WIDE if framewise else WIDE * history)
+    scaling = {"mean": numbers.mean, "scale": numbers.scale}
+    network = dense(WIDE, history, **scaling)
+    plain = dense(WIDE * history, mean=np.zeros(WIDE * history), scale=np.ones(WIDE * history))
+    low, high = -np.ones(WIDE, np.float32), np.ones(WIDE, np.float32)
+    stack = StackedObservations(ROWS, history, gym.spaces.Box(low, high))
+    x, theirs = inputs(), []
+    scaled = (x - numbers.mean) * numbers.scale if framewise else x.astype(np.float64)
+    stack.stacked_obs = stack.stacked_obs.astype(np.float64)
+    for step, start in enumerate(STARTS):
+        infos: list[Any] = [{"terminal_observation": scaled[step, i]} for i in range(ROWS)]
+        z = stack.update(scaled[step], start, infos)[0] if step else stack.reset(scaled[0])
+        z = z if framewise else (z - numbers.mean) * numbers.scale
+        theirs.append(np.clip(plain(z)[:, 0], -1.0, 1.0))
+    ours = driven(network, x)
+    assert network.memory == (history - 1) * WIDE
+    assert np.abs(ours - np.array(theirs)).max() < 1e-6
+    assert np.abs(ours - driven(network, x, np.zeros_like(STARTS))).max() > 1e-3
+
+
+def remembering() -> Network:
+    return dense(WIDE, 3, cells_of(torchs("lstm", 2, 3 * WIDE)), activation="silu")
+
+
+def test_a_row_of_a_batch_is_its_single_drive() -> None:
+    network, x = remembering(), inputs()
+    together = driven(network, x)
+    agent = Learned(gym.make(ID), Policy("mine", network, CARD))
+    for row in range(ROWS):
+        state = None
+        for step in range(60):
+            action, state = agent.predict(x[step, row], state, STARTS[step, row : row + 1])
+            assert action.shape == (1,) and action[0] == pytest.approx(
+                together[step, row], abs=1e-6
+            )
+
+
+def test_predict_is_pure_and_a_row_with_a_nan_keeps_its_memory() -> None:
+    agent = Learned(gym.make(ID), Policy("mine", remembering(), CARD))
+    x = inputs()
+    _, state = agent.predict(x[0])
+    before = state.copy()
+    first, _ = agent.predict(x[1], state)
+    assert np.array_equal(state, before) and np.array_equal(agent.predict(x[1], state)[0], first)
+    x[1, 2, 0] = np.nan
+    action, after = agent.predict(x[1], state)
+    assert np.isnan(action[2]).all() and np.array_equal(after[2], before[2])
+    assert np.array_equal(np.delete(action, 2, 0), np.delete(first, 2, 0))
+
+
+@pytest.mark.parametrize("framewise", [True, False])
+def test_what_is_not_read_is_left_out_of_every_frame(framewise: bool) -> None:
+    scale = np.ones(WIDE)
+    scale[[1, 5]] = 0.0
+    scale = scale if framewise else np.tile(scale, 3)
+    network = replace(remembering(), mean=np.zeros(len(scale)), scale=scale)
+    assert list(np.flatnonzero(~network.reads)) == [1, 5]
+    x = inputs().astype(np.float64)
+    state, less = np.zeros((ROWS, network.memory)), network.reading(network.reads)
+    other = np.zeros((ROWS, less.memory))
+    for obs in x[:20]:
+        assert less(obs[:, network.reads], other) == pytest.approx(network(obs, state), abs=1e-12)
+
+
+@pytest.mark.parametrize("activation", ACTIVATIONS)
+def test_activations_are_torchs(activation: str) -> None:
+    names = {
+        "relu": "ReLU",
+        "elu": "ELU",
+        "leaky-relu": "LeakyReLU",
+        "silu": "SiLU",
+        "tanh": "Tanh",
+    }
+    x = np.concatenate([RNG.normal(size=100) * 3.0, [0.0, -800.0, 800.0]])
+    theirs = getattr(torch.nn, names[activation])()(torch.from_numpy(x)).numpy()
+    with np.errstate(over="raise"):
+        assert ACTIVATIONS[activation](x) == pytest.approx(theirs, abs=1e-13)
+
+
+def test_a_file_holds_the_memory(tmp_path: Path) -> None:
+    network, path = remembering(), tmp_path / "mine.safetensors"
+    save_policy(path, network, CARD)
+    policy = load_policy(path)
+    assert policy.network.history == 3 and [cell.kind for cell in policy.network.cells] == [
+        "lstm",
+        "lstm",
+    ]
+    assert np.array_equal(driven(policy.network, inputs()), driven(network, inputs()))
+    cells = [replace(cell, bias_in=cell.bias_in + 1.0) for cell in network.cells]
+    other = replace(policy, network=replace(network, cells=cells))
+    assert other.salt != policy.salt
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"history": 0}, "history is at least 1 frame"),
+        ({"history": 5}, "66 inputs are not 5 frames"),
+        ({"mean": np.zeros(7), "scale": np.ones(7)}, "with 22 inputs, got"),
+        ({"cells": cells_of(torchs("gru", 1))}, "22 inputs are not 3 frames"),
+        ({"cells": cells_of(torchs("gru", 1, 66)) * 2}, "cell 1 takes 66 inputs, not 7"),
+        ({"cells": cells_of(torchs("gru", 1, 66, 8))}, "layer 0 takes 8 inputs"),
+    ],
+)
+def test_memory_that_does_not_fit_is_refused(change: dict[str, Any], named: str) -> None:
+    with pytest.raises(ValueError, match=named):
+        replace(remembering(), **change)
+
+
+def test_a_cell_that_does_not_fit_together_is_refused() -> None:
+    (cell,) = cells_of(torchs("gru", 1))
+    for change, named in (
+        ({"kind": "rnn"}, "unknown cell 'rnn'; known: gru, lstm"),
+        ({"kind": "lstm"}, "do not fit together"),
+        ({"bias_in": np.zeros(3)}, "do not fit together"),
+    ):
+        with pytest.raises(ValueError, match=named):
+            replace(cell, **change)
+    bad = replace(cell, weight_state=np.full_like(cell.weight_state, np.nan))
+    with pytest.raises(ValueError, match="weight_state of cell 0: 147 are not finite"):
+        dense(WIDE, cells=[bad])
