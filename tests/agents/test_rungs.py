@@ -15,6 +15,7 @@ from sideslip.envs.scenarios.manoeuvres import SCENARIOS
 from tests.envs.helpers import bits
 
 FUSION, AFS = "sideslip/YawFusion-v0", "sideslip/AfsYawFusion-v0"
+VISION = "sideslip/YawVision-v0"
 LINEAR = {"base": "random-steering", "tyres": "linear"}
 
 
@@ -31,8 +32,13 @@ def costs(rung: str, count: int, **env: Any) -> np.ndarray:
     return J
 
 
-@pytest.mark.parametrize("env_id", [FUSION, AFS, "sideslip/YawVision-v0"])
-@pytest.mark.parametrize("rung", RUNGS)
+OFTEN = [*((rung, FUSION) for rung in RUNGS), ("oracle-state-lqr", AFS), ("nominal", VISION)]
+RARELY = [each for each in itertools.product(RUNGS, (AFS, VISION)) if each not in OFTEN]
+
+
+@pytest.mark.parametrize(
+    ("rung", "env_id"), [*OFTEN, *(pytest.param(*each, marks=pytest.mark.long) for each in RARELY)]
+)
 def test_rows_of_a_vector_env_have_the_bits_of_single_ones(rung: str, env_id: str) -> None:
     envs, agent = make_rung(rung, env_id, num_envs=2)
     env, alone = make_rung(rung, env_id)

@@ -144,8 +144,7 @@ def test_a_batch_has_the_episodes_of_its_seeds() -> None:
         np.testing.assert_array_equal(env.motion[i], alone.motion)
 
 
-@pytest.mark.plain
-@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("mode", [MODES[0], pytest.param(MODES[1], marks=pytest.mark.plain)])
 def test_episodes_follow_each_other_as_in_the_vector_env(mode: str) -> None:
     """Resets of their own and by a mask, drives and ends: to 1e-9 over a few episodes."""
     told: dict[str, Any] = {
