@@ -5,11 +5,12 @@ from pathlib import Path
 from typing import Any
 
 from ..envs.backend.files import whole
+from ..envs.rendering.palette import INK, colour
 from .control.cells import REFERENCE_FILTER
 from .control.contests import TITLES
 from .harness.metrics import METRICS
 from .harness.results import Row, ShareMap, Suite
-from .report.colours import INK, SHARE_SCALE, colour
+from .report.colours import SHARE_SCALE
 
 _ACROSS = 3  # panels
 

@@ -18,6 +18,7 @@ from .engine.step import step_vehicle
 from .engine.views import motion_in, record_in, slow_in, true_states_in, vehicle_in
 from .engine.window import window_of
 from .record import FAST_WIDTH, PACKET_WIDTH, Array, Record
+from .rendering.drawn import DrawnOne, Numbers
 from .scenarios.manoeuvres import scenario_from
 from .scenarios.scenario import Scenario
 from .sensors.link import SlowSensor
@@ -30,7 +31,7 @@ from .vehicle.vehicle import Vehicle
 from .vehicle.vehicles import VehicleSource, vehicle_from
 
 
-class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
+class StabilityEnv(DrawnOne, gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
     """Keep a car's sideslip angle where it should be, by two motors and, if asked, by steering.
 
     ## Action
@@ -86,10 +87,8 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
     "zero-slip", "model" (its steady state), "limited" (by friction) or "lagged" (so limited,
     understeering, through a lag of 0.1 s). fast: "summary" or "all". slow, by name ("camera",
     "gps"): fields of `SlowSensor` that replace the id's. yaw_first: yaw moment before acceleration
-    where both pass the motors' limit. steering: the action may steer too.
+    where both pass the motors' limit. steering: the action may steer too. render_mode: of `Drawn`.
     """
-
-    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012  Gymnasium's convention
 
     def __init__(
         self,
@@ -106,9 +105,6 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
         render_mode: str | None = None,
         **slow: Mapping[str, Any] | None,
     ) -> None:
-        if render_mode is not None:  # stable-baselines3 tries "rgb_array" and minds TypeError only
-            raise TypeError(f"unknown render_mode {render_mode!r}; known: none")
-        self.render_mode = render_mode
         car = vehicle_from(vehicle)
         self.config = EnvConfig(
             sensors,
@@ -125,7 +121,7 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
         )
         self.control_period, self.reference = int(control_period), reference
         self._now = self.config.base
-        self.annotations: dict[str, float] = {}
+        self._draw_in(render_mode)
 
         self.layout: tuple[Entry, ...] = self.config.layout
         self._bounds = self.config.bounds
@@ -161,8 +157,10 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
         self.final_ticks_done, self.final_delivered = self.ticks_done, self.delivered
         reset_vehicle(config.start, key & 0xFFFFFFFF, key >> 32, self._bounds, self._row(obs))
         self._over = False
-        self.annotations = {}
-        return obs, self._info(1)
+        self.annotations, info = {}, self._info(1)
+        if self._traces:
+            self._seen()
+        return obs, info
 
     def step(
         self, action: npt.ArrayLike
@@ -181,6 +179,8 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
         terminated = info["failure"] != RUNNING
         truncated = info["is_success"]
         self._over = terminated or truncated
+        if self._traces:
+            self._seen()
         return obs, -info["cost"], terminated, truncated, info
 
     def _advance(self, force: npt.NDArray[np.float32], obs: npt.NDArray[np.float32]) -> int:
@@ -262,9 +262,8 @@ class StabilityEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
         """Unstable draws thrown away at this reset."""
         return int(self._state[Z.clock.redraws])
 
-    def annotate(self, **values: float) -> None:
-        """Numbers to draw beside the truth, from wrappers (beta_hat, ...)."""
-        self.annotations.update(values)
+    def _numbers(self, row: int) -> Numbers:
+        return self._params, self._state, self._switches, self._report, self._now
 
     def get_state(self) -> dict[str, Any]:
         """A snapshot that `set_state` continues from, bit for bit."""

@@ -16,6 +16,7 @@ from .arguments import actions_of, count_of, mask_of, mode_of, named, seeds_of
 from .engine.batch import step_rows
 from .engine.episodes import Episodes
 from .record import Array
+from .rendering.drawn import DrawnRows, Numbers
 from .stability import StabilityEnv
 from .task.failures import REFUSED
 from .task.info import infos_of
@@ -27,7 +28,7 @@ Infos = dict[str, Any]
 _INFO = ("all", "ends")
 
 
-class StabilityVectorEnv(Episodes, VectorEnv[Observations, Any, npt.NDArray[Any]]):
+class StabilityVectorEnv(DrawnRows, Episodes, VectorEnv[Observations, Any, npt.NDArray[Any]]):
     """`num_envs` environments, each of which is a `StabilityEnv(**arguments)` bit for bit.
 
     Observations, rewards, ends, infos and records are those of `SyncVectorEnv`: row i of
@@ -38,7 +39,7 @@ class StabilityVectorEnv(Episodes, VectorEnv[Observations, Any, npt.NDArray[Any]
     arguments: those of `StabilityEnv`. autoreset_mode: "NextStep", "SameStep" or "Disabled" (rows
     that ended wait for `reset` with a `reset_mask`), or the enum. info: "all" tells the infos of
     every row in every step, as `SyncVectorEnv` does; "ends" only those of the last step of an
-    episode, and none at resets.
+    episode, and none at resets. render_mode: of `Drawn`.
 
     ## Reset
     `seed`: an int, or a list (N,) of int or None. `options`: those of `StabilityEnv`, each one for
@@ -67,6 +68,7 @@ class StabilityVectorEnv(Episodes, VectorEnv[Observations, Any, npt.NDArray[Any]
         num_envs: int = 1,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         info: str = "all",
+        render_mode: str | None = None,
         **arguments: Any,
     ) -> None:
         self.num_envs = N = count_of(num_envs)
@@ -77,7 +79,8 @@ class StabilityVectorEnv(Episodes, VectorEnv[Observations, Any, npt.NDArray[Any]
         one = StabilityEnv(**arguments)
         Episodes.__init__(self, one.config, N)
         self.reference = one.reference
-        self.metadata = {**one.metadata, "autoreset_mode": self._mode}
+        self._draw_in(render_mode)
+        self.metadata["autoreset_mode"] = self._mode
         self.single_observation_space = one.observation_space
         self.single_action_space = one.action_space
         self.observation_space = batch_space(one.observation_space, N)
@@ -119,6 +122,8 @@ class StabilityVectorEnv(Episodes, VectorEnv[Observations, Any, npt.NDArray[Any]
         self.reset_rows(chosen, configs, of)
         self.over[mask] = False
         self._waiting, self._started = int(self.over.sum()), True
+        if self._traces:
+            self._seen()
         return self.obs.copy(), infos_of(self.reports, mask) if self._all_infos else {}
 
     def step(self, actions: npt.ArrayLike) -> tuple[Observations, Array, Flags, Flags, Infos]:
@@ -161,6 +166,8 @@ class StabilityVectorEnv(Episodes, VectorEnv[Observations, Any, npt.NDArray[Any]
             infos |= infos_of(self.reports, np.ones(N, np.bool_))
         elif ended:
             infos |= infos_of(self.reports, self.over)
+        if self._traces:
+            self._seen()
         return self.obs.copy(), rewards, terminated, truncated, infos
 
     def _finished(self) -> Infos:
@@ -174,6 +181,10 @@ class StabilityVectorEnv(Episodes, VectorEnv[Observations, Any, npt.NDArray[Any]
         self.reset_rows(rows)
         self.over[:] = False
         return infos
+
+    def _numbers(self, row: int) -> Numbers:
+        numbers = self.params[row], self.states[row], self.switches[row], self.reports[row]
+        return *numbers, self.configs[row]
 
     @property  # type: ignore[misc]  # without a setter, as in sync
     def np_random(self) -> tuple[np.random.Generator, ...]:  # type: ignore[override]

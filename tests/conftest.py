@@ -4,6 +4,7 @@ import os
 
 # Before numpy comes: on small matrices BLAS's threads only wait for each other.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # no window opens
 
 from pathlib import Path
 

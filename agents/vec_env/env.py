@@ -81,6 +81,7 @@ class NativeVecEnv(VecEnv):
             vector_env.single_observation_space,
             vector_env.single_action_space,
         )
+        self.metadata = dict(vector_env.metadata)
 
     @property
     def spec(self) -> Any:
@@ -125,6 +126,15 @@ class NativeVecEnv(VecEnv):
         more = {key: each for key, each in infos.items() if "final_" not in key}
         for i, info in zip(rows, _rows_of(more, rows), strict=True):
             self.reset_infos[i] = info_of(self._base.reports[i])[0] | info
+
+    def get_images(self) -> Sequence[npt.NDArray[np.uint8] | None]:
+        """A frame of each row, of render_mode="rgb_array"."""
+        frames: Any = self.vector_env.render()
+        return frames or ()
+
+    def render(self, mode: str | None = None) -> npt.NDArray[np.uint8] | None:
+        """All rows' frames as one; of render_mode="human" None, for `step` shows the first row."""
+        return None if self.render_mode == "human" else super().render(mode)
 
     def close(self) -> None:
         """Close the vector env."""

@@ -8,11 +8,11 @@ import numpy as np
 from ...agents import make_agent
 from ...agents.rollout import Rollout, rollout
 from ...envs.record import Array
+from ...envs.rendering.palette import INK, colour
 from ...envs.vehicle.vehicles import VEHICLES
 from ..harness.drives import make_env
 from ..harness.explorer import Explorer, Panel
 from ..harness.results import Suite
-from ..report.colours import INK, colour
 from ..report.kml import track_kml
 from .build import agent_options, estimate_options, name_of
 from .cells import REFERENCE_FILTER, Cell

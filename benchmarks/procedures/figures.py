@@ -6,9 +6,9 @@ import numpy as np
 from plotly import graph_objects as go
 from plotly.subplots import make_subplots
 
+from ...envs.rendering.palette import GREY, INK, colour
 from ...envs.scenarios.tracks import Section
 from ..harness.results import Suite
-from ..report.colours import GREY, INK, colour
 from ..report.figures import time_series, track
 from . import fmvss126, iso3888, iso7401
 from .cases import Case, Done, Sine, Transient, of

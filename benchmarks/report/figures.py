@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from .colours import FACTS, GREY, INK, colour, line_styles
+from ...envs.rendering.palette import FACTS, GREY, INK, colour
+from .colours import line_styles
 
 try:
     from plotly import graph_objects as go

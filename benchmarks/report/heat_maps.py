@@ -8,8 +8,9 @@ import numpy.typing as npt
 from plotly import graph_objects as go
 from plotly.subplots import make_subplots
 
+from ...envs.rendering.palette import INK
 from ..harness.results import ShareMap
-from .colours import INK, SHARE_SCALE, line_styles
+from .colours import SHARE_SCALE, line_styles
 
 Array = npt.NDArray[np.float64]
 

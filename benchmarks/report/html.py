@@ -16,8 +16,8 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
+from ...envs.rendering.palette import INK, base, colour
 from ..harness.results import Suite, Table, write_text
-from .colours import INK, base, colour
 
 
 def write_report(

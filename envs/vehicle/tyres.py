@@ -213,22 +213,45 @@ def tyre_forces(
 ) -> Any:
     """(F_yf, F_yr, F_x, N_z): lateral forces of the axles, drive force, moment of the motors.
 
+    The arguments are those of `tyres_at`.
+    """
+    if shifts(small_angle, law, roll):
+        a, b, c, d, F_x, N_z = _shifted_tyres(motion, load, car, g_y)
+        F_fl, F_fr, F_rl, F_rr = lateral_forces(a, b, c, d, law, 0)
+        return F_fl + F_fr, F_rl + F_rr, F_x, N_z
+    a, b, c, d, F_x, N_z = _standing_tyres(motion, load, car, small_angle)
+    F_fl, F_fr, F_rl, F_rr = lateral_forces(a, b, c, d, law, small_angle)
+    return F_fl + F_fr, F_rl + F_rr, F_x, N_z
+
+
+@inlined
+def tyres_at(
+    motion: Any, load: Any, car: Any, g_y: Any, small_angle: int, law: int, roll: int
+) -> Any:
+    """The four Tyres, front left and right, rear left and right; then the drive force in N and the
+    moment in N m of the motors.
+
     g_y: m/s2, the road's bank as the car feels it. Roll moves load from side to side, which
     matters to tyres with a limit only, and is left out of the small-angle plant.
     """
     if shifts(small_angle, law, roll):
-        return _shifted_forces(motion, load, car, g_y, law)
+        return _shifted_tyres(motion, load, car, g_y)
+    return _standing_tyres(motion, load, car, small_angle)
+
+
+@inlined
+def _standing_tyres(motion: Any, load: Any, car: Any, small_angle: int) -> Any:
+    """`tyres_at` where roll moves no load."""
     t_f, t_r = slips(motion, load, car, small_angle)
     front = Tyre(t_f, load.limit_f, load.slope_f)
     left = Tyre(t_r, load.limit_l, load.slope_l)
     right = Tyre(t_r, load.limit_r, load.slope_r)
-    F_fl, F_fr, F_rl, F_rr = lateral_forces(front, front, left, right, law, small_angle)
-    return F_fl + F_fr, F_rl + F_rr, load.F_x, load.N_z
+    return front, front, left, right, load.F_x, load.N_z
 
 
 @inlined
-def _shifted_forces(motion: Any, load: Any, car: Any, g_y: Any, law: int) -> Any:
-    """`tyre_forces` of tyres whose load roll moves from side to side.
+def _shifted_tyres(motion: Any, load: Any, car: Any, g_y: Any) -> Any:
+    """`tyres_at` where roll moves load from side to side.
 
     A quotient costs ten products: the slips' and the slopes' are all taken from one.
     """
@@ -244,12 +267,11 @@ def _shifted_forces(motion: Any, load: Any, car: Any, g_y: Any, law: int) -> Any
     per = 1.0 / (along_f * along_r * (sides * squares))
     front = load.slope_f * (along_r * squares * per)  # C_f / 3 F_max of the standing tyre, 1/along
     rear = car.C_r * (1.0 / 3.0) * (along_f * sides * per)
-    F_fl, F_fr, F_rl, F_rr = lateral_forces(
+    return (
         Tyre(across_f, load.limit_f * narrow, front * wide),
         Tyre(across_f, load.limit_f * wide, front * narrow),
         Tyre(across_r, left, rear * square_r * left),
         Tyre(across_r, right, rear * square_l * right),
-        law,
-        0,
+        F_l + F_r,
+        0.5 * car.d_r * (F_r - F_l),
     )
-    return F_fl + F_fr, F_rl + F_rr, F_l + F_r, 0.5 * car.d_r * (F_r - F_l)

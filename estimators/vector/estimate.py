@@ -16,7 +16,7 @@ from ...envs.task.observation import Entry
 from ...envs.vehicle.vehicles import VehicleSource
 from ..wrappers.arguments import Arguments, Setup, Source
 from ..wrappers.estimate import EstimateObservation as Single
-from ..wrappers.outputs import BETA, NEES, outputs_of
+from ..wrappers.outputs import BETA, NEES, STD, outputs_of, titled
 from ..wrappers.truth import as_built, set_stiffness
 from .make import batch_of
 from .records import BatchedRecords, Records, SyncRecords, records_of, state_of, true_vehicles
@@ -84,6 +84,7 @@ class EstimateObservation(
         inner = () if replace else getattr(env, "layout", self._records.layout)
         states = self.estimator.names
         self._outputs = outputs_of(arguments.label, states, outputs, std, name, inner)
+        self._title = titled(arguments.label, name)
         self.layout: tuple[Entry, ...] = self._outputs.layout
         low, high = self._outputs.bounds
         self.single_observation_space = gym.spaces.Box(low, high, dtype=np.float32)
@@ -232,7 +233,7 @@ class EstimateObservation(
                 values[~present] = 0.0
             infos[key], infos[f"_{key}"] = values, present
             if place == BETA:
-                self._records.annotate(key, values, mask)
+                self._records.annotate(self._title, values, summary[:, STD], mask)
 
 
 def _records_below(env: VectorEnv[Any, Any, Any]) -> SyncRecords | BatchedRecords:

@@ -74,8 +74,10 @@ class BatchedRecords:
         env = self._env
         return [Setup(env.nominal[i], env.slow_sensors[i], env.held_speed[i]) for i in rows]
 
-    def annotate(self, key: str, values: Array, mask: npt.NDArray[np.bool_]) -> None:
-        """Numbers to draw: a batch is not drawn."""
+    def annotate(self, label: str, beta: Array, std: Array, rows: npt.NDArray[np.bool_]) -> None:
+        """Estimates of some rows to draw beside the truth, by an env that draws."""
+        if hasattr(self._env, "annotate"):
+            self._env.annotate(label, beta, std, rows)
 
 
 class SyncRecords:
@@ -122,11 +124,10 @@ class SyncRecords:
         """What the environments of some rows offer to their estimators."""
         return [setup_of(self._bases[i]) for i in rows]
 
-    def annotate(self, key: str, values: Array, mask: npt.NDArray[np.bool_]) -> None:
-        """Numbers to draw beside the truth."""
-        for base, value, drawn in zip(self._bases, values.tolist(), mask, strict=True):
-            if drawn:
-                base.annotate(**{key: value})
+    def annotate(self, label: str, beta: Array, std: Array, rows: npt.NDArray[np.bool_]) -> None:
+        """Estimates of some rows to draw beside the truth."""
+        for i in np.flatnonzero(rows):
+            self._bases[i].annotate(label, float(beta[i]), float(std[i]))
 
 
 def true_vehicles(base: Any, rows: Sequence[int]) -> list[Vehicle]:

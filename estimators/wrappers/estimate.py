@@ -14,7 +14,7 @@ from ...envs.vehicle.vehicles import VehicleSource
 from ..estimator import Estimator
 from .arguments import AnyEstimator, Arguments, Setup, Source, setup_of
 from .kernel import observe_entry
-from .outputs import BETA, outputs_of, write
+from .outputs import BETA, STD, outputs_of, titled, write
 from .truth import as_built, set_stiffness
 
 _MAY_STAND_BETWEEN = (PassiveEnvChecker, OrderEnforcing)
@@ -86,7 +86,7 @@ class EstimateObservation(
         self.layout: tuple[Entry, ...] = self._outputs.layout
         low, high = self._outputs.bounds
         self.observation_space = gym.spaces.Box(low, high, dtype=np.float32)
-        self._width = len(self.layout)
+        self._width, self._title = len(self.layout), titled(label, name)
         self._summary = np.zeros(3)
 
     def _configured(self) -> AnyEstimator:
@@ -161,7 +161,7 @@ class EstimateObservation(
         for key, place in outputs.keys:
             info[key] = values[place]
             if place == BETA:
-                base.annotate(**{key: values[place]})
+                base.annotate(self._title, values[BETA], values[STD])
         return out
 
 

@@ -82,6 +82,11 @@ def outputs_of(
     )
 
 
+def titled(label: str, name: str | None) -> str:
+    """What a wrapper's estimates are called in pictures."""
+    return label if name is None else f"{label} ({name})"
+
+
 def write(
     estimator: EstimatorLike,
     obs: npt.NDArray[np.float32],

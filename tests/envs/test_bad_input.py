@@ -45,7 +45,7 @@ ARGUMENTS: list[tuple[Arguments, type[Exception], str]] = [
     ),
     ({"fast": "some"}, ValueError, "fast is 'summary' or 'all', got 'some'"),
     ({"on_bad_action": "shrug"}, ValueError, "on_bad_action is 'raise' or 'fail', got 'shrug'"),
-    ({"render_mode": "human"}, TypeError, "unknown render_mode 'human'"),
+    ({"render_mode": "ansi"}, ValueError, "unknown render_mode 'ansi'; known: human, rgb_array"),
     ({"gps": {"period": 0.1}}, ValueError, "this id has no gps; it has: camera"),
     ({"camera": {"perriod": 0.1}}, TypeError, "perriod"),
     ({"camera": {"period": -0.1}}, ValueError, "period must be at least one tick, got -0.1"),

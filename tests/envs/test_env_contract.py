@@ -183,11 +183,10 @@ def test_spec_goes_through_json(name: str) -> None:
 def test_docstring_tells_arguments_options_info_and_states(name: str) -> None:
     text = StabilityEnv.__doc__ or ""
     words = set(re.findall(r"\w+", text))
-    parameters = StabilityEnv.__init__.__annotations__.keys() - {"return", "render_mode"}
+    parameters = StabilityEnv.__init__.__annotations__.keys() - {"return"}
     assert parameters - words == set()
     assert set(INFO) <= words
     assert {"scenario", "vehicle", "friction", "state", "duration"} <= words
     assert {"v_x", "v_y", "gamma", "psi", "X", "Y", "s", "y", "theta"} <= words
     for section in ("Action", "Observation", "Record", "Reward", "Episode end", "Info", "Options"):
         assert f"## {section}" in text
-    assert unwrapped(name).metadata["render_modes"] == []

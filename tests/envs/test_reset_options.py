@@ -141,9 +141,10 @@ def test_slow_sensors_can_be_changed_field_by_field() -> None:
 
 def test_annotations_are_for_drawing_and_end_with_the_episode(env: StabilityEnv) -> None:
     env.reset(seed=0)
-    env.annotate(beta_hat=0.1)
-    env.annotate(beta_hat=0.2, beta_std=0.01)
-    assert env.annotations == {"beta_hat": 0.2, "beta_std": 0.01}
+    env.annotate("mine", 0.1, 0.02)
+    env.annotate("mine", 0.2, 0.01)
+    env.annotate("another", 0.3, 0.01)
+    assert env.annotations == {"mine": (0.2, 0.01), "another": (0.3, 0.01)}
     env.reset()
     assert env.annotations == {}
 

@@ -6,7 +6,8 @@ import sys
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.report.colours import COLOURS, INK, colour, line_styles
+from sideslip.benchmarks.report.colours import line_styles
+from sideslip.envs.rendering.palette import COLOURS, INK, colour
 
 
 def test_colours_stay_with_their_names() -> None:

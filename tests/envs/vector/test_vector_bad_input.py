@@ -23,7 +23,7 @@ ARGUMENTS: list[tuple[dict[str, Any], type[Exception], str]] = [
     ({"autoreset_mode": "Later"}, ValueError, "'Later'; known: 'NextStep', 'SameStep', 'Disabled'"),
     ({"info": "some"}, ValueError, "info is 'all' or 'ends', got 'some'"),
     ({"scenario": "slalon"}, ValueError, "unknown scenario 'slalon'"),
-    ({"render_mode": "human"}, TypeError, "unknown render_mode 'human'"),
+    ({"render_mode": "ansi"}, ValueError, "unknown render_mode 'ansi'; known: human, rgb_array"),
     ({"on_bad_action": "shrug"}, ValueError, "on_bad_action is 'raise' or 'fail'"),
     ({"estimator": "dakf"}, TypeError, "unexpected keyword argument 'estimator'"),
 ]

@@ -133,9 +133,10 @@ def test_several_estimators_stand_side_by_side() -> None:
         obs, *_, info = env.step(still(env))
     assert info["plain_beta_hat"] != info["beta_hat"]
     values = dict(zip([entry.name for entry in env.layout], obs, strict=True))
-    for name in ("plain_beta_hat", "beta_hat"):
-        assert values[name] == np.float32(info[name])
-        assert env.unwrapped.annotations[name] == info[name]
+    for before, title in (("plain_", "bicycle-kf (plain)"), ("", "exact-kf")):
+        hat, std = info[f"{before}beta_hat"], info[f"{before}beta_std"]
+        assert values[f"{before}beta_hat"] == np.float32(hat)
+        assert env.unwrapped.annotations[title] == (hat, std)
 
 
 @pytest.mark.parametrize(

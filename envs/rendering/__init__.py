@@ -1,0 +1,1 @@
+"""Pictures of cars: what is drawn of each (`scene`, `trace`), on what (`canvas`), and the views."""

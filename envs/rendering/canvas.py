@@ -1,0 +1,146 @@
+"""A canvas: shapes are drawn at twice their size and shrunk, so that edges are smooth; text is not.
+
+Nothing here needs a display.
+"""
+
+import functools
+import os
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+try:
+    import pygame
+except ModuleNotFoundError as error:
+    raise ModuleNotFoundError(
+        "pictures need pygame: pip install 'sideslip[render]'", name=error.name
+    ) from None
+
+Points = npt.ArrayLike
+"""Places, (n, 2)."""
+Box = tuple[float, float, float, float]
+"""Left, top, width and height in pixels."""
+
+_TIMES = 2
+_FONTS = "dejavusans,notosans,liberationsans,arial,helveticaneue,segoeui"
+
+
+class Canvas:
+    """A picture of `size` pixels, (width, height). Places and widths are in pixels of the result,
+    x to the right and y down; colours are "#RRGGBB"."""
+
+    def __init__(self, size: tuple[int, int]) -> None:
+        self.size = size
+        self._large = pygame.Surface((size[0] * _TIMES, size[1] * _TIMES), 0, 32)
+        self._texts: list[tuple[pygame.Surface, tuple[float, float]]] = []
+
+    def within(self, box: Box | None) -> None:
+        """Draw only there from now on; None: everywhere. Text is drawn everywhere."""
+        self._large.set_clip(None if box is None else [round(_TIMES * each) for each in box])
+
+    def area(self, box: Box, colour: str, radius: float = 0.0) -> None:
+        """A filled box with round corners."""
+        scaled = pygame.Rect([round(_TIMES * each) for each in box])
+        pygame.draw.rect(self._large, colour, scaled, border_radius=round(_TIMES * radius))
+
+    def polygon(self, points: Points, colour: str) -> None:
+        """A filled polygon."""
+        scaled = _scaled(points)
+        pygame.draw.polygon(self._large, colour, scaled)
+        pygame.draw.aalines(self._large, colour, True, scaled)
+
+    def line(self, points: Points, colour: str, width: float = 1.0) -> None:
+        """A line through at least two points."""
+        scaled, thick = _scaled(points), max(round(_TIMES * width), 1)
+        pygame.draw.lines(self._large, colour, False, scaled, thick)
+        if thick > 4:
+            for point in scaled:
+                pygame.draw.circle(self._large, colour, point, thick / 2)
+
+    def dashes(
+        self, points: Points, colour: str, width: float = 1.0, on: float = 6.0, off: float = 5.0
+    ) -> None:
+        """A dashed line: so many pixels drawn, so many not."""
+        along = np.asarray(points, float)
+        steps = np.hypot(*np.diff(along, axis=0).T)
+        length = np.concatenate([[0.0], np.cumsum(steps)])
+        starts = np.arange(0.0, length[-1], on + off)
+        ends = np.stack([starts, np.minimum(starts + on, length[-1])], 1).ravel()
+        places = _scaled(np.stack([np.interp(ends, length, each) for each in along.T], 1))
+        for start, end in zip(places[::2], places[1::2], strict=True):
+            pygame.draw.line(self._large, colour, start, end, max(round(_TIMES * width), 1))
+
+    def disc(self, centre: Any, radius: float, colour: str) -> None:
+        """A filled circle."""
+        pygame.draw.circle(self._large, colour, _scaled([centre])[0], _TIMES * radius)
+
+    def ring(self, centre: Any, radius: float, colour: str, width: float = 1.0) -> None:
+        """A circle."""
+        place, thick = _scaled([centre])[0], max(round(_TIMES * width), 1)
+        pygame.draw.circle(self._large, colour, place, _TIMES * radius + thick / 2, thick)
+
+    def arrow(self, start: Any, end: Any, colour: str, width: float = 2.0) -> None:
+        """A line with a head at its end; the head shrinks with a short one."""
+        a, b = np.asarray(start, float), np.asarray(end, float)
+        length = float(np.hypot(*(b - a)))
+        if length < 1.0:
+            return
+        ahead = (b - a) / length
+        aside, head = np.array([-ahead[1], ahead[0]]), min(4.0 * width, 0.6 * length)
+        neck = b - head * ahead
+        half = 0.5 * width * aside
+        self.polygon([a + half, neck + half, neck - half, a - half], colour)
+        self.polygon([b, neck + 0.45 * head * aside, neck - 0.45 * head * aside], colour)
+
+    def text(
+        self,
+        place: Any,
+        words: str,
+        colour: str,
+        size: int = 13,
+        align: float = 0.0,
+        bold: bool = False,
+    ) -> float:
+        """Words whose middle line passes the place; align 0 begins there, 1 ends there. Returns
+        their width."""
+        drawn = _words(words, colour, size, bold)
+        width, height = drawn.get_size()
+        self._texts.append((drawn, (place[0] - align * width, place[1] - 0.5 * height)))
+        return float(width)
+
+    def finished(self) -> pygame.Surface:
+        """The picture; the canvas may be drawn upon anew."""
+        small = pygame.transform.smoothscale(self._large, self.size)
+        small.blits(self._texts)
+        self._texts = []
+        return small
+
+
+def pixels(picture: pygame.Surface) -> npt.NDArray[np.uint8]:
+    """A picture as an array (height, width, 3)."""
+    width, height = picture.get_size()
+    flat = np.frombuffer(pygame.image.tobytes(picture, "RGB"), np.uint8)
+    return flat.reshape(height, width, 3).copy()
+
+
+def _scaled(points: Points) -> list[tuple[int, int]]:
+    """Places on the large surface; what lies far outside is drawn at its edge's other side."""
+    whole = np.rint(np.clip(np.asarray(points, float), -4000.0, 4000.0) * _TIMES).astype(int)
+    return [(x, y) for x, y in whole.tolist()]
+
+
+@functools.cache
+def _font(size: int, bold: bool) -> pygame.font.Font:
+    pygame.font.init()
+    return pygame.font.SysFont(_FONTS, size, bold)
+
+
+@functools.lru_cache(512)
+def _words(words: str, colour: str, size: int, bold: bool) -> pygame.Surface:
+    try:
+        return _font(size, bold).render(words, True, colour)
+    except pygame.error:  # somebody's window called pygame.quit(), which ends all fonts
+        _font.cache_clear()
+        return _font(size, bold).render(words, True, colour)

@@ -1,0 +1,145 @@
+"""What makes an environment one that can be drawn. Pygame is loaded with the first picture."""
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from gymnasium import logger
+from gymnasium.error import ResetNeeded
+
+from ..arguments import check_choice
+from ..engine.layout import P, Z
+from ..engine.packing import EpisodeConfig
+from ..record import Array
+from ..ticks import TICK
+from .trace import Shot, Trace
+
+Frame = npt.NDArray[np.uint8]
+Numbers = tuple[Array, Array, Any, Array, EpisodeConfig]
+"""The first fields of a `Shot`."""
+MODES = ("human", "rgb_array")
+_SHOWN = 20  # ticks of driving between two pictures in a window, or a control period
+
+
+class Drawn:
+    """An environment of one or more cars that draws them.
+
+    render_mode: None, "rgb_array" (`render` returns frames, (540, 960, 3) bytes) or "human" (a
+    window in which `reset` and `step` show the first car, in real time). The drawing reads what the
+    engine wrote and changes nothing of it. The strip charts begin at an episode's first picture.
+
+    Raises ValueError for an unknown mode; with the first picture ModuleNotFoundError where pygame
+    is missing, RuntimeError where there is no display, ResetNeeded where there was no reset.
+    """
+
+    control_period: int
+    render_mode: str | None
+    metadata: dict[str, Any] = {"render_modes": list(MODES), "render_fps": 100}  # noqa: RUF012
+
+    def _draw_in(self, mode: str | None) -> None:
+        """Take the render mode; `render_fps` is that of real time."""
+        if mode is not None:
+            check_choice("render_mode", mode, MODES)
+        self.render_mode = mode
+        rate = max(round(1.0 / (self.control_period * TICK)), 1)
+        self.metadata = {**self.metadata, "render_fps": rate}
+        self._traces = [Trace()] if mode == "human" else []
+
+    def _numbers(self, row: int) -> Numbers:
+        """A car's packed numbers: views, which change with the car."""
+        raise NotImplementedError
+
+    def _seen(self) -> None:
+        """Remember what a reset or a step led to, and show it in the window if there is one.
+
+        Called where `_traces` has some. The window is an estimate behind: wrappers have not
+        estimated yet.
+        """
+        for row, trace in enumerate(self._traces):
+            _, state, _, report, _ = self._numbers(row)
+            trace.add(report, state)
+        if self.render_mode == "human":
+            self._show()
+
+    def _show(self) -> None:
+        from . import picture, window
+
+        n, now = self.control_period, self.shot(0)
+        between = n * max(-(-_SHOWN // n), 1)
+        if int(now.state[Z.clock.tick]) % between == 0:
+            window.show(picture.draw(now), 1.0 / (between * TICK))
+
+    def shot(self, row: int = 0) -> Shot:
+        """What a car's picture is drawn from."""
+        if not self._traces:
+            self._traces = [Trace() for _ in range(self._cars)]
+        now = Shot(*self._numbers(row), self._traces[row])
+        if not now.params[P.car.m] > 0.0:
+            raise ResetNeeded("there is nothing to draw yet: call reset() first")
+        if now.trace.empty:
+            now.trace.add(now.report, now.state)
+        return now
+
+    def _frames(self) -> tuple[Frame, ...] | None:
+        """A frame of each car; None where a window shows them or no mode was asked for."""
+        if self.render_mode == "rgb_array":
+            from .canvas import pixels
+            from .picture import draw
+
+            return tuple(pixels(draw(self.shot(row))) for row in range(self._cars))
+        if self.render_mode == "human":
+            self._show()
+        else:
+            logger.warn("render() draws nothing: the env was made without a render_mode")
+        return None
+
+    @property
+    def _cars(self) -> int:
+        return int(getattr(self, "num_envs", 1))
+
+    def _close_window(self) -> None:
+        if self.render_mode == "human":
+            from .window import close
+
+            close()
+
+
+class DrawnOne(Drawn):
+    """A single environment that draws its car."""
+
+    def _draw_in(self, mode: str | None) -> None:
+        super()._draw_in(mode)
+        self.annotations: dict[str, tuple[float, float]] = {}
+
+    def annotate(self, label: str, beta: float, std: float) -> None:
+        """A wrapper's estimate of the sideslip angle now and its standard deviation, in rad, to be
+        drawn beside the truth."""
+        self.annotations[label] = beta, std
+        if self._traces:
+            self._traces[0].estimate(label, beta, std)
+
+    def render(self) -> Frame | None:
+        """The car's frame in the mode "rgb_array", else None."""
+        frames = self._frames()
+        return None if frames is None else frames[0]
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        self._close_window()
+
+
+class DrawnRows(Drawn):
+    """A vector environment that draws its cars."""
+
+    def annotate(self, label: str, beta: Array, std: Array, rows: npt.NDArray[np.bool_]) -> None:
+        """The same as of a single environment for some rows, each (N,)."""
+        for row in np.flatnonzero(rows[: len(self._traces)]):
+            self._traces[row].estimate(label, beta[row], std[row])
+
+    def render(self) -> tuple[Frame, ...] | None:
+        """A frame of each car in the mode "rgb_array", else None."""
+        return self._frames()
+
+    def close_extras(self, **_: Any) -> None:
+        """Close the window, if there is one."""
+        self._close_window()

@@ -1,0 +1,215 @@
+"""The road from above: the car in true proportion, its lane or cones, its trail, what its camera
+sees. The road's direction at the car is to the right, left of it is up."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ..record import Array
+from ..task.failures import FAILURES
+from ..vehicle.vehicle import Vehicle
+from .canvas import Box, Canvas
+from .palette import INK, PALETTE, mixed
+from .scene import AHEAD, Scene
+from .trace import MOMENT
+
+BLUE, ORANGE = PALETTE[0], PALETTE[1]
+ASPHALT, GRASS, PAINT, FAINT, SOFT = "#D9DCE0", "#E2E9DA", "#FFFFFF", "#AEB4BA", "#6B7177"
+ROOF, TYRE = "#FFFFFF", "#23272B"
+SCALE = 22.0  # pixels a metre
+LANE = 1.75  # m to either side of the centre line, where the scenario sets no limit
+OVERHANG = 1.62  # length of a car in wheelbases
+
+
+class Driven(NamedTuple):
+    """A car to draw: where it is, where it was, the colour of its body, and a name beside it."""
+
+    scene: Scene
+    truth: Array  # rows of `Moment`
+    colour: str
+    name: str = ""
+
+
+class View(NamedTuple):
+    """From the ground to pixels."""
+
+    x: float  # m, the place on the ground that is drawn at `centre`
+    y: float
+    cos: float  # of the direction that is drawn to the right
+    sin: float
+    centre: tuple[float, float]  # pixels
+
+    def __call__(self, points: Array) -> Array:
+        """Pixels of places on the ground, (n, 2)."""
+        rel = np.asarray(points, float) - (self.x, self.y)
+        right = rel[:, 0] * self.cos + rel[:, 1] * self.sin
+        up = rel[:, 1] * self.cos - rel[:, 0] * self.sin
+        return np.stack([self.centre[0] + SCALE * right, self.centre[1] - SCALE * up], 1)
+
+
+class Road:
+    """The centre line: as it was driven along, and as it goes on."""
+
+    def __init__(self, scene: Scene, truth: Array) -> None:
+        s, y, theta = truth[:, MOMENT.s], truth[:, MOMENT.y], truth[:, MOMENT.theta]
+        X = truth[:, MOMENT.X] + y * np.sin(theta)
+        Y = truth[:, MOMENT.Y] - y * np.cos(theta)
+        back, on = np.arange(-float(AHEAD), 0.0), np.arange(1.0, AHEAD + 1.0)
+        turned = theta[-1] + np.cumsum(scene.bends)
+        middle = turned - 0.5 * scene.bends
+        ahead = X[-1] + np.cumsum(np.cos(middle)), Y[-1] + np.cumsum(np.sin(middle))
+        self._s = np.concatenate([s[0] + back, s, s[-1] + on])
+        self._X = np.concatenate([X[0] + back * np.cos(theta[0]), X, ahead[0]])
+        self._Y = np.concatenate([Y[0] + back * np.sin(theta[0]), Y, ahead[1]])
+        self._theta = np.concatenate([theta[0] + 0.0 * back, theta, turned])
+
+    def at(self, s: Array, y: Array) -> Array:
+        """Places on the ground at distances s along the road and y to its left, (n, 2)."""
+        theta = np.interp(s, self._s, self._theta)
+        X, Y = np.interp(s, self._s, self._X), np.interp(s, self._s, self._Y)
+        return np.stack([X - y * np.sin(theta), Y + y * np.cos(theta)], 1)
+
+
+def draw_road(canvas: Canvas, box: Box, cars: list[Driven]) -> None:
+    """The road around the last of the cars, in a box; the others are ghosts beside it."""
+    scene, truth, *_ = cars[-1]
+    motion, road = scene.motion, Road(scene, truth)
+    reach = box[3] / SCALE / 2.0 - 2.5  # the view follows a car that would leave it
+    y = motion.y - min(max(motion.y, -reach), reach)
+    x_0, y_0 = road.at(np.array([motion.s]), np.array([y]))[0]
+    centre = box[0] + 0.3 * box[2], box[1] + 0.5 * box[3]
+    view = View(x_0, y_0, np.cos(motion.theta), np.sin(motion.theta), centre)
+    s = np.arange(motion.s - 16.0, motion.s + 34.0, 1.0)
+    canvas.within(box)
+    _surface(canvas, box, view, road, scene, s)
+    if scene.sight is not None:
+        _sight(canvas, view, road, scene)
+    _marks(canvas, box, view, road, scene, s)
+    for car in cars:
+        trail = view(car.truth[-400:, [MOMENT.X, MOMENT.Y]])
+        if len(trail) > 1:
+            canvas.line(trail, mixed(car.colour, ASPHALT, 0.55), 2.0)
+    for car in cars:
+        m = car.scene.motion
+        pose = view(np.array([[m.X, m.Y]]))[0]
+        draw_car(canvas, pose, m.psi - motion.theta, SCALE, car.scene, car.colour)
+        above = pose - (0.0, 0.5 * SCALE * car.scene.vehicle.width + 16.0)
+        if car.name and box[0] < above[0] < box[0] + box[2] and box[1] < above[1] - 8.0:
+            failure = car.scene.failure
+            words = f"{car.name}: {FAILURES[failure]}" if failure else car.name
+            canvas.text(above, words, mixed(car.colour, INK, 0.6), 12, 0.5)
+    canvas.within(None)
+
+
+def _band(road: Road, view: View, s: Array, right: float, left: float) -> Array:
+    """The outline of a strip of the road between two offsets."""
+    edges = road.at(s, np.full_like(s, right)), road.at(s[::-1], np.full_like(s, left))
+    return view(np.concatenate(edges))
+
+
+def _surface(canvas: Canvas, box: Box, view: View, road: Road, scene: Scene, s: Array) -> None:
+    """Grass and asphalt, or a wide proving ground; the lanes between cones are lighter."""
+    wide = scene.half_width > 10.0
+    canvas.area(box, ASPHALT if wide or scene.lanes else GRASS)
+    if not (wide or scene.lanes):
+        edge = scene.half_width + 0.6
+        canvas.polygon(_band(road, view, s, -edge, edge), ASPHALT)
+    for lane in scene.lanes:
+        along = np.array([lane.start, lane.start + lane.length])
+        half = 0.5 * lane.width
+        outline = _band(road, view, along, lane.offset - half, lane.offset + half)
+        canvas.polygon(outline, mixed(PAINT, ASPHALT, 0.5))
+
+
+def _marks(canvas: Canvas, box: Box, view: View, road: Road, scene: Scene, s: Array) -> None:
+    """Lane markings, or cones with the driver's path; a thin line every ten metres."""
+    for place in np.arange(10.0 * np.ceil(s[0] / 10.0), s[-1], 10.0):
+        across = view(road.at(np.full(2, place), np.array([-30.0, 30.0])))
+        canvas.line(across, mixed(PAINT, ASPHALT, 0.35), 1.0)
+        x, top = across[:, 0].mean(), box[1] + box[3]
+        canvas.text((x + 4.0, top - 10.0), f"{place:.0f} m", SOFT, 11)
+    if scene.lanes:
+        path = scene.path[(scene.path[:, 0] > s[0]) & (scene.path[:, 0] < s[-1])]
+        canvas.dashes(view(road.at(*path.T)), SOFT, 1.0, 2.0, 4.0)
+    else:
+        edge = scene.half_width if scene.half_width <= 10.0 else LANE
+        for side in (-edge, edge):
+            canvas.line(view(road.at(s, np.full_like(s, side))), PAINT, 2.0)
+        for start in np.arange(9.0 * np.floor(s[0] / 9.0), s[-1], 9.0):
+            dash = start + np.arange(4.0)
+            canvas.line(view(road.at(dash, 0.0 * dash)), PAINT, 2.0)
+    for lane in scene.lanes:
+        count = max(round(lane.length / 3.0), 2)
+        for place in np.linspace(lane.start, lane.start + lane.length, count + 1):
+            for side in (-0.5, 0.5):
+                at = np.array([place]), np.array([lane.offset + side * lane.width])
+                if abs(place - s.mean()) < 30.0:
+                    cone = view(road.at(*at))[0]
+                    canvas.disc(cone, 3.6, ORANGE)
+                    canvas.disc(cone, 1.4, PAINT)
+
+
+def _sight(canvas: Canvas, view: View, road: Road, scene: Scene) -> None:
+    """The camera's field of view to the preview point, and the offset there that it measures."""
+    m, sight = scene.motion, scene.sight
+    assert sight is not None
+    colour = PALETTE[5] if sight.sees else ORANGE
+    angles = m.psi + np.linspace(-sight.half_angle, sight.half_angle, 9)
+    reach = sight.ahead / np.cos(angles - m.psi)
+    rim = np.stack([m.X + reach * np.cos(angles), m.Y + reach * np.sin(angles)], 1)
+    wedge = np.concatenate([[[m.X, m.Y]], rim])
+    canvas.polygon(view(wedge), mixed(colour, ASPHALT, 0.2))
+    ahead = np.array([[m.X + sight.ahead * np.cos(m.psi), m.Y + sight.ahead * np.sin(m.psi)]])
+    if sight.sees:
+        lane = road.at(np.array([m.s + sight.ahead]), np.array([0.0]))
+        canvas.line(view(np.concatenate([lane, ahead])), colour, 2.5)
+        canvas.disc(view(lane)[0], 3.0, colour)
+
+
+def draw_car(
+    canvas: Canvas, place: Array, heading: float, scale: float, scene: Scene, colour: str
+) -> None:
+    """A car at a place in pixels; heading: rad from the picture's right, to the left positive."""
+    cos, sin = np.cos(heading), np.sin(heading)
+
+    def on(points: Array) -> Array:
+        x, y = np.asarray(points, float).T * scale
+        return np.stack([place[0] + x * cos - y * sin, place[1] - x * sin - y * cos], 1)
+
+    front, rear, half = body(scene.vehicle)
+    for wheel in scene.wheels:  # further out than they are, to be seen
+        outline = wheel_outline(wheel.x, np.sign(wheel.y) * half, wheel.angle, scene.vehicle)
+        canvas.polygon(on(outline), TYRE)
+    canvas.polygon(on(rounded(rear, front, half)), colour)
+    glass, length = mixed(INK, colour, 0.55), front - rear
+    for back, ahead, tip, foot in ((0.62, 0.74, 0.72, 0.86), (0.14, 0.21, 0.86, 0.74)):
+        x, y = rear + np.array([back, ahead]) * length, np.array([foot, tip]) * half
+        canvas.polygon(on(np.stack([x[[0, 1, 1, 0]], [y[0], y[1], -y[1], -y[0]]], 1)), glass)
+
+
+def body(vehicle: Vehicle) -> tuple[float, float, float]:
+    """(front, rear, half width) in m from the centre of gravity."""
+    over = 0.5 * (OVERHANG - 1.0) * vehicle.wheelbase
+    return vehicle.front_arm + over, -vehicle.rear_arm - over, 0.5 * vehicle.width
+
+
+def rounded(rear: float, front: float, half: float) -> Array:
+    """A body's outline: a box whose corners are quarters of an ellipse, longer at the front."""
+    turn = np.linspace(0.0, 0.5 * np.pi, 6)
+    outline = []
+    for x, y, a, b in ((front, half, 0.45, 0.4), (rear, half, 0.2, 0.25)):
+        a, b = min(a, 0.3 * (front - rear)), min(b, 0.7 * half)
+        sign = 1.0 if x > 0.0 else -1.0
+        corner = np.stack([x - sign * a * (1.0 - np.cos(turn)), y - b * (1.0 - np.sin(turn))], 1)
+        outline.append(corner if x > 0.0 else corner[::-1])
+    left = np.concatenate(outline)
+    return np.concatenate([left, left[::-1] * (1.0, -1.0)])
+
+
+def wheel_outline(x: float, y: float, angle: float, vehicle: Vehicle) -> Array:
+    """A wheel's corners in car axes in m."""
+    r, w = vehicle.wheel_radius, 0.3 * vehicle.wheel_radius
+    corners = np.array([(r, w), (r, -w), (-r, -w), (-r, w)])
+    cos, sin = np.cos(angle), np.sin(angle)
+    turned: Array = corners @ np.array([(cos, sin), (-sin, cos)]) + (x, y)
+    return turned

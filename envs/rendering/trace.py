@@ -1,0 +1,91 @@
+"""What an episode's pictures remember: the truth and the estimates of the steps so far."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..engine.layout import Z
+from ..engine.packing import EpisodeConfig
+from ..record import Array
+from ..task.info import REPORT
+
+
+class Moment(NamedTuple):
+    """Columns of the truth."""
+
+    t: int = 0  # s
+    beta: int = 1  # rad
+    gamma: int = 2  # rad/s
+    beta_ref: int = 3
+    gamma_ref: int = 4
+    yaw_moment: int = 5  # N m
+    X: int = 6  # m, on the ground
+    Y: int = 7
+    s: int = 8  # m, along the road
+    y: int = 9  # m, left of its centre line
+    theta: int = 10  # rad, its direction
+
+
+MOMENT = Moment()
+_OF_REPORT = [getattr(REPORT, name) for name in Moment._fields[: MOMENT.X]]
+_OF_STATE = [getattr(Z.motion, name) for name in Moment._fields[MOMENT.X :]]
+
+
+class Trace:
+    """The steps of an episode that were seen."""
+
+    def __init__(self) -> None:
+        self._rows = np.empty((256, len(MOMENT)))
+        self._count = 0
+        self._estimates: dict[str, Array] = {}
+
+    def add(self, report: Array, state: Array) -> None:
+        """Remember the moment; one that is not after the last begins a new episode."""
+        t, k = report[REPORT.t], self._count
+        if k and t <= self._rows[k - 1, MOMENT.t]:
+            k, self._estimates = 0, {}
+        if k == len(self._rows):
+            self._rows = _grown(self._rows)
+            self._estimates = {name: _grown(each) for name, each in self._estimates.items()}
+        self._rows[k, : MOMENT.X], self._rows[k, MOMENT.X :] = report[_OF_REPORT], state[_OF_STATE]
+        self._count = k + 1
+
+    def estimate(self, label: str, value: float, deviation: float) -> None:
+        """An estimate of beta at the newest moment, and its standard deviation, rad."""
+        if label not in self._estimates:
+            self._estimates[label] = np.full((len(self._rows), 2), np.nan)
+        self._estimates[label][self._count - 1] = value, deviation
+
+    @property
+    def empty(self) -> bool:
+        """Whether nothing was seen yet."""
+        return self._count == 0
+
+    @property
+    def now(self) -> Array:
+        """The newest moment, (len(Moment),)."""
+        newest: Array = self._rows[self._count - 1]
+        return newest
+
+    def since(self, t: float, most: int = 400) -> tuple[Array, dict[str, Array]]:
+        """The truth from a time on, (n, len(Moment)), and by label the estimates and their
+        deviations, (n, 2), NaN where there are none; thinned out to `most` moments or so."""
+        first = int(np.searchsorted(self._rows[: self._count, MOMENT.t], t))
+        step = max((self._count - first) // most, 1)
+        chosen = np.arange(self._count - 1, first - 1, -step)[::-1]
+        return self._rows[chosen], {name: each[chosen] for name, each in self._estimates.items()}
+
+
+class Shot(NamedTuple):
+    """What a picture is drawn from: an episode's packed numbers, and what was seen of it."""
+
+    params: Array  # of `engine.layout`
+    state: Array
+    switches: Any
+    report: Array
+    config: EpisodeConfig
+    trace: Trace
+
+
+def _grown(rows: Array) -> Array:
+    return np.concatenate([rows, np.full_like(rows, np.nan)])

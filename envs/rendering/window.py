@@ -1,0 +1,48 @@
+"""The window of render_mode "human": one a process, as pygame has it."""
+
+import functools
+import os
+
+import pygame
+
+_NO_WINDOW = ("offscreen", "dummy")  # SDL's drivers that show nothing
+
+
+@functools.cache
+def _clock() -> pygame.time.Clock:
+    return pygame.time.Clock()
+
+
+def _opened(size: tuple[int, int]) -> pygame.Surface:
+    try:
+        pygame.display.init()
+        driver = pygame.display.get_driver()
+        if driver in _NO_WINDOW and os.environ.get("SDL_VIDEODRIVER") != driver:
+            raise pygame.error("SDL finds no screen")
+        screen = pygame.display.set_mode(size)
+    except pygame.error as error:
+        close()
+        raise RuntimeError(
+            f"render_mode='human' opens a window, and there is no display ({error}): use "
+            "render_mode='rgb_array', whose frames gymnasium.wrappers.RecordVideo writes to a "
+            "file, or set SDL_VIDEODRIVER=dummy"
+        ) from None
+    pygame.display.set_caption("sideslip")
+    return screen
+
+
+def show(picture: pygame.Surface, rate: float) -> None:
+    """Show a picture, no sooner than 1 / rate seconds after the last one.
+
+    Raises RuntimeError where there is no display.
+    """
+    screen = pygame.display.get_surface() or _opened(picture.get_size())
+    screen.blit(picture, (0, 0))
+    pygame.event.pump()
+    pygame.display.flip()
+    _clock().tick(rate)
+
+
+def close() -> None:
+    """Close the window."""
+    pygame.display.quit()

@@ -1,0 +1,185 @@
+"""What the pixels of a frame mean, and that drawing changes nothing."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+pytest.importorskip("pygame")
+from sideslip.envs import StabilityEnv
+from sideslip.envs.engine.step import kind_of
+from sideslip.envs.rendering.palette import GREY, INK, colour
+from sideslip.envs.rendering.picture import _CLOSEUP, _ROAD, _STRIPS, SIZE, draw
+from sideslip.envs.rendering.road import BLUE, ORANGE
+from sideslip.envs.rendering.scene import scene_of
+from sideslip.envs.rendering.strips import SPAN
+from sideslip.envs.rendering.trace import MOMENT, Trace
+from sideslip.estimators import EstimateObservation
+
+from ..helpers import FULL, bits, play
+
+HARD = FULL | {"steering": "step", "amplitude": 0.12, "onset": 0.1, "roll": True, "friction": 0.5}
+
+
+def painted(frame: Any, shade: str, box: Any) -> Any:
+    """The places (x, y) within a box that have a colour."""
+    left, top, width, height = map(int, box)
+    wanted = [int(shade[i : i + 2], 16) for i in (1, 3, 5)]
+    y, x = np.nonzero((frame[top : top + height, left : left + width] == wanted).all(2))
+    return np.stack([x, y], 1)
+
+
+def started(scenario: Any = "straight", mode: str = "rgb_array", **state: float) -> StabilityEnv:
+    env = StabilityEnv(scenario=scenario, render_mode=mode)
+    env.reset(seed=0, options={"state": state} if state else None)
+    return env
+
+
+def seen(env: StabilityEnv) -> Any:
+    frame = env.render()
+    assert frame is not None
+    return frame
+
+
+def scene(env: StabilityEnv) -> Any:
+    shot = env.shot()
+    return scene_of(shot.params, shot.state, shot.switches, shot.config)
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_a_positive_heading_points_up_and_left_of_the_road_is_up(side: float) -> None:
+    x, y = painted(seen(started(psi=side * 0.5)), BLUE, _ROAD).T
+    assert np.corrcoef(x, -y)[0, 1] * side > 0.5
+    aside = painted(seen(started(y=side * 1.5)), BLUE, _ROAD)[:, 1].mean()
+    assert (0.5 * _ROAD[3] - aside) * side > 20.0
+
+
+@pytest.mark.parametrize("action", [1.0, -1.0])
+def test_a_positive_yaw_moment_drives_the_right_wheel(action: float) -> None:
+    env = started()
+    for _ in range(5):
+        env.step([action])
+    left, right = scene(env).torques
+    assert right * action > 50.0 > -50.0 > left * action
+    rows = painted(seen(env), BLUE, (44.0, _CLOSEUP[1], 31.0, _CLOSEUP[3]))[:, 1]
+    below = rows.mean() > 0.5 * _CLOSEUP[3]  # bars to the right drive; the right motor is below
+    assert below == (action > 0.0)
+
+
+def test_forces_are_the_plants_and_stay_in_their_circles() -> None:
+    env, fullest = started(HARD), 0.0
+    for _ in range(100):
+        before = env.motion
+        env.step([0.0])
+        now = scene(env)
+        assert now.motion == env.motion
+        for wheel in now.wheels:
+            used = np.hypot(wheel.F_x, wheel.F_y) / wheel.capacity
+            fullest = max(fullest, used)
+            assert used <= 1.0 + 1e-9
+    assert fullest > 0.9
+    car, (left, right, *rear) = env.vehicle, now.wheels
+    F_y = (left.F_y + right.F_y) * np.cos(now.steer) + sum(each.F_y for each in rear)
+    moved = (env.motion.v_y - before.v_y) / 0.01 + env.motion.v_x * env.motion.gamma
+    rolled = car.roll_moment_arm * (env.motion.phi_dot - before.phi_dot) / 0.01
+    assert abs(F_y - car.mass * moved + rolled) < 0.05 * abs(F_y)
+    grip = 0.5 * car.mass * 9.81  # of friction 0.5
+    assert sum(each.capacity for each in now.wheels) == pytest.approx(grip, rel=1e-2)
+
+
+def test_linear_tyres_have_no_circle() -> None:
+    env = started(FULL | {"tyres": "linear"})
+    assert [wheel.capacity for wheel in scene(env).wheels] == [0.0] * 4
+    assert kind_of(env._params, env._switches).law == 0
+
+
+def test_the_chart_has_the_truth_and_an_estimate_where_a_wrapper_makes_one() -> None:
+    bare: Any = gym.make("sideslip/YawVision-v0", scenario=HARD, render_mode="rgb_array")
+    for env in (bare, EstimateObservation(bare, "exact-kf")):
+        env.reset(seed=0)
+        frames = [env.render()]
+        for _ in range(60):
+            env.step(np.zeros(1, np.float32))
+        frames.append(env.render())
+        lines = [len(painted(frame, colour("exact-kf"), _STRIPS)) for frame in frames]
+        assert (lines[1] > 20) == (env is not bare)
+        truth = [len(painted(frame, INK, _STRIPS)) for frame in frames]
+        assert truth[1] > truth[0] + 100
+
+
+def test_the_chart_begins_anew_with_an_episode_and_slides() -> None:
+    env = started(FULL | {"duration": 12.0})
+    assert env.render() is not None
+    for _ in range(1100):
+        env.step([0.0])
+    trace = env.shot().trace
+    assert len(trace.since(0.0, 10_000)[0]) == 1101
+    assert len(trace.since(0.0)[0]) <= 800
+    assert trace.now[MOMENT.t] - trace.since(trace.now[MOMENT.t] - SPAN)[0][0, 0] <= SPAN
+    env.reset()
+    assert len(env.shot().trace.since(0.0)[0]) == 1
+
+
+def test_estimates_are_of_their_moment_and_nan_before() -> None:
+    trace, state = Trace(), np.zeros(500)
+    for k in range(300):
+        trace.add(np.full(13, 0.01 * k), state)
+        if k > 250:
+            trace.estimate("mine", float(k), 0.1)
+    truth, estimates = trace.since(2.0, 1000)
+    hats = estimates["mine"][:, 0]
+    known = np.isfinite(hats)
+    assert known.sum() == 49 and np.allclose(hats[known], 100.0 * truth[known, MOMENT.t])
+
+
+def test_drawing_changes_no_bit() -> None:
+    still, drawn = (
+        StabilityEnv(scenario="slalom"),
+        StabilityEnv(scenario="slalom", render_mode="rgb_array"),
+    )
+    assert bits(still.reset(seed=3)) == bits(drawn.reset(seed=3))
+    for _ in range(3):
+        drawn.render()
+        before = drawn.get_state()["state"].tobytes()
+        drawn.render()
+        assert drawn.get_state()["state"].tobytes() == before
+        assert bits(play(still, [0.3] * 40)) == bits(play(drawn, [0.3] * 40))
+
+
+def test_nothing_is_remembered_before_the_first_picture() -> None:
+    env = started()
+    env.step([0.0])
+    assert env._traces == []
+    env.render()
+    env.step([0.0])
+    assert len(env.shot().trace.since(0.0)[0]) == 2
+
+
+def test_every_road_is_drawn() -> None:
+    car: dict[str, Any] = {"vehicle": "passenger-car", "render_mode": "rgb_array"}
+    cones = StabilityEnv(scenario="car-iso-3888-1", **car)
+    bend = StabilityEnv(scenario="curved-road", render_mode="rgb_array")
+    laid = StabilityEnv(scenario="limit-slalom", **car)
+    wind = {"base": "gust", "wind_start": 0.0}
+    windy = StabilityEnv(scenario=wind, sensors="gps", render_mode="rgb_array")
+    for env in (cones, bend, laid, windy):
+        env.reset(seed=0)
+        env.render()
+        for _ in range(60):
+            env.step([0.0])
+        assert seen(env).shape == (*SIZE[::-1], 3) and seen(env).dtype == np.uint8
+    assert len(painted(seen(cones), ORANGE, _ROAD)) > 50
+    assert len(painted(seen(bend), ORANGE, _ROAD)) == 0
+    assert scene(windy).wind != 0.0 and scene(windy).sight is None and scene(bend).sight.sees
+
+
+def test_a_ghost_drives_beside() -> None:
+    one, other = started(), started(y=2.0, Y=2.0)
+    alone = painted(seen(one), GREY, _ROAD)
+    picture = draw(one.shot(), "with control", [("without", other.shot())])
+    from sideslip.envs.rendering.canvas import pixels
+
+    both = painted(pixels(picture), GREY, _ROAD)
+    assert len(both) > len(alone) + 500
+    assert both[:, 1].mean() < 0.5 * _ROAD[3]
