@@ -31,22 +31,36 @@ def enjoy_command(
     json: Annotated[Path | None, typer.Option("--json", help="Write the rows.")] = None,
     parquet: Annotated[Path | None, typer.Option("--parquet", help="Write the rows.")] = None,
     plot: Annotated[Path | None, typer.Option(help="Write the first episode as a PNG.")] = None,
+    video: Annotated[
+        Path | None, typer.Option(help="Write it as a film, .mp4 or .gif, no control beside it.")
+    ] = None,
     card: Annotated[bool, typer.Option("--card", help="Show the policy's card, no more.")] = False,
 ) -> None:
     """Drive a learned policy: its cost against no control and the best classical line."""
     from ...agents.learned.files import load_policy
-    from ..control.figures import run_of
+    from ..control.figures import contestant_of, run_of
     from ..policies import enjoy, suite_of
+    from ..report.film import Driver, check_film, film
 
     console = Console()
     if card:
         _show_card(console, load_policy(policy))
         return
     check_writable(html, json, parquet, plot)
+    check_film(video)
     found = enjoy(policy, episodes, env_id=env, scenario=scenario, seed=seed)
     write_output(console, [suite_of(found)], html, json, parquet)
     first = found.cells[found.policy.name]
     show_episode(console, run_of(first, found.seeds[0]), found.policy.name, plot)
+    if video is not None:
+        cars = (found.policy.name, first), ("no control", found.cells["none"])
+        film(
+            video,
+            [Driver(name, *contestant_of(cell)) for name, cell in cars],
+            found.seeds[0],
+            console,
+        )
+        console.print(f"film: {video}", highlight=False, soft_wrap=True)
 
 
 def _show_card(console: Console, policy: "Policy") -> None:

@@ -97,6 +97,8 @@ def run(
     plot: Annotated[Path | None, typer.Option(help="Write a PNG.")] = None,
     parquet: Annotated[Path | None, typer.Option(help="Write every signal.")] = None,
     kml: Annotated[Path | None, typer.Option(help="Write the track for a map.")] = None,
+    video: Annotated[Path | None, typer.Option(help="Write a film, .mp4 or .gif.")] = None,
+    beside: Annotated[str | None, typer.Option(help="Another agent, a ghost in the film.")] = None,
 ) -> None:
     """Drive one episode, print its score, draw it."""
     import gymnasium as gym
@@ -104,14 +106,17 @@ def run(
     from ...agents import make_agent
     from ...agents.rollout import rollout
     from ...estimators.wrappers.estimate import EstimateObservation
+    from ..report.film import Driver, check_film, film_drive
 
     check_writable(plot, parquet, kml)
+    check_film(video)
     options: dict[str, Any] = {} if scenario is None else {"scenario": scenario}
     env: gym.Env[Any, Any] = gym.make(env_id, control_period=control_period, **options)
     if estimator is not None:
         env = EstimateObservation(env, estimator)
-    drive = rollout(env, make_agent(agent, env), seed)
-    show_episode(console, drive, agent, plot, parquet, kml)
+    driver = Driver(agent, env, make_agent(agent, env))
+    show_episode(console, rollout(env, driver.agent, seed), agent, plot, parquet, kml)
+    film_drive(video, driver, beside, seed, console)
 
 
 @app.command()

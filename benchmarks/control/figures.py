@@ -145,7 +145,12 @@ def over_time(
 
 def run_of(cell: Cell, seed: int) -> Rollout:
     """One episode of a contestant in a single env."""
+    return rollout(*contestant_of(cell), seed)
+
+
+def contestant_of(cell: Cell) -> tuple[Any, Any]:
+    """A single env with its filter, and the contestant that drives it."""
     estimate = estimate_options(cell) if cell.estimator else None
     name = name_of(cell.estimator)
     env = make_env(cell.contest.env_id, name, estimate, **cell.env_options)
-    return rollout(env, make_agent(cell.controller, env, **agent_options(cell)), seed)
+    return env, make_agent(cell.controller, env, **agent_options(cell))

@@ -1,0 +1,142 @@
+"""Films of drives: a car, and others as ghosts on the same road, as MP4 or GIF."""
+
+import copy
+import tempfile
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from rich.console import Console
+from rich.progress import track
+
+from ...agents import make_agent
+from ...agents.rollout import steps_of
+from ...envs.backend.files import whole
+from ...envs.ticks import TICK
+from ..harness.results import check_writable
+
+Frame = npt.NDArray[np.uint8]
+RATES = {".mp4": 50.0, ".gif": 12.5}  # pictures a second, by a file's ending
+_COLOURS = 96  # of a GIF
+
+
+class Driver(NamedTuple):
+    """Who drives which environment, and what the film calls it."""
+
+    name: str
+    env: Any  # a Gymnasium environment of this package, wrapped or not
+    agent: Any  # with stable-baselines3's `predict`, or None
+
+
+def check_film(path: Path | None) -> None:
+    """Refuse before the work what cannot be filmed.
+
+    Raises ValueError for another ending than those of `RATES`, ModuleNotFoundError without the
+    extra `render`, OSError where nothing can be written.
+    """
+    if path is None:
+        return
+    if path.suffix.lower() not in RATES:
+        raise ValueError(f"a film ends in {' or '.join(RATES)}, got {str(path)!r}")
+    check_writable(path)
+    try:
+        import moviepy
+        import pygame
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(
+            f"a film needs {error.name}: pip install 'sideslip[render]'", name=error.name
+        ) from None
+    assert moviepy and pygame
+
+
+def film_drive(
+    path: Path | None, driver: Driver, beside: str | None, seed: int | None, console: Console
+) -> None:
+    """The film of a drive, where there is a path for it; beside: an agent's name, for a ghost that
+    drives in an env of the same kind. Raises as `film` and `make_agent`, ValueError for a ghost
+    without a film."""
+    if path is None:
+        if beside is not None:
+            raise ValueError(f"{beside!r} can only drive beside in a film: --video names its file")
+        return
+    drivers = [driver]
+    if beside is not None:
+        env = copy.deepcopy(driver.env)
+        name = "no control" if beside == "none" else beside
+        drivers.append(Driver(name, env, make_agent(beside, env)))
+    film(path, drivers, seed, console)
+    console.print(f"film: {path}", highlight=False, soft_wrap=True)
+
+
+def film(
+    path: Path, drivers: Sequence[Driver], seed: int | None = 0, console: Console | None = None
+) -> None:
+    """Drive an episode and write its film, whole or not at all; a console shows the progress.
+
+    The first driver's car is filmed until its episode ends; the others' drive on the same road.
+    Raises as `check_film` and, for an env of another package, AttributeError.
+    """
+    check_film(path)
+    base = drivers[0].env.unwrapped
+    step = base.control_period * TICK
+    every = max(round(1.0 / (RATES[path.suffix.lower()] * step)), 1)
+    frames: Iterable[Frame] = frames_of(drivers, seed, every)
+    if console is not None:
+        total = base.config.base.scenario.duration / (every * step) + 1.0
+        frames = track(frames, str(path), total, console=console, transient=True)
+    with tempfile.TemporaryDirectory() as folder:
+        part = Path(folder, "film").with_suffix(path.suffix.lower())
+        write = _write_gif if part.suffix == ".gif" else _write_mp4
+        write(part, frames, 1.0 / (every * step))
+        with whole(path) as file:
+            file.write(part.read_bytes())
+
+
+def frames_of(drivers: Sequence[Driver], seed: int | None, every: int) -> Iterator[Frame]:
+    """A frame of every so many steps of the first driver's episode, and of its last one."""
+    from ...envs.rendering.canvas import pixels
+    from ...envs.rendering.picture import draw
+
+    bases = [driver.env.unwrapped for driver in drivers]
+    first, *others = (steps_of(driver.env, driver.agent, seed) for driver in drivers)
+    for k, step in enumerate(first):
+        for other in others:
+            next(other, None)  # where its episode is over it stays where it is
+        main, *ghosts = [base.shot() for base in bases]
+        if k % every == 0 or step.terminated or step.truncated:
+            names = [driver.name for driver in drivers[1:]]
+            named = list(zip(names, ghosts, strict=True))
+            yield pixels(draw(main, drivers[0].name if ghosts else "true", named))
+
+
+def _write_mp4(path: Path, frames: Iterable[Frame], rate: float) -> None:
+    from moviepy.video.io.ffmpeg_writer import FFMPEG_VideoWriter
+
+    writer = None
+    try:
+        for frame in frames:
+            if writer is None:
+                size = frame.shape[1], frame.shape[0]
+                quality = ["-crf", "20", "-movflags", "+faststart"]
+                writer = FFMPEG_VideoWriter(str(path), size, rate, ffmpeg_params=quality)
+            writer.write_frame(frame)
+    finally:
+        if writer is not None:
+            writer.close()
+
+
+def _write_gif(path: Path, frames: Iterable[Frame], rate: float) -> None:
+    """One palette for all frames, without dither: what does not change costs nothing."""
+    from PIL import Image
+
+    pictures = [Image.fromarray(frame) for frame in frames]
+    sample = np.concatenate(
+        [np.asarray(each)[::2, ::2] for each in pictures[:: len(pictures) // 6 or 1]]
+    )
+    palette = Image.fromarray(sample).quantize(_COLOURS, Image.Quantize.MEDIANCUT)
+    indexed = [each.quantize(palette=palette, dither=Image.Dither.NONE) for each in pictures]
+    lasts = [round(1000.0 / rate)] * len(indexed)
+    lasts[-1] += 1500  # ms, before it begins anew
+    indexed[0].save(path, save_all=True, append_images=indexed[1:], duration=lasts, loop=0)

@@ -1,0 +1,87 @@
+"""Films: whole or not there at all, of as many frames as the drive lasts."""
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+pytest.importorskip("pygame")
+pytest.importorskip("moviepy")
+from moviepy import VideoFileClip
+from PIL import Image
+from rich.console import Console
+
+from sideslip.agents import make_agent
+from sideslip.benchmarks.report.film import Driver, check_film, film, film_drive, frames_of
+from sideslip.envs.rendering.palette import GREY
+
+SHORT: dict[str, Any] = {"scenario": {"base": "slalom", "duration": 0.4, "onset": 0.0}}
+
+
+def driver(name: str = "none") -> Driver:
+    env = gym.make("sideslip/YawVision-v0", **SHORT)
+    return Driver(name, env, make_agent(name, env))
+
+
+def test_a_film_lasts_as_long_as_the_drive(tmp_path: Path) -> None:
+    mp4, gif = tmp_path / "a.mp4", tmp_path / "a.GIF"
+    film(mp4, [driver()], seed=1)
+    with VideoFileClip(str(mp4)) as clip:
+        assert clip.size == [960, 540] and clip.fps == 50.0
+        assert clip.duration == pytest.approx(0.42, abs=0.021)
+    film_drive(gif, driver(), "none", 1, Console(quiet=True))
+    with Image.open(gif) as picture:
+        assert picture.size == (960, 540) and picture.n_frames == 6
+        assert picture.info["duration"] == 80
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["a.GIF", "a.mp4"]
+
+
+def test_a_ghost_is_the_drive_that_it_would_be_alone() -> None:
+    alone, beside = driver(), driver()
+    list(frames_of([alone], 3, 10))
+    frames = list(frames_of([driver("feedforward"), beside], 3, 10))
+    assert bytes(alone.env.unwrapped._state) == bytes(beside.env.unwrapped._state)
+    grey = [int(GREY[i : i + 2], 16) for i in (1, 3, 5)]
+    assert (frames[-1][262:] == grey).all(2).sum() > 30  # its lines and its name
+
+
+def test_nothing_is_half_written(tmp_path: Path) -> None:
+    class Broken:
+        def predict(self, obs: Any, state: Any = None, *_: Any, **__: Any) -> Any:
+            if state == 9:
+                raise RuntimeError("broken")
+            return np.zeros(1, np.float32), (state or 0) + 1
+
+    path = tmp_path / "old.mp4"
+    path.write_bytes(b"older")
+    with pytest.raises(RuntimeError, match="broken"):
+        film(path, [driver()._replace(agent=Broken())])
+    assert path.read_bytes() == b"older" and len(list(tmp_path.iterdir())) == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "error", "message"),
+    [
+        ("film.avi", ValueError, r"a film ends in .mp4 or .gif, got '.*film.avi'"),
+        ("film", ValueError, "a film ends in .mp4 or .gif"),
+        ("none/film.mp4", FileNotFoundError, "no such folder"),
+    ],
+)
+def test_what_cannot_be_filmed_is_refused_before_the_work(
+    name: str, error: type[Exception], message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(error, match=message):
+        check_film(tmp_path / name)
+
+
+def test_the_extra_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "moviepy", None)
+    with pytest.raises(ModuleNotFoundError, match=r"needs moviepy: pip install 'sideslip\[render"):
+        check_film(tmp_path / "film.mp4")
+
+
+def test_a_ghost_without_a_film_is_refused() -> None:
+    with pytest.raises(ValueError, match="'none' can only drive beside in a film: --video names"):
+        film_drive(None, driver(), "none", 0, Console(quiet=True))
