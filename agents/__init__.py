@@ -85,9 +85,9 @@ def make_agent(
 ) -> Controller | Agent:
     """An agent for an env, single or vector; ours are designed from the env's nominal vehicle.
 
-    name: of `AGENTS`, a shipped policy, the path of one (`.../NAME.safetensors`), or an entry point
-    "package.module:Name"; or a factory, called with the env and the options; or an `Agent`, which
-    is returned. options: arguments of that controller.
+    name: of `AGENTS`, a shipped policy, the path of one (`.../NAME.safetensors`), an entry point
+    "package.module:Name", or a class in a file, "FILE.py:Name"; or a factory, called with the env
+    and the options; or an `Agent`, which is returned. options: arguments of that controller.
     Raises ValueError for an unknown name or an observation without what the controller needs,
     TypeError for an unknown option, options beside an `Agent`, or what has no `predict`.
 

@@ -36,11 +36,12 @@ def make_estimator(
 ) -> Estimator | ForeignEstimator:
     """Build an estimator by name (`sideslip.estimators.FILTERS` lists them).
 
-    name: of `FILTERS`; or a registered name, an entry point "package.module:Name" or a factory,
-    which is called with the arguments below: what it builds comes as a `ForeignEstimator`.
-    vehicle: the filter's, as `vehicle_from` takes it. sensors: the slow sensors that are there, by
-    name ("camera", "gps"). dt: seconds of a tick. speed: m/s if it is held; None measures it with
-    the front wheels. options: of a filter of `FILTERS`, those that `FilterConfig` lists.
+    name: of `FILTERS`; or a registered name, an entry point "package.module:Name", a class in a
+    file, "FILE.py:Name", or a factory, which is called with the arguments below: what it builds
+    comes as a `ForeignEstimator`. vehicle: the filter's, as `vehicle_from` takes it. sensors: the
+    slow sensors that are there, by name ("camera", "gps"). dt: seconds of a tick. speed: m/s if it
+    is held; None measures it with the front wheels. options: of a filter of `FILTERS`, those that
+    `FilterConfig` lists.
 
     Raises
     ------

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
 from ..envs.arguments import unknown_names
+from .user_files import is_user_file, load_user_class
 
 Factory = Callable[..., Any]
 
@@ -23,16 +24,17 @@ class Registry:
     def register(self, name: str, factory: Factory | str) -> None:
         """Make a name known; the same factory once more changes nothing.
 
-        factory: a callable, or "package.module:Name", which is imported when first asked for.
-        Raises TypeError for another kind of name or factory; ValueError for a name that is empty,
-        has a colon or belongs to another factory, and for a string that is no entry point.
+        factory: a callable, or "package.module:Name" or "FILE.py:Name", which is loaded when first
+        asked for. Raises TypeError for another kind of name or factory; ValueError for a name that
+        is empty, has a colon or belongs to another factory, and a string that is no entry point.
         """
         if not isinstance(name, str):
             raise TypeError(f"the name of an {self._kind} is a str, got {name!r}")
         if not name or ":" in name:
             raise ValueError(f"the name of an {self._kind} has letters and no colon, got {name!r}")
         if isinstance(factory, str):
-            _parts(factory)
+            if not is_user_file(factory):
+                _parts(factory)
         elif not callable(factory):
             raise TypeError(
                 f"{name!r}: a factory is callable or 'package.module:Name', "
@@ -43,14 +45,17 @@ class Registry:
             raise ValueError(f"the {self._kind} {name!r} is registered already, as {known!r}")
 
     def load(self, name: str, others: Iterable[str] = ()) -> Factory:
-        """The factory of a registered name or of an entry point "package.module:Name".
+        """The factory of a name, an entry point "package.module:Name" or "FILE.py:Name".
 
         others: further names that may have been meant. Raises ValueError for a name that nobody
-        registered or an entry point that leads nowhere, TypeError where no callable is there.
+        registered or an entry point that leads nowhere, TypeError where no callable is there; for
+        files as `load_user_class`.
         """
         factory = self._factories.get(name, name)
         if not isinstance(factory, str):
             return factory
+        if is_user_file(factory):
+            return load_user_class(factory)
         if ":" in factory:
             return imported(factory)
         raise ValueError(unknown_names(self._kind, [name], [*self._factories, *others]))
