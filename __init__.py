@@ -13,7 +13,7 @@ sideslip/YawGps-v0
 sideslip/YawVision-v0
 sideslip/YawVisionUneven-v0
 
-`rollout`, `make_agent`, `make_estimator`, `register_agent`, `register_estimator` and the
+`rollout`, `score`, `make_agent`, `make_estimator`, `register_agent`, `register_estimator` and the
 subpackages are loaded when first asked for.
 """
 
@@ -35,6 +35,7 @@ __all__ = [
     "register_agent",
     "register_estimator",
     "rollout",
+    "score",
 ]
 
 _HOMES = {
@@ -43,6 +44,7 @@ _HOMES = {
     "register_agent": ".agents",
     "register_estimator": ".estimators",
     "rollout": ".agents.rollout",
+    "score": ".benchmarks.entrants.score",
 }
 _ROOMS = ("envs", "estimators", "agents", "benchmarks")
 _ENVIRONMENTS: dict[str, dict[str, Any]] = {

@@ -4,11 +4,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
 from .harness.results import Suite
+
+if TYPE_CHECKING:
+    from .entrants.challenge import Challenge
 
 
 @dataclass(frozen=True)
@@ -17,7 +20,8 @@ class Request:
 
     quick: few seeds. jobs: processes, None for all processors. episodes: of a cell of the matrix,
     None for the suite's own number. keep: a folder for finished cases. clairvoyant: a file of
-    `sideslip calibrate`, None for the package's.
+    `sideslip calibrate`, None for the package's. challenge: a user's contestants, who drive instead
+    of the matrix.
     """
 
     quick: bool = False
@@ -26,6 +30,7 @@ class Request:
     episodes: int | None = None
     keep: Path | None = None
     clairvoyant: Path | None = None
+    challenge: "Challenge | None" = None
 
 
 _Run = Callable[[Any, Request], Suite]
@@ -38,6 +43,10 @@ def _seeds(suite: Any, r: Request) -> Any:
 def _control(suite: Any, r: Request) -> Any:
     from .control.cells import EPISODES, QUICK_EPISODES
 
+    if r.challenge is not None:
+        from .entrants.suite import run as run_challenge
+
+        return run_challenge(r.challenge, r.jobs, r.console, r.keep)
     usual = QUICK_EPISODES if r.quick else EPISODES
     return suite.run(r.episodes or usual, r.jobs, r.console, r.keep, r.quick, r.clairvoyant)
 

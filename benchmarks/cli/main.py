@@ -13,6 +13,7 @@ from ... import __version__
 from ..harness.results import check_writable
 from ..suites import SUITES, Request, run_suite
 from .calibrate import calibrate_command
+from .challenge import Agents, EnvId, Estimators, Fresh, Limit, Scenarios, challenge_of
 from .enjoy import enjoy_command
 from .output import show_episode, write_output
 from .train import train_command
@@ -140,9 +141,28 @@ def bench(
     clairvoyant: Annotated[
         Path | None, typer.Option(help="A file of `sideslip calibrate`; default: the package's.")
     ] = None,
+    agent: Agents = None,
+    estimator: Estimators = None,
+    scenario: Scenarios = None,
+    env_id: EnvId = "",
+    fresh: Fresh = False,
+    limit: Limit = 600.0,
 ) -> None:
-    """Compare estimators and controllers, and a recorded drive with --log."""
-    names = suites or list(SUITES)
+    """Compare estimators and controllers, and a recorded drive with --log; with --agent and
+    --estimator your own beside some of the package's."""
+    challenge = challenge_of(
+        suites or [],
+        agent or [],
+        estimator or [],
+        None if log else vehicle,
+        scenario or [],
+        env_id,
+        fresh,
+        limit,
+        episodes,
+        quick,
+    )
+    names = suites or (["control"] if challenge else list(SUITES))
     unknown = [name for name in names if name not in SUITES]
     if unknown:
         raise ValueError(f"unknown suite {', '.join(unknown)}; known: {', '.join(SUITES)}")
@@ -152,7 +172,7 @@ def bench(
         from ..recorded.suite import replay_file
 
         done.append(replay_file(log, vehicle, mapping=mapping))
-    request = Request(quick, jobs, console, episodes, keep, clairvoyant)
+    request = Request(quick, jobs, console, episodes, keep, clairvoyant, challenge)
     done += [run_suite(name, request) for name in names]
     order = [*names, "replay"]
     done.sort(key=lambda suite: order.index(suite.name))

@@ -15,12 +15,14 @@ from ...agents import make_agent
 from ...agents.learned.files import is_policy, load_policy
 from ...agents.rollout import steps_of
 from ...agents.rungs import FILTER, GRIP, STEER_WEIGHT, levels_of, make_rung
+from ...envs.arguments import brief
 from ...envs.scenarios.manoeuvres import scenario_from
+from ...envs.sensors.slow import SENSOR_SETS
 from ...envs.task.observation import Entry
 from ...estimators.filters import FILTERS
 from ...estimators.vector.estimate import EstimateObservation
 from ..harness.drives import quietly
-from .cells import REFERENCE_CONTROLLER, SETUPS, TRUTH, Cell
+from .cells import REFERENCE_CONTROLLER, REFERENCE_FILTER, SETUPS, TRUTH, Cell
 from .contests import STEERING
 
 STEPS = 200  # of a decision's time
@@ -78,6 +80,8 @@ def estimate_options(cell: Cell) -> dict[str, Any]:
     found: dict[str, Any] = {"outputs": outputs_for(cell.estimator), "std": False}
     if cell.estimator in SETUPS:
         name, options = SETUPS[cell.estimator]
+        if cell.estimator == REFERENCE_FILTER:
+            options = options | {"slow": slow_sensors(cell.contest.env_id)}
         if name == FILTER:
             levels = levels_of(scenario_from(cell.env_options["scenario"]))
             options = levels | cell.best["filter"] | options
@@ -89,6 +93,36 @@ def estimate_options(cell: Cell) -> dict[str, Any]:
     return found
 
 
+def slow_sensors(env_id: str) -> list[str]:
+    """The names of an id's slow sensors."""
+    return list(SENSOR_SETS[gym.spec(env_id).kwargs["sensors"]])
+
+
+class Checked:
+    """A user's agent, whose `predict` is to return actions (rows, width) and a state.
+
+    Raises TypeError or ValueError with what came instead; NaN is the env's to judge.
+    """
+
+    def __init__(self, agent: Any, rows: int, width: int) -> None:
+        self.agent, self.shape = agent, (rows, width)
+
+    def predict(
+        self, observation: Any, state: Any, episode_start: Any, deterministic: bool = True
+    ) -> tuple[Any, Any]:
+        """What the agent's returns."""
+        found = self.agent.predict(observation, state, episode_start, deterministic=deterministic)
+        if not (isinstance(found, tuple) and len(found) == 2):
+            raise TypeError(f"predict returns (action, state), got {brief(found)}")
+        shape = np.shape(found[0])
+        if shape != self.shape:
+            raise ValueError(
+                f"predict of observations {observation.shape} returns actions {self.shape}, a row "
+                f"a car, got shape {shape}"
+            )
+        return found
+
+
 def make_cars(cell: Cell, cars: int) -> tuple[VectorEnv[Any, Any, Any], Any]:
     """(vector env of `cars` rows with the cell's estimator, its agent), both as they are tuned."""
     contest, options = cell.contest, cell.env_options
@@ -98,9 +132,12 @@ def make_cars(cell: Cell, cars: int) -> tuple[VectorEnv[Any, Any, Any], Any]:
     if cell.estimator == TRUTH:
         env = TrueState(env)
     elif cell.estimator:
-        name = name_of(cell.estimator)
-        env = quietly(EstimateObservation, env, name, **estimate_options(cell))
-    return env, make_agent(cell.controller, env, **agent_options(cell))
+        source = cell.objects.get("estimator", name_of(cell.estimator))
+        env = quietly(EstimateObservation, env, source, **estimate_options(cell))
+    agent = make_agent(cell.objects.get("controller", cell.controller), env, **agent_options(cell))
+    if cell.is_users:
+        return env, Checked(agent, cars, env.single_action_space.shape[0])
+    return env, agent
 
 
 def agent_options(cell: Cell) -> dict[str, Any]:

@@ -4,6 +4,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from ...agents import AGENTS
+from ...agents.learned.files import is_policy
 from ...agents.tuned import Options, tuned
 from .contests import NOMINAL, PARAMETERS, STATE, STATES, STEERING, TIERS, YAW, Contest, oracle_of
 
@@ -56,7 +58,9 @@ class Cell:
     estimator: a name of `SETUPS` or of `make_estimator`, "truth", or "" where the controller reads
     none or brings its own. controller: a name of `make_agent`, or a rung. options: of the env
     beside the contest's, a scenario that has no name among them; tuned: options of filter and
-    controller instead of the best known; cells are equal whatever both are.
+    controller instead of the best known; objects: a user's own instead of what the names mean, an
+    agent, or a factory of one, as "controller", a filter's factory as "estimator". Cells are equal
+    whatever these three are.
     """
 
     contest: Contest
@@ -64,13 +68,24 @@ class Cell:
     controller: str
     options: dict[str, Any] = field(default_factory=dict, compare=False)
     tuned: Options | None = field(default=None, compare=False)
+    objects: dict[str, Any] = field(default_factory=dict, compare=False)
+
+    @property
+    def is_users(self) -> bool:
+        """Whether its controller is a user's own."""
+        name = self.controller
+        known = name in AGENTS or name in (*RUNGS, *STATES) or is_policy(name)
+        return "controller" in self.objects or not known
 
     @property
     def best(self) -> Options:
         """The options of its filter and its controller: `tuned`, or those of `agents.tuned`, where
-        the reference controller, `nominal`'s design on any filter, has the rung's."""
+        the reference controller, `nominal`'s design on any filter, has the rung's, and a user's own
+        the rung's filter."""
         if self.tuned is not None:
             return self.tuned
+        if self.is_users:
+            return tuned(self.contest.kind, NOMINAL) | {"controller": {}}
         name = NOMINAL if self.controller == REFERENCE_CONTROLLER else self.controller
         return tuned(self.contest.kind, name)
 
@@ -87,6 +102,8 @@ class Cell:
     @property
     def rung(self) -> str:
         """The rung of the ladder that drives, "" where a contestant does."""
+        if self.is_users:
+            return ""
         if self.controller == STATE:
             return oracle_of(self.contest)
         return self.controller if self.controller in (*RUNGS, *STATES) else ""

@@ -13,6 +13,7 @@ from ...envs.record import FAST
 from ...envs.task.failures import FAILURES
 from ...envs.ticks import TICK
 from ...envs.vehicle.dynamics import Motion
+from ...estimators.user_files import reason_of
 from ..harness.metrics import EPISODE, FOLDS, Moment
 from .build import make_cars
 from .cells import Cell
@@ -105,7 +106,7 @@ def drive(chunk: Chunk) -> Driven:
         return _drive(chunk)
     except Exception as error:
         empty = np.full((len(chunk.seeds), len(NUMBERS)), np.nan)
-        return Driven(empty, np.nan, error=f"{type(error).__name__}: {error}")
+        return Driven(empty, np.nan, error=reason_of(error))
 
 
 def _drive(chunk: Chunk) -> Driven:

@@ -3,7 +3,7 @@
 import contextlib
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cache
 from pathlib import Path
@@ -43,11 +43,16 @@ def measure(
     jobs: int | None = None,
     console: Console | None = None,
     keep: Path | None = None,
+    by: Callable[[Chunk], Driven] | None = None,
+    title: str = "control",
 ) -> Results:
     """Drive every cell on the seeds, slow ones on the first of them.
 
-    keep: a folder in which finished cases stay, so that a run that was stopped goes on.
+    keep: a folder in which finished cases stay, so that a run that was stopped goes on. by: what
+    drives a chunk instead of `drive`, without that folder. title: of the progress bar.
     """
+    if not cells:
+        return Results()
     chunks = []
     for cell in cells:
         mine = seeds[:SLOW_EPISODES] if cell.slow else seeds
@@ -55,7 +60,7 @@ def measure(
             Chunk(cell, tuple(mine[first : first + CHUNK]), keep=first == 0)
             for first in range(0, len(mine), CHUNK)
         ]
-    driven = run_cases(CachedDrive(keep), chunks, "control", jobs, console)
+    driven = run_cases(by or CachedDrive(keep), chunks, title, jobs, console)
     parts: dict[Cell, list[Driven]] = {}
     for chunk, each in zip(chunks, driven, strict=True):
         parts.setdefault(chunk.cell, []).append(each)
@@ -86,12 +91,12 @@ class CachedDrive:
         if self.folder is None:
             return drive(chunk)
         path = self._path(chunk)
-        found = _read(path, chunk)
+        found = read_case(path, chunk)
         if found is not None:
             return found
         driven = drive(chunk)
         if not driven.error:  # an error is worth another try
-            _write(path, driven)
+            write_case(path, driven)
         return driven
 
     def _path(self, chunk: Chunk) -> Path:
@@ -110,7 +115,7 @@ def sources() -> str:
     return digest.hexdigest()
 
 
-def _read(path: Path, chunk: Chunk) -> Driven | None:
+def read_case(path: Path, chunk: Chunk) -> Driven | None:
     """The chunk's result; None where the file is absent, damaged or another chunk's."""
     shapes: dict[str, tuple[int, ...]] = {
         "numbers": (len(chunk.seeds), len(NUMBERS)),
@@ -132,8 +137,8 @@ def _fits(array: npt.NDArray[Any], shape: tuple[int, ...]) -> bool:
     return array.dtype == np.float64 and array.shape == shape and bool(np.isfinite(array).all())
 
 
-def _write(path: Path, driven: Driven) -> None:
-    """A full disk loses the file, not the run."""
+def write_case(path: Path, driven: Driven) -> None:
+    """Write a file of `read_case`; a full disk loses the file, not the run."""
     arrays: dict[str, Any] = {"numbers": driven.numbers, "seconds": np.array(driven.seconds)}
     if driven.series is not None:
         arrays["series"] = driven.series

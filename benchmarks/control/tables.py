@@ -120,15 +120,15 @@ class Standing:
         return found
 
 
-def standings(found: Mapping[Cell, Driven], tier: str, yards: Yardsticks) -> list[Standing]:
-    """Every contestant of a tier, the best first: by failures where nominal fails in more than
-    10 %, else by score."""
+def standings(found: Mapping[Cell, Driven], tier: str | None, yards: Yardsticks) -> list[Standing]:
+    """Every contestant of a tier, None: of all together, the best first: by failures where nominal
+    fails in more than 10 %, else by score."""
     mine: dict[tuple[str, str], list[Cell]] = {}
     for cell in found:
-        if cell.contest.tier == tier:
+        if tier in (None, cell.contest.tier):
             mine.setdefault((cell.controller, cell.estimator), []).append(cell)
     made = [
-        Standing(tier, cells[0], {cell.contest: found[cell] for cell in cells}, yards)
+        Standing(tier or "", cells[0], {cell.contest: found[cell] for cell in cells}, yards)
         for cells in mine.values()
     ]
     return sorted(made, key=_rank)

@@ -1,0 +1,115 @@
+"""`sideslip.score`: a contestant's score as a Python object."""
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from ..control.cells import REFERENCE_FILTER
+from ..harness.stats import Estimate
+from .challenge import EPISODES, Challenge, Pair
+from .compare import compare
+from .verdict import sentence
+from .worker import LIMIT
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+@dataclass(frozen=True, repr=False)
+class Score:
+    """Where a contestant stands between nominal, 0, and oracle-state, 1.
+
+    score, cost (over nominal's), won (share of the episodes cheaper than nominal's), failures
+    (share of all episodes): each an `Estimate` with its 95 % interval, NaN where there is none. n:
+    episodes that count. contests: a row each, the same numbers by contest. error: why it was not
+    driven, "" where it was, in one contest or more. text: the sentence of the benchmark.
+    """
+
+    agent: str
+    estimator: str
+    score: Estimate
+    cost: Estimate
+    won: Estimate
+    failures: Estimate
+    n: int
+    contests: tuple[dict[str, Any], ...]
+    error: str
+    text: str
+
+    def __repr__(self) -> str:
+        return f"<{self.text}>"
+
+    def to_pandas(self) -> "pd.DataFrame":
+        """A row a contest (needs pandas)."""
+        import pandas as pd
+
+        return pd.DataFrame(list(self.contests))
+
+
+_NONE = Estimate(float("nan"))
+_COLUMNS = {
+    "score": "score",
+    "cost": "cost_vs_nominal",
+    "won": "share_won",
+    "failures": "failure_rate",
+}
+
+
+def score(
+    agent: Any,
+    env_id: str = "",
+    *,
+    scenarios: Sequence[Any] = (),
+    vehicle: Any = None,
+    estimator: Any = REFERENCE_FILTER,
+    episodes: int = EPISODES,
+    seeds: Sequence[int] | None = None,
+    fresh: bool = False,
+    limit: float = LIMIT,
+    jobs: int | None = None,
+) -> Score:
+    """Score a controller, a policy or a filter as `sideslip bench control` does.
+
+    agent: a name, a file's class ("my.py:MyController") or a path, as `make_agent` takes them, or
+    an agent, its class or another factory. estimator: in front of it, a name, a file's class or a
+    factory, "" for none; a filter is scored under "lqr". env_id: the contests of one id; default:
+    both on which the matrix is driven. scenarios: names, files or mappings, or one; default: a
+    contest or two of every tier. vehicle: a name, file or mapping instead of the contests' cars.
+    seeds: instead of the benchmark's, whose baselines are on file. fresh, limit: of `Challenge`,
+    whose errors it raises.
+
+    What is a file drives in a process of its own, an object in this one. An error while it drives
+    is the result's `error`.
+    """
+    alone = isinstance(scenarios, str | os.PathLike | Mapping)
+    driven_in = (scenarios,) if alone else tuple(scenarios)
+    chosen = None if seeds is None else tuple(map(int, seeds))
+    pair = Pair(agent, estimator)
+    challenge = Challenge(
+        (pair,), vehicle, driven_in, env_id, episodes, chosen, fresh=fresh, limit=limit
+    )
+    found = compare(challenge, jobs)
+    standing = found.of(pair)
+    rows = []
+    for contest, driven in standing.results.items():
+        numbers = standing.by_contest.get(contest, {})
+        row: dict[str, Any] = {
+            "tier": contest.tier, "env_id": contest.env_id, "scenario": contest.scenario
+        }  # fmt: skip
+        for name, metric in _COLUMNS.items():
+            number = numbers.get(metric, _NONE)
+            row |= {name: number.value, f"{name}_low": number.low, f"{name}_high": number.high}
+        pairs = standing.pairs.get(contest)
+        rows.append(row | {"n": len(pairs[0]) if pairs else 0, "error": driven.error})
+    overall = {name: standing.overall.get(metric, _NONE) for name, metric in _COLUMNS.items()}
+    errors = [row["error"] for row in rows]
+    return Score(
+        standing.cell.controller,
+        standing.cell.estimator,
+        **overall,
+        n=standing.n,
+        contests=tuple(rows),
+        error=errors[0] if all(errors) else "",
+        text=sentence(standing),
+    )

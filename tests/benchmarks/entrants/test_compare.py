@@ -1,0 +1,273 @@
+"""The user's row is the one that the matrix would give, on seeds that are whose they should be."""
+
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import sideslip
+from sideslip.benchmarks.control.build import agent_options
+from sideslip.benchmarks.control.cells import REFERENCE_FILTER, Cell, some_of
+from sideslip.benchmarks.control.contests import NOMINAL, STEERING, YAW, Contest, contests
+from sideslip.benchmarks.control.episodes import NUMBERS, Chunk, Driven, drive
+from sideslip.benchmarks.control.run import Results
+from sideslip.benchmarks.control.seeds import salt_of, salted_seeds
+from sideslip.benchmarks.entrants import baselines, compare
+from sideslip.benchmarks.entrants.challenge import EPISODES, Challenge, Pair, pairs_of
+from sideslip.benchmarks.entrants.verdict import sentence, table, verdict
+
+COST, FAILURE = NUMBERS.index("cost"), NUMBERS.index("failure")
+PD = """
+class Pd:
+    def __init__(self, env):
+        pass
+"""
+Run = Callable[..., tuple[int, str, str]]
+
+
+def wrapped(folder: Path, options: dict[str, Any]) -> str:
+    """A user's file around the shipped LQR."""
+    path = folder / "mine.py"
+    path.write_text(
+        "from sideslip.agents import Lqr\n\n\nclass Mine:\n"
+        f"    def __init__(self, env):\n        self.inner = Lqr(env, **{options!r})\n\n"
+        "    def predict(self, *observed, deterministic=True):\n"
+        "        return self.inner.predict(*observed, deterministic=deterministic)\n"
+    )
+    return f"{path}:Mine"
+
+
+def test_a_wrapped_controller_has_the_shipped_ones_row(tmp_path: Path, run: Run) -> None:
+    """Bit for bit, by command and by `score`; so it is nominal, whose design LQR is."""
+    contest = Contest("", YAW, "coms", "zero-slip", "gust")
+    shipped = Cell(contest, REFERENCE_FILTER, "lqr")
+    mine = wrapped(tmp_path, agent_options(shipped))
+    rows = tmp_path / "rows.json"
+    arguments = ("--scenario", "gust", "--env", YAW, "--episodes", 4, "--jobs", 1, "--json", rows)
+    status, out, error = run("bench", "control", "--agent", mine, *arguments)
+    assert status == 0, error
+    number = {
+        row["metric"]: row["value"]
+        for row in json.loads(rows.read_text())
+        if row["controller"] == mine and row["scenario"] == contest.name
+    }
+    seeds = tuple(salted_seeds(salt_of(), 4))
+    costs = drive(Chunk(shipped, seeds)).costs
+    assert number["cost"] == np.mean(costs)
+    assert number["score"] == 0.0 and number["cost_vs_nominal"] == 1.0
+    words = " ".join(out.split())
+    assert "100 % [100, 100] of nominal's cost, wins 50 % of the episodes" in words
+    assert "Not publishable: 1 contest x 4 episodes" in words
+    found = sideslip.score(mine, YAW, scenarios="gust", episodes=4, jobs=1)
+    assert (found.score.value, found.cost.value, found.won.value) == (0.0, 1.0, 0.5)
+    assert (found.n, found.error) == (4, "") and f"{mine} on {REFERENCE_FILTER}" in repr(found)
+    frame = found.to_pandas()
+    assert isinstance(frame, pd.DataFrame)
+    assert frame["cost"].tolist() == [number["cost_vs_nominal"]]
+    assert frame["failures"].tolist() == [number["failure_rate"]]
+
+
+@pytest.fixture
+def driven(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Cell, tuple[int, ...]]]:
+    """Every cell that is to be driven with its seeds; none is. Whom the user brings costs half."""
+    asked: list[tuple[Cell, tuple[int, ...]]] = []
+
+    def stand_in(cells: Sequence[Cell], seeds: Sequence[int], **_: Any) -> Results:
+        asked.extend((cell, tuple(seeds)) for cell in cells)
+        return Results({cell: episodes(cell, len(seeds)) for cell in cells})
+
+    monkeypatch.setattr(compare, "measure", stand_in)
+    monkeypatch.setattr(baselines, "measure", stand_in)
+    return asked
+
+
+def episodes(cell: Cell, n: int) -> Driven:
+    levels = {NOMINAL: 4.0, "oracle-state": 1.0, "none": 20.0}
+    numbers = np.zeros((n, len(NUMBERS)))
+    numbers[:, COST] = levels.get(cell.controller, 2.0) * (1.0 + 0.1 * np.arange(n) % 3)
+    if "broken" in cell.controller:
+        return Driven(np.full_like(numbers, np.nan), np.nan, error="ValueError: no (pd.py, line 3)")
+    return Driven(numbers, 0.0)
+
+
+def challenge(folder: Path, **options: Any) -> Challenge:
+    (folder / "pd.py").write_text(PD)
+    return Challenge((Pair(f"{folder}/pd.py:Pd"),), **options)
+
+
+def on_file(folder: Path, monkeypatch: pytest.MonkeyPatch, change: float = 1.0) -> None:
+    """A file of baselines with 8 episodes of a salt of its own, their costs times `change`."""
+    monkeypatch.setattr(baselines, "FILE", folder / "baselines.json")
+    monkeypatch.setattr(baselines, "EPISODES", 8)
+    monkeypatch.setattr(baselines, "salt_of", lambda: "abcd")
+    baselines.write_baselines(folder / "baselines.json")
+    text = json.loads((folder / "baselines.json").read_text())
+    for entry in text:
+        entry["costs"] = [change * cost for cost in entry["costs"]]
+    (folder / "baselines.json").write_text(json.dumps(text))
+
+
+def test_committed_baselines_serve_where_a_sample_costs_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, driven: list[tuple[Cell, tuple[int, ...]]]
+) -> None:
+    on_file(tmp_path, monkeypatch)
+    del driven[:]
+    found = compare.compare(challenge(tmp_path, episodes=8))
+    assert found.on_file and found.salt == "abcd"
+    seeds = {seeds for cell, seeds in driven if cell.is_users}
+    assert seeds == {tuple(salted_seeds("abcd", 8))}
+    again = [(cell, seeds) for cell, seeds in driven if not cell.is_users]
+    assert {seeds for _, seeds in again} == {tuple(salted_seeds("abcd", 2))}
+    assert {cell.controller for cell, _ in again} == {NOMINAL, "oracle-state", "none", "esc"}
+    assert "on file, a sample driven again" in verdict(found)[-1]
+
+
+@pytest.mark.parametrize("why", ["costs", "episodes", "vehicle", "scenario", "seeds", "fresh"])
+def test_otherwise_they_drive_anew_on_everybodys_seeds(
+    why: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    driven: list[tuple[Cell, tuple[int, ...]]],
+) -> None:
+    on_file(tmp_path, monkeypatch, change=1.01 if why == "costs" else 1.0)
+    changes: dict[str, dict[str, Any]] = {
+        "episodes": {"episodes": 9},
+        "vehicle": {"vehicle": {"base": "passenger-car", "mass": 900.0}},
+        "scenario": {"scenarios": ({"base": "gust", "speed": 9.0},)},
+        "seeds": {"seeds": (5, 6, 7)},
+        "fresh": {"fresh": True},
+    }
+    options = changes.get(why, {})
+    del driven[:]
+    found = compare.compare(challenge(tmp_path, **{"episodes": 8} | options))
+    assert not found.on_file
+    everyone = {cell: seeds for cell, seeds in driven}  # the last time
+    assert set(everyone) == set(found.results.found)
+    assert len(set(everyone.values())) == 1
+    (seeds,) = set(everyone.values())
+    if why in ("costs", "episodes", "vehicle", "scenario"):
+        assert seeds == tuple(salted_seeds(salt_of(), len(seeds)))
+    if why == "seeds":
+        assert seeds == (5, 6, 7) and found.salt == ""
+    if why == "vehicle":
+        masses = {
+            cell.env_options[car]["mass"] for cell in everyone for car in ("vehicle", "nominal")
+        }
+        assert masses == {900.0}
+    assert ("Publishable" in verdict(found)[-1]) == (why == "fresh")
+
+
+def test_fresh_seeds_follow_the_users_file(
+    tmp_path: Path, driven: list[tuple[Cell, tuple[int, ...]]]
+) -> None:
+    salts = [compare.compare(challenge(tmp_path, fresh=True)).salt]
+    (tmp_path / "pd.py").write_text(PD + "# better\n")
+    path = (Pair(f"{tmp_path}/pd.py"),)
+    salts += [compare.compare(Challenge(path, fresh=fresh)).salt for fresh in (True, False)]
+    assert len(set(salts)) == 3
+    (tmp_path / "pd.py").write_text(PD)
+    assert compare.compare(Challenge(path, fresh=True)).salt == salts[0]
+
+
+def test_the_verdict_has_a_sentence_for_each_and_five_lines_at_most(
+    tmp_path: Path, driven: list[tuple[Cell, tuple[int, ...]]]
+) -> None:
+    pairs = [Pair(f"{tmp_path}/{name}.py") for name in ("a", "broken", "c", "d", "e")]
+    for pair in pairs:
+        Path(pair.agent).write_text(PD)
+    found = compare.compare(Challenge(tuple(pairs), seeds=(1, 2, 3)))
+    lines = verdict(found)
+    assert len(lines) == 5 and "2 more stand in the table" in lines[3]
+    mine = found.of(pairs[0])
+    assert lines[0] == f"Place 3 of 9: {sentence(mine)}."
+    assert "50 % [50, 50] of nominal's cost (tier 1: 50, tier 2a: 50, tier 2b: 50" in lines[0]
+    assert "closes 50 % [50, 50] of the gap" in lines[0] and "fails in 0.0 %" in lines[0]
+    broken = sentence(found.of(pairs[1]))
+    assert "not driven: " in broken and broken.endswith("ValueError: no (pd.py, line 3)")
+    cells = table(found).cells
+    assert sum(line[0].startswith("> ") for line in cells) == 5
+    assert len(cells) == 5 + 4
+
+
+def test_an_agent_drives_on_the_estimators_and_these_under_lqr() -> None:
+    assert pairs_of(["esc"], []) == [Pair("esc", REFERENCE_FILTER)]
+    found = pairs_of(["esc", "two-dof"], ["dakf", ""])
+    assert [(pair.agent, pair.estimator) for pair in found] == [
+        *(("esc", "dakf"), ("esc", ""), ("two-dof", "dakf"), ("two-dof", "")),
+        ("lqr", "dakf"),
+    ]
+    assert pairs_of(["ppo-yaw-vision"], [])[0].estimator == ""
+
+
+def test_contests_are_those_of_the_id() -> None:
+    esc = (Pair("esc"),)
+    assert list(Challenge(esc).contests) == some_of(contests())
+    steering = Challenge(esc, env_id=STEERING).contests
+    assert {contest.env_id for contest in steering} == {STEERING} and len(steering) == 4
+    vision = list(Challenge(esc, env_id="sideslip/YawVision-v0").contests)
+    assert {contest.env_id for contest in vision} == {"sideslip/YawVision-v0"}
+    assert [contest.tier for contest in vision] == ["1", "2a", "2b", "2c"]
+    scored = list(Challenge(esc, scenarios=("car-slalom",)).contests)
+    assert scored and set(scored) <= set(contests())
+    own = Challenge(esc, vehicle="passenger-car", scenarios=("gust",)).contests
+    assert {contest.reference for contest in own} == {"lagged"}
+
+
+def test_a_users_agent_has_nominals_filter(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As it was tuned, and no tuned options of its own."""
+    tuned = {NOMINAL: {"filter": {"force_sd": 7.0}, "controller": {"grip": 0.6}}}
+    monkeypatch.setattr(
+        "sideslip.benchmarks.control.cells.tuned", lambda kind, name: tuned.get(name, {})
+    )
+    mine = Pair("my.py:Pd").cell(Contest())
+    assert mine.best == {"filter": {"force_sd": 7.0}, "controller": {}}
+    assert mine.is_users and not Pair("esc").cell(Contest()).is_users
+    assert not Pair(NOMINAL, "").cell(Contest()).is_users
+
+
+WRONG: dict[str, tuple[dict[str, Any], str]] = {
+    "agent": ({"pairs": (Pair("lqrr"),)}, "unknown agent 'lqrr'"),
+    "estimator": ({"pairs": (Pair("lqr", "dakff"),)}, "unknown estimator 'dakff'"),
+    "zip": ({"pairs": (Pair("mine.zip"),)}, "mine.zip"),
+    "file": ({"pairs": (Pair("mine.py:A"),)}, "there is no file mine.py"),
+    "id": ({"env_id": "YawFusion"}, "env"),
+    "one episode": ({"episodes": 1}, "two episodes"),
+    "no files": ({"fresh": True}, "there is none"),
+    "vehicle": ({"vehicle": "comss"}, "comss"),
+    "scenario": ({"scenarios": ({"bas": "gust"},)}, "bas"),
+    "limit": ({"limit": 0.0}, "above 0"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_a_challenge_that_cannot_be_driven_is_refused_before_it_is(case: str) -> None:
+    options, message = WRONG[case]
+    with pytest.raises((ValueError, TypeError, FileNotFoundError), match=message):
+        Challenge(**{"pairs": (Pair("esc"),)} | options)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("control", "--fresh"), "go with --agent or --estimator"),
+        (("papers", "--agent", "esc"), "go with the suite control alone"),
+        (("--estimator", "none"), "goes with --agent"),
+    ],
+)
+def test_options_that_do_not_go_together(
+    arguments: tuple[str, ...], message: str, run: Run
+) -> None:
+    status, _, error = run("bench", *arguments)
+    assert status == 2 and message in " ".join(error.split())
+
+
+@pytest.mark.long
+def test_the_baselines_on_file_still_cost_the_same() -> None:
+    """Else: `python -m sideslip.benchmarks.entrants.baselines`."""
+    cells = baselines.cells_of(some_of(contests()))
+    assert len(baselines.read_baselines()) == len(cells)
+    assert baselines.on_file(cells, EPISODES) is not None

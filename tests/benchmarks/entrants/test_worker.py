@@ -1,0 +1,87 @@
+"""A user's contestant that goes wrong is a result with its reason, and nobody else's end."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sideslip.benchmarks.control.cells import Cell
+from sideslip.benchmarks.control.contests import Contest
+from sideslip.benchmarks.control.episodes import Chunk
+from sideslip.benchmarks.entrants import worker
+from sideslip.benchmarks.entrants.worker import drive_apart, drive_users
+
+SHORT = {"scenario": {"base": "gust", "duration": 0.05}}
+HEAD = """
+import os
+import numpy as np
+
+
+class Mine:
+    def __init__(self, env):
+        self.calls = 0
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        self.calls += 1
+        action = np.zeros((len(observation), 1), np.float32)
+"""
+
+
+def chunk(folder: Path, body: str, estimator: str = "") -> Chunk:
+    (folder / "mine.py").write_text(f"{HEAD}        {body}\n")
+    cell = Cell(Contest(scenario="gust"), estimator, str(folder / "mine.py"), dict(SHORT))
+    return Chunk(cell, (0, 1, 2), keep=True)
+
+
+WRONG = {
+    "raises": ("return action / self.forgotten, state", r"no attribute 'forgotten' .mine.py, line"),
+    "one action for all": (
+        "return action[0], state",
+        r"returns actions \(3, 1\).* got shape \(1,\)",
+    ),
+    "too wide": ("return np.hstack([action] * 2), state", r"got shape \(3, 2\)"),
+    "ragged": ("return [[0.0], [0.0, 1.0], [0.0]], state", "inhomogeneous"),
+    "no state": ("return action", r"predict returns \(action, state\), got"),
+    "nothing": ("pass", r"predict returns \(action, state\), got None"),
+    "NaN": ("return action * np.nan, state", "every action is NaN"),
+    "NaN once all drive": ("return action * (1.0 if self.calls < 3 else np.nan), state", "NaN"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_an_agent_that_goes_wrong_was_not_driven(case: str, tmp_path: Path) -> None:
+    body, reason = WRONG[case]
+    driven = drive_users(chunk(tmp_path, body))
+    assert np.isnan(driven.numbers).all()
+    assert re.search(reason, driven.error), driven.error
+
+
+def test_one_nan_ends_its_episode_alone(tmp_path: Path) -> None:
+    """As the env has it: a failure of that episode, no end of the others."""
+    driven = drive_users(chunk(tmp_path, "action[1] = np.nan; return action, state"))
+    assert not driven.error
+    assert driven.failed("bad-action").tolist() == [0.0, 1.0, 0.0]
+
+
+def test_what_it_does_to_its_process_is_its_result(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It ends, or never returns; the numbers of one that drives are those of this process."""
+    gone = drive_apart(chunk(tmp_path, "os._exit(3)"))
+    assert gone.error == "its process ended with status 3"
+    asleep = chunk(tmp_path, "import time; time.sleep(1e6)")
+    assert drive_apart(asleep, limit=1.0).error.startswith("no end within 1 s")
+    fine = chunk(tmp_path, "print('hello'); action[:] = 0.1; return action, state")
+    apart, here = drive_apart(fine), drive_users(fine)
+    assert not apart.error
+    assert np.array_equal(apart.numbers, here.numbers)
+    assert apart.series is not None and np.array_equal(apart.series, here.series)  # type: ignore[arg-type]
+
+
+def test_a_hang_is_found_in_the_users_file(tmp_path: Path) -> None:
+    stack = (
+        f'0:00:01)!\n  File "/lib/time.py", line 9 in sleep\n  File "{tmp_path}/mine.py", line 12'
+    )
+    assert worker._place(chunk(tmp_path, "pass").cell, stack) == ", still in mine.py, line 12"
+    assert worker._place(Cell(Contest(), "", "pd"), stack) == ""
