@@ -79,6 +79,25 @@ def count_of(num_envs: Any) -> int:
     return int(num_envs)
 
 
+def steps_of(max_episode_steps: Any) -> int:
+    """How many steps; TypeError for what is no whole number, ValueError below one."""
+    if isinstance(max_episode_steps, bool) or not isinstance(max_episode_steps, int | np.integer):
+        raise TypeError(f"max_episode_steps is a number of steps, got {brief(max_episode_steps)}")
+    if max_episode_steps < 1:
+        raise ValueError(f"max_episode_steps is at least 1, got {brief(max_episode_steps)}")
+    return int(max_episode_steps)
+
+
+def each_of(name: str, value: Any, count: int) -> Sequence[Any]:
+    """An argument of each row: a list or tuple as it is, another value for all; ValueError for a
+    list of another length."""
+    if not isinstance(value, list | tuple):
+        return [value] * count
+    if len(value) != count:
+        raise ValueError(f"{name}: one or a list of {count}, one a row, got {len(value)}")
+    return value
+
+
 def mode_of(autoreset_mode: Any) -> AutoresetMode:
     """The mode of its name or itself; ValueError for another."""
     try:

@@ -13,11 +13,14 @@ from .backend.files import write_whole
 ENDINGS = (".toml", ".json")
 
 
-def is_path(source: object, endings: tuple[str, ...] = ENDINGS) -> bool:
-    """Whether a value is a path: a `Path`, or a text that ends as such files do."""
-    return isinstance(source, os.PathLike) or (
-        isinstance(source, str) and source.lower().endswith(endings)
-    )
+def ends_in(source: object, endings: tuple[str, ...]) -> bool:
+    """Whether a value is a text or a `Path` with one of these endings."""
+    return isinstance(source, str | os.PathLike) and str(source).lower().endswith(endings)
+
+
+def is_document(source: object) -> bool:
+    """Whether a value is a path: any `Path`, or a text that ends as documents do."""
+    return isinstance(source, os.PathLike) or ends_in(source, ENDINGS)
 
 
 def read_document(source: "str | os.PathLike[str]", what: str) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from .engine.views import motion_in, record_in, slow_in, true_states_in, vehicle
 from .engine.window import window_of
 from .record import FAST_WIDTH, PACKET_WIDTH, Array, Record
 from .rendering.drawn import DrawnOne, Numbers
-from .scenarios.manoeuvres import scenario_from
+from .scenarios.manoeuvres import ScenarioSource, scenario_from
 from .scenarios.scenario import Scenario
 from .sensors.link import SlowSensor
 from .task.failures import REFUSED, RUNNING
@@ -81,19 +81,19 @@ class StabilityEnv(DrawnOne, gym.Env[npt.NDArray[np.float32], npt.NDArray[np.flo
     Y, s, y, theta`, and `phi, phi_dot` where the car rolls); unknown keys raise ValueError.
 
     ## Arguments
-    All JSON-able. sensors: "vision", "vision-uneven", "gps" or "fusion" (camera and GPS). scenario:
-    as `scenario_from` takes it. vehicle: the true one, as `vehicle_from` takes it; nominal: that of
-    estimators and controllers (default: vehicle). control_period: ticks of 1 ms. reference:
-    "zero-slip", "model" (its steady state), "limited" (by friction) or "lagged" (so limited,
-    understeering, through a lag of 0.1 s). fast: "summary" or "all". slow, by name ("camera",
-    "gps"): fields of `SlowSensor` that replace the id's. yaw_first: yaw moment before acceleration
-    where both pass the motors' limit. steering: the action may steer too. render_mode: of `Drawn`.
+    sensors: "vision", "vision-uneven", "gps" or "fusion" (camera and GPS). scenario: as of
+    `scenario_from`. vehicle: the true one, as of `vehicle_from`; nominal: that of estimators and
+    controllers (default: vehicle). control_period: ticks of 1 ms. reference: "zero-slip", "model"
+    (its steady state), "limited" (by friction) or "lagged" (so limited, understeering, lag 0.1 s).
+    fast: "summary" or "all". slow, by name ("camera", "gps"): fields of `SlowSensor` that replace
+    the id's. yaw_first: yaw moment before acceleration where both pass the motors' limit. steering:
+    the action may steer too. render_mode: of `Drawn`.
     """
 
     def __init__(
         self,
         sensors: str = "vision",
-        scenario: str | Mapping[str, Any] | Scenario = "random-steering",
+        scenario: ScenarioSource = "random-steering",
         vehicle: VehicleSource = "coms",
         nominal: VehicleSource | None = None,
         control_period: int = 10,
@@ -136,8 +136,7 @@ class StabilityEnv(DrawnOne, gym.Env[npt.NDArray[np.float32], npt.NDArray[np.flo
         self.rows = np.zeros((self.control_period, FAST_WIDTH))
         self.packets = np.zeros((self.config.most_packets, PACKET_WIDTH))
         self._report = np.zeros(len(REPORT))
-        self.ticks_done = 0  # rows of the newest record
-        self.delivered = 0  # its packets
+        self.ticks_done = self.delivered = 0  # rows and packets of the newest record
         # the record as it stood before the newest reset: a vector env resets within a step
         self.final_rows, self.final_packets = self.rows.copy(), self.packets.copy()
         self.final_ticks_done, self.final_delivered = 0, 0
@@ -155,6 +154,7 @@ class StabilityEnv(DrawnOne, gym.Env[npt.NDArray[np.float32], npt.NDArray[np.flo
         self.rows, self.final_rows = self.final_rows, self.rows
         self.packets, self.final_packets = self.final_packets, self.packets
         self.final_ticks_done, self.final_delivered = self.ticks_done, self.delivered
+        self._params = np.zeros(len(config.start.params))  # behind which a trace may be
         reset_vehicle(config.start, key & 0xFFFFFFFF, key >> 32, self._bounds, self._row(obs))
         self._over = False
         self.annotations, info = {}, self._info(1)
@@ -288,7 +288,7 @@ class StabilityEnv(DrawnOne, gym.Env[npt.NDArray[np.float32], npt.NDArray[np.flo
             )
         if snapshot["layout"] != self.layout:
             raise ValueError("the snapshot is of an env with other sensors or another observation")
-        self._params[:] = snapshot["params"]
+        self._params = np.array(snapshot["params"])
         self._state[:] = snapshot["state"]
         self._switches[:] = snapshot["switches"]
         self._now = snapshot["config"]

@@ -12,9 +12,11 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from .arguments import actions_of, count_of, mask_of, mode_of, named, seeds_of
+from .arguments import actions_of, count_of, each_of, mask_of, mode_of, named, seeds_of, steps_of
 from .engine.batch import step_rows
+from .engine.config import EnvConfig
 from .engine.episodes import Episodes
+from .engine.layout import Z
 from .record import Array
 from .rendering.drawn import DrawnRows, Numbers
 from .stability import StabilityEnv
@@ -26,6 +28,7 @@ Flags = npt.NDArray[np.bool_]
 Infos = dict[str, Any]
 
 _INFO = ("all", "ends")
+_BY_ROW = ("scenario", "vehicle")  # arguments that may be a list
 
 
 class StabilityVectorEnv(DrawnRows, Episodes, VectorEnv[Observations, Any, npt.NDArray[Any]]):
@@ -36,10 +39,11 @@ class StabilityVectorEnv(DrawnRows, Episodes, VectorEnv[Observations, Any, npt.N
     its own generator. `gym.make_vec(id, num_envs=N, **arguments)` builds it.
 
     ## Arguments
-    arguments: those of `StabilityEnv`. autoreset_mode: "NextStep", "SameStep" or "Disabled" (rows
-    that ended wait for `reset` with a `reset_mask`), or the enum. info: "all" tells the infos of
-    every row in every step, as `SyncVectorEnv` does; "ends" only those of the last step of an
-    episode, and none at resets. render_mode: of `Drawn`.
+    arguments: those of `StabilityEnv`; scenario and vehicle may each be a list (N,), one a row, for
+    all its episodes. max_episode_steps: as of `TimeLimit` around each row. autoreset_mode:
+    "NextStep", "SameStep" or "Disabled" (rows that ended wait for `reset` with a `reset_mask`), or
+    the enum. info: "all" has the infos of every row in every step, as `SyncVectorEnv` does; "ends"
+    only those of the last step of an episode, and none at resets. render_mode: of `Drawn`.
 
     ## Reset
     `seed`: an int, or a list (N,) of int or None. `options`: those of `StabilityEnv`, each one for
@@ -69,6 +73,7 @@ class StabilityVectorEnv(DrawnRows, Episodes, VectorEnv[Observations, Any, npt.N
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         info: str = "all",
         render_mode: str | None = None,
+        max_episode_steps: int | None = None,
         **arguments: Any,
     ) -> None:
         self.num_envs = N = count_of(num_envs)
@@ -76,8 +81,9 @@ class StabilityVectorEnv(DrawnRows, Episodes, VectorEnv[Observations, Any, npt.N
         if info not in _INFO:
             raise ValueError(f"info is 'all' or 'ends', got {info!r}")
         self._all_infos = info == "all"
-        one = StabilityEnv(**arguments)
-        Episodes.__init__(self, one.config, N)
+        self._longest = None if max_episode_steps is None else steps_of(max_episode_steps)
+        one, rows = _rows_of(arguments, N)
+        Episodes.__init__(self, rows)
         self.reference = one.reference
         self._draw_in(render_mode)
         self.metadata["autoreset_mode"] = self._mode
@@ -158,6 +164,11 @@ class StabilityVectorEnv(DrawnRows, Episodes, VectorEnv[Observations, Any, npt.N
             )
         if resting is not None:
             self.reset_rows(resting)
+        if self._longest is not None:
+            late = self.states[:, Z.clock.tick] > (self._longest - 1) * self.control_period
+            truncated |= late
+            ended += int((late & ~self.over).sum())
+            self.over |= late
         infos: Infos = {}
         if ended and self._mode == AutoresetMode.SAME_STEP:
             infos, ended = self._finished(), 0
@@ -223,8 +234,28 @@ class StabilityVectorEnv(DrawnRows, Episodes, VectorEnv[Observations, Any, npt.N
         if snapshot["layout"] != self.layout:
             raise ValueError("the snapshot is of an env with other sensors or another observation")
         for name, each in self.arrays._asdict().items():
-            each[:] = snapshot[name]
+            if name != "params":
+                each[:] = snapshot[name]
+        self.hold(snapshot["params"].copy())
         self.configs, self.seeds = list(snapshot["configs"]), list(snapshot["seeds"])
         self.generators = copy.deepcopy(snapshot["rng"])
         self._started, self._waiting = snapshot["started"], int(self.over.sum())
         self.sort()
+
+
+def _rows_of(arguments: Mapping[str, Any], count: int) -> tuple[StabilityEnv, list[EnvConfig]]:
+    """The first row's env, and the config of each row; rows with the same values share one."""
+    columns = {name: each_of(name, arguments.get(name), count) for name in _BY_ROW}
+    envs: dict[tuple[int, ...], StabilityEnv] = {}
+    rows = []
+    for values in zip(*columns.values(), strict=True):
+        key = tuple(map(id, values))
+        if key not in envs:
+            own = {
+                name: value
+                for name, value in zip(columns, values, strict=True)
+                if value is not None
+            }
+            envs[key] = StabilityEnv(**{**arguments, **own})
+        rows.append(envs[key].config)
+    return next(iter(envs.values())), rows

@@ -12,10 +12,9 @@ from ...envs.engine.arrays import Row
 from ...envs.engine.layout import Drive, P, Task, Z
 from ...envs.engine.step import kind_of, step_vehicle
 from ...envs.engine.tick import Kind
-from ...envs.engine.window import window_of
+from ...envs.engine.window import programmed, window_of
 from ...envs.scenarios.roads import NOMINAL_PATH, Lead, laid_by
 from ...envs.scenarios.speed import Pace, acceleration_command, wanted_motion
-from ...envs.scenarios.steering import steering_at
 from ...envs.scenarios.wind import wind_at
 from ...envs.task.info import REPORT
 from ...envs.task.reference import Target
@@ -129,12 +128,9 @@ def forecast_of(base: Any, steps: int = 1, actions: Array | None = None) -> Fore
     if actions is None:
         actions = np.zeros((fixed.periods, fixed.width))
     drive, driver, refs = _driven(base, snapshot, actions, n)
-    programme = read(p, P.programme)
-    every = range(ticks + 1)
-    if fixed.kind.follows:
-        command = driver
-    else:
-        command = np.array([steering_at(float(k), programme) for k in every])
+    command = driver
+    if not fixed.kind.follows:
+        command = np.array([programmed(p, float(k)) for k in range(ticks + 1)])
     known = _known(p, fixed, drive, command, refs)
     return Forecast(fixed, known, start, command[:-1].reshape(-1, n))
 

@@ -94,7 +94,7 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
         self._links: dict[int, set[Link]] = {
             i: set() for i, name in enumerate(SLOW_NAMES) if name in host.config.slow
         }
-        self._build(self._capacities([host.config.base]))
+        self._build(self._capacities(host.configs))
 
     @classmethod
     def make(cls, env_id: str, num_envs: int = 1, **arguments: Any) -> "DeviceVectorEnv":
@@ -109,8 +109,10 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
 
         Raises ValueError for a config of another kind of plant.
         """
-        configs = list(configs)
+        configs = list({id(config): config for config in configs}.values())
         for config in configs:
+            if config.scenario.trace:
+                raise ValueError(f"{config.scenario.name!r}: no trace is driven on a device")
             kind = _kind_of(config)
             if kind != self._kind:
                 raise ValueError(

@@ -8,7 +8,7 @@ from ..backend.decorators import jit
 class Row(NamedTuple):
     """One episode's arrays."""
 
-    p: Any  # (PARAMS_WIDTH,), packed as in `Params`
+    p: Any  # (PARAMS_WIDTH,), packed as in `Params`; behind it a recorded trace, if there is one
     z: Any  # (STATE_WIDTH,), packed as in `State`
     switches: Any  # (len(Switches),) int64
     obs: Any  # (k,) float32
@@ -44,7 +44,7 @@ class Records(NamedTuple):
 class Start(NamedTuple):
     """The packed start of an episode; of several, arrays have an axis more, the first."""
 
-    params: Any  # (PARAMS_WIDTH,), with what the scenario does not draw
+    params: Any  # as in `Row`, with what the scenario does not draw
     low: Any  # (len(Draws),), the ranges that it draws from
     high: Any
     switches: Any

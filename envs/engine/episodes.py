@@ -19,7 +19,7 @@ from .batch import reset_rows
 from .config import EnvConfig
 from .lanes import block_of
 from .layout import FLAGS, PARAMS_WIDTH, STATE_WIDTH, P, Z
-from .packing import EpisodeConfig
+from .packing import EpisodeConfig, widened
 from .views import Each, record_in, slow_in, true_states_in, vehicle_in
 
 Whole = npt.NDArray[np.int64]
@@ -27,15 +27,21 @@ T = TypeVar("T")
 
 
 class Episodes:
-    """N episodes of one `EnvConfig`: arrays with a row for each, and each one's generator.
+    """N episodes of an `EnvConfig` each: arrays with a row for each, and each one's generator.
+
+    rows: of each row, which differ in scenario and vehicles alone; `config` is that of the first.
 
     `rows` (N, n, FAST_WIDTH) of which `ticks_done` (N,) are there and `packets` (N, most,
     PACKET_WIDTH) of which `delivered` (N,) are make the records; `final_...` are those before a
     row's newest reset. What is no array is a sequence of N whose items are made when asked for.
     """
 
-    def __init__(self, config: EnvConfig, count: int) -> None:
-        self.config, self._count, N = config, count, count
+    def __init__(self, rows: Sequence[EnvConfig]) -> None:
+        config, N = rows[0], len(rows)
+        self.config, self._count, self._own = config, N, list(rows)
+        distinct = {id(each): each for each in rows}
+        self._distinct = list(distinct.values())
+        self._which = np.array([list(distinct).index(id(each)) for each in rows])
         self.control_period = int(config.control_period)
         self.layout = config.layout
         self.arrays = Rows(
@@ -59,7 +65,7 @@ class Episodes:
             self.final_rows, self.final_packets, self.final_ticks_done, self.final_delivered
         )
         self.block = block_of(N, self.control_period)
-        self.configs: list[EpisodeConfig] = [config.base] * N
+        self.configs: list[EpisodeConfig] = [each.base for each in rows]
         self.generators: list[np.random.Generator | None] = [None] * N
         self.seeds: list[int | None] = [None] * N
 
@@ -74,10 +80,10 @@ class Episodes:
         configs: list[EpisodeConfig] = []
         known: dict[tuple[Any, ...], int] = {}  # rows with the same objects as options share one
         for i in chosen:
-            key = (*each[i], *map(id, each[i].values()))
+            key = (id(self._own[i]), *each[i], *map(id, each[i].values()))
             if key not in known:
                 known[key] = len(configs)
-                configs.append(self.config.with_options(each[i]))
+                configs.append(self._own[i].with_options(each[i]))
             places.append(known[key])
         return configs, np.array(places, np.int64)
 
@@ -90,15 +96,25 @@ class Episodes:
         """Reset rows with the next keys of their generators, each with the config of its place
         `of` in `configs` (None: without options)."""
         if configs is None or of is None:
-            configs, of = [self.config.base], np.zeros(len(chosen), np.int64)
+            places, of = np.unique(self._which[chosen], return_inverse=True)
+            configs = [self._distinct[place].base for place in places]
         keys = np.empty(len(chosen), np.uint64)
         for m, (i, place) in enumerate(zip(chosen.tolist(), of.tolist(), strict=True)):
             keys[m] = self.generator(i).integers(0, 2**64, dtype=np.uint64)
             self.configs[i] = configs[place]
         words = np.stack([keys & 0xFFFFFFFF, keys >> 32], 1).astype(np.int64)
-        starts = Start(*map(np.stack, zip(*(config.start for config in configs), strict=True)))
+        width = max(self.params.shape[1], *(len(config.start.params) for config in configs))
+        if width > self.params.shape[1]:  # for a trace
+            self.hold(np.array([widened(row, width) for row in self.params]))
+        packed = [c.start._replace(params=widened(c.start.params, width)) for c in configs]
+        starts = Start(*map(np.stack, zip(*packed, strict=True)))
         reset_rows(chosen, of, starts, words, self.config.bounds, self.arrays, self._final)
         self.sort()
+
+    def hold(self, params: Array) -> None:
+        """Take these packed parameters, (N, width)."""
+        self.params = params
+        self.arrays = self.arrays._replace(params=params)
 
     def sort(self) -> None:
         """Put rows whose ticks have the same text next to each other in the block's order."""

@@ -128,6 +128,18 @@ def _numbers(part: Any) -> list[float]:
     return [number for each in part for number in _numbers(each)]
 
 
+def _trace_of(scenario: Scenario) -> list[float]:
+    """What `steering.trace_at` reads, behind the packed parameters."""
+    trace = scenario.trace
+    return [scenario.trace_step / TICK, *trace, trace[-1]] if trace else []
+
+
+def widened(params: Array, width: int) -> Array:
+    """Packed parameters as long as with a longer trace: the last angle stays, none stays none."""
+    traced = len(params) > PARAMS_WIDTH
+    return np.pad(params, (0, width - len(params)), "edge" if traced else "constant")
+
+
 def episode_config(
     scenario: Scenario,
     vehicle: Vehicle,
@@ -201,12 +213,12 @@ def episode_config(
     )
     low, high = scenario.draws()
     start = Start(
-        params=np.array(_numbers(params), np.float64),
+        params=np.array(_numbers(params) + _trace_of(scenario), np.float64),
         low=low,
         high=high,
         switches=np.array(switches, np.int64),
         motion=np.full(len(Motion._fields), np.nan) if motion is None else motion,
     )
-    assert len(start.params) == PARAMS_WIDTH
+    assert len(start.params) == PARAMS_WIDTH or scenario.trace
     held = scenario.held_speed if np.isnan(start.motion[0]) else None  # or it starts at another
     return EpisodeConfig(start, vehicle, nominal, scenario, slow, held)

@@ -10,7 +10,7 @@ from ..backend.random import CHANNELS, normals
 from ..record import FAST
 from ..scenarios.draws import DRAWS, DRAWS_WIDTH, realise
 from ..scenarios.driver import wanted_angle
-from ..scenarios.steering import DRIVER, steering_at, write_steering
+from ..scenarios.steering import DRIVER, write_steering
 from ..scenarios.tracks import laid
 from ..sensors.inertial import Chance, fast_row
 from ..sensors.link import clock_phase
@@ -21,9 +21,10 @@ from ..ticks import FOREVER, NEVER, whole_ticks
 from ..vehicle.dynamics import curvature_beside, gravity_at, sideslip_angle
 from ..vehicle.vehicle import GRAVITY
 from .arrays import Row, Start
-from .layout import FLAGS, STATE_WIDTH, P, Z
+from .layout import FLAGS, PARAMS_WIDTH, STATE_WIDTH, P, Z
 from .observe import observe, write_report
 from .packets import FAR, sense_slow
+from .window import programmed
 
 
 @jit
@@ -89,6 +90,9 @@ def reset_vehicle(start: Start, key_low: int, key_high: int, bounds: Any, row: R
     change = select(d.tyre_change_time > 0.0, whole_ticks(d.tyre_change_time), FOREVER)
     write(p, (change, d.front_change, d.rear_change), P.change)
     write_steering(switches[FLAGS.steering], d, p[P.programme[0] :])
+    if d.side < 0.5:
+        for i in range(PARAMS_WIDTH + 1, len(p)):  # a trace
+            p[i] = 0.0 - p[i]
     p[P.pace.speed] = d.speed
     for i in range(STATE_WIDTH):
         z[i] = 0.0
@@ -99,7 +103,7 @@ def reset_vehicle(start: Start, key_low: int, key_high: int, bounds: Any, row: R
     _write_surroundings(p, d, motion.s, motion.v_x)
     n = normals(key_low, key_high, 0, CHANNELS.initial)
     road, target = read(p, P.road), read(p, P.target)
-    steer = steering_at(0.0, read(p, P.programme))
+    steer = programmed(p, 0.0)
     if switches[FLAGS.steering] == DRIVER:
         person, path = read(p, P.driver), read(p, P.path)
         steer = wanted_angle(motion, path, road, target, person, p[P.task.stop])

@@ -14,10 +14,10 @@ from ..backend.primitives import to_float, whole
 from ..backend.random import CHANNELS, normals
 from ..backend.simd import LANES
 from ..record import Array
-from ..scenarios.steering import steering_at
+from ..scenarios.steering import steering_at, trace_at
 from ..sensors.inertial import Chance
 from ..vehicle.dynamics import Motion
-from .layout import P, Z
+from .layout import PARAMS_WIDTH, P, Z
 
 
 class Window(NamedTuple):
@@ -38,6 +38,22 @@ def window_of(n: int, *lanes: int) -> Array:
 
 
 @jit
+def programmed(p: Any, tick: Any) -> Any:
+    """The angle in rad at a tick of one vehicle's programme, or of the trace behind `Params`."""
+    if len(p) > PARAMS_WIDTH and p[PARAMS_WIDTH] > 0.0:
+        return trace_at(tick, p[PARAMS_WIDTH:])
+    return steering_at(tick, read(p, P.programme))
+
+
+@jit
+def follow_trace(p: Any, z: Any, n: int, window: Any) -> None:
+    """Write the angles of a trace, where there is one, over those of the programme."""
+    if len(p) > PARAMS_WIDTH and p[PARAMS_WIDTH] > 0.0:
+        for j in range(n):
+            window[WINDOW.ahead, j] = trace_at(z[Z.clock.tick] + (j + 1), p[PARAMS_WIDTH:])
+
+
+@jit
 def foresee(p: Any, z: Any, n: int, follows: int, window: Any) -> None:
     """The random numbers and the programme's steering of the next n ticks of one vehicle.
 
@@ -54,6 +70,7 @@ def foresee(p: Any, z: Any, n: int, follows: int, window: Any) -> None:
         write(window, wheels, WINDOW.wheels, j)
         if not follows:
             put(window, steering_at(to_float(ticks), programme), WINDOW.ahead, j)
+    follow_trace(p, z, n, window)
 
 
 @jit

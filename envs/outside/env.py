@@ -14,8 +14,7 @@ from ..engine.step import conclude, fixed_of, kind_of, shares_of, write_end
 from ..engine.tick import Fixed, Kind, Moving, command, sense
 from ..engine.window import WINDOW, chance_at, foresee
 from ..record import FAST
-from ..scenarios.manoeuvres import scenario_from
-from ..scenarios.scenario import Scenario
+from ..scenarios.manoeuvres import ScenarioSource, scenario_from
 from ..stability import StabilityEnv
 from ..ticks import TICK
 from .checks import check_options, check_scenario
@@ -51,7 +50,7 @@ class OutsideEnv(StabilityEnv):
         self,
         model: str = "drift",
         sensors: str = "fusion",
-        scenario: str | Mapping[str, Any] | Scenario = "random-steering",
+        scenario: ScenarioSource = "random-steering",
         reference: str = "model",
         **options: Any,
     ) -> None:

@@ -61,7 +61,7 @@ def read_log(path: str | Path, mapping: Mapping[str, str] | None = None) -> Log:
     source = Path(path)
     values = read_quantities(source, mapping or {}, NEEDED, _GAPS)
     try:
-        first, dt = _clock(values["time"])
+        first, dt = clock_of(values["time"])
     except ValueError as error:
         raise ValueError(f"{source}: {error}") from None
     fast, present = _fast(values)
@@ -91,7 +91,7 @@ def packet_rows(
     return packets
 
 
-def _clock(time: Array) -> tuple[int, float]:
+def clock_of(time: Array) -> tuple[int, float]:
     """(first tick, dt in s) of an even clock; ValueError names the row where it is not."""
     steps = np.diff(time)
     typical = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 0.0

@@ -18,6 +18,7 @@ Fields = Mapping[str, Any]
 
 MOST_SLIP = 1.5  # rad: a start beyond it has no speed along the car
 SHORTEST_GPS_PERIOD = 0.05  # s; an env keeps room for its packets
+MOST_SAMPLES = 1_000_000  # of a trace
 SIDES = ("side", "wind_side")  # drawn, but no fields
 
 TIER_NAMES = ("", "1", "2a", "2b", "2c")
@@ -54,6 +55,7 @@ _NUMBERS = (
     "driver_gain",
     "driver_lag",
     "driver_rate",
+    "trace_step",
 )
 _NUMBERS_OR_NONE = ("acceleration", "gps_period")
 _TIMES_OR_NONE = {  # how many
@@ -97,6 +99,7 @@ def check(fields: Fields) -> None:
         _check_draws(fields)
         _check_motion(fields)
         _check_sensors(fields)
+        _check_trace(fields)
     except ValueError as error:
         raise ValueError(f"scenario {brief(fields['name'])}: {error}") from None
 
@@ -119,6 +122,19 @@ def _check_names(fields: Fields) -> None:
         raise ValueError(f"road 'nominal-path' has no curvature, got {fields['curvature']!r}")
     if fields["path_speed"] is not None and fields["path"] == "road":
         raise ValueError("path_speed needs a track as path; a road has no lengths to scale")
+
+
+def _check_trace(fields: Fields) -> None:
+    trace, steering = fields["trace"], fields["steering"]
+    if not isinstance(trace, tuple) or not all(map(is_finite, trace)):
+        raise ValueError(f"trace is angles in rad, finite ones, got {brief(trace)}")
+    if (len(trace) > 1) != (steering == "trace") or len(trace) > MOST_SAMPLES:
+        raise ValueError(
+            f"trace has 2 to {MOST_SAMPLES} angles where the steering is 'trace', else none; got "
+            f"{len(trace)} with {steering!r}"
+        )
+    if fields["trace_step"] < TICK:
+        raise ValueError(f"trace_step is {TICK} s or more, got {fields['trace_step']!r}")
 
 
 def _check_mappings(fields: Fields) -> None:

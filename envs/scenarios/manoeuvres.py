@@ -1,10 +1,13 @@
 """The manoeuvres by name: those drawn by the seed; the tiers' and the papers' own beside them."""
 
 import dataclasses
+import os
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
-from ..arguments import brief, check_choice, listed
+from ..arguments import brief, check_choice, unknown_names
+from ..documents import ends_in, is_document, read_document
 from .draws import KMH
 from .papers import ROAD_TESTS, SIMULATIONS
 from .scenario import Scenario
@@ -17,6 +20,7 @@ from .tiers import (
     TIERS,
     random_of,
 )
+from .traces import TABLES, trace_from
 
 _DRAWN: dict[str, Any] = {
     "mirror": True,
@@ -126,25 +130,48 @@ SCENARIOS: dict[str, Scenario] = {
 }
 
 
-def scenario_from(source: "str | Scenario | Mapping[str, Any]") -> Scenario:
-    """A scenario from its name, a mapping of fields, or a scenario itself.
+ScenarioSource = str | os.PathLike[str] | Mapping[str, Any] | Scenario
+"""What `scenario_from` takes."""
 
-    A mapping may name a scenario to start from under `"base"`. Raises ValueError for an unknown
-    name, TypeError for an unknown field and for another type.
+
+def scenario_from(source: ScenarioSource) -> Scenario:
+    """A scenario from its name, a file, a mapping of fields, or a scenario itself.
+
+    A TOML or JSON file holds such a mapping, `Scenario.write` makes one; a CSV or Parquet file is a
+    recorded drive, whose steering is driven again (`trace_from`). A mapping may start from another
+    scenario, a name or a file, under `base`. A file without a `name` has that of the file.
+
+    Raises FileNotFoundError; ValueError for an unknown name, a file that cannot be read and a value
+    out of place, TypeError for an unknown field and for another kind of source. Messages name the
+    file.
     """
     if isinstance(source, Scenario):
         return source
-    if isinstance(source, str):
-        check_choice("scenario", source, SCENARIOS)
-        return SCENARIOS[source]
-    if not isinstance(source, Mapping):
-        raise TypeError(f"a scenario is a name or a mapping of fields, got {brief(source)}")
-    values = dict(source)
+    if isinstance(source, Mapping):
+        return _scenario_of(dict(source))
+    if ends_in(source, TABLES):
+        return trace_from(source)
+    if is_document(source):
+        values = read_document(source, "scenario")
+        try:
+            return _scenario_of({"name": Path(source).stem} | values)
+        except (TypeError, ValueError) as error:
+            raise type(error)(f"{source}: {error}") from None
+    if not isinstance(source, str):
+        raise TypeError(
+            "a scenario is a name, the path of a TOML, JSON, CSV or Parquet file or a mapping of "
+            f"fields, got {brief(source)}"
+        )
+    check_choice("scenario", source, SCENARIOS)
+    return SCENARIOS[source]
+
+
+def _scenario_of(values: dict[str, Any]) -> Scenario:
+    """A scenario of a mapping."""
     base = values.pop("base", None)
-    known = {entry.name for entry in dataclasses.fields(Scenario)}
-    unknown = sorted(set(values) - known, key=str)
-    if unknown:
-        raise TypeError(f"unknown scenario field {listed(map(brief, unknown))}")
+    known = [entry.name for entry in dataclasses.fields(Scenario)]
+    if unknown := [key for key in values if key not in known]:
+        raise TypeError(unknown_names("scenario field", unknown, [*known, "base"]))
     if base is not None:
         return scenario_from(base).replace(**values)
     return Scenario(**{"name": "custom", **values})

@@ -2,12 +2,14 @@
 
 import dataclasses
 import math
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
+from ..documents import write_document
 from ..record import Array
 from .checks import SIDES, check
 from .draws import DRAWS_WIDTH, KMH, Draws, Range, range_of
@@ -19,9 +21,11 @@ class Scenario:
 
     Steering is a kind of `STEERING_KINDS`, built from onset, amplitude, frequency (random: two
     pairs of sines; sweep: to frequency_2) and hold (of a step, a dwell, a ramp or a sweep, or from
-    one lane change to the next). mirror: the seed draws the side of steering, track, bend, bank,
-    friction_right and start, and that of the wind. initial_beta, initial_gamma: sideslip angle in
-    rad and yaw rate in rad/s that the car starts with.
+    one lane change to the next); "trace" follows the angles of `trace` (rad at the wheels, recorded
+    every trace_step seconds, straight between them) and holds the last. mirror: the seed draws the
+    side of steering, track, bend, bank, friction_right and start, and that of the wind.
+    initial_beta, initial_gamma: sideslip angle in rad and yaw rate in rad/s that the car starts
+    with.
 
     The steering "driver" keeps to a path of `PATHS` (`driver.py`): the road's centre line, or a
     track that begins where the car is at the onset at the speed it starts with, for the vehicle's
@@ -73,6 +77,8 @@ class Scenario:
     name: str
     duration: float = 10.0
     steering: str = "straight"
+    trace: tuple[float, ...] = ()
+    trace_step: float = 0.01
     onset: Range = 0.0
     amplitude: Range = 0.0
     amplitude_2: Range = 0.0
@@ -176,6 +182,10 @@ class Scenario:
     def replace(self, **changes: Any) -> "Scenario":
         """A copy with some fields changed; TypeError on an unknown field."""
         return dataclasses.replace(self, **changes)
+
+    def write(self, path: str | os.PathLike[str]) -> None:
+        """Write a TOML or JSON file, by its ending, that `scenario_from` reads back."""
+        write_document(path, self.to_dict())
 
     def to_dict(self) -> dict[str, Any]:
         """JSON types only, defaults left out; `scenario_from` reads it back."""

@@ -9,16 +9,16 @@ from typing import Any
 
 from ..backend.decorators import jit
 from ..backend.elementary import PI, sincos, smoothstep
-from ..backend.primitives import anywhere, maximum, minimum, select
+from ..backend.primitives import anywhere, floor, maximum, minimum, select
 from ..ticks import FOREVER, TICK, whole_ticks
 
 (
     STRAIGHT, SINE, SLALOM, LANE_CHANGE, STEP, RANDOM, DOUBLE_LANE_CHANGE, SINE_WITH_DWELL, RAMP,
-    SWEEP, HELD_STEP, DRIVER,
-) = range(12)  # fmt: skip
+    SWEEP, HELD_STEP, DRIVER, TRACE,
+) = range(13)  # fmt: skip
 STEERING_KINDS = (
     "straight", "sine", "slalom", "lane-change", "step", "random", "double-lane-change",
-    "sine-with-dwell", "ramp", "sweep", "held-step", "driver",
+    "sine-with-dwell", "ramp", "sweep", "held-step", "driver", "trace",
 )  # fmt: skip
 SINES, STEPS = 4, 3
 _RAMP_AT = 5 * SINES + 3 * STEPS
@@ -57,6 +57,17 @@ def steering_at(tick: Any, programme: Any) -> Any:
 
 
 @jit
+def trace_at(tick: Any, trace: Any) -> Any:
+    """The angle in rad of a recorded trace at a tick, straight between its samples.
+
+    trace: ticks from sample to sample, the samples, and the last one again, which stays.
+    """
+    place = minimum(tick / trace[0], len(trace) - 2.0)
+    k = int(minimum(floor(place), len(trace) - 3.0))
+    return trace[k + 1] + (place - k) * (trace[k + 2] - trace[k + 1])
+
+
+@jit
 def _sine(programme: Any, i: int, amplitude: Any, hertz: Any, start: Any, end: Any) -> None:
     programme[5 * i] = amplitude
     programme[5 * i + 1] = 2.0 * PI * hertz
@@ -84,7 +95,8 @@ def _dwell(programme: Any, a: Any, hertz: Any, start: Any, dwell: Any) -> None:
 
 @jit
 def write_steering(kind: int, d: Any, programme: Any) -> None:
-    """Fill the steering programme of a kind from drawn numbers; a driver's is empty.
+    """Fill the steering programme of a kind from drawn numbers; a driver's and a
+    trace's are empty.
 
     The slalom, the lane changes, the step and the random steering leave the car on its old
     heading: the slalom starts with a half wave of half the amplitude, the step is followed by its

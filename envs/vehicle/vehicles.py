@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ..arguments import brief, check_choice, is_finite, unknown_names
-from ..documents import is_path, read_document
+from ..documents import is_document, read_document
 from .vehicle import COMS, PASSENGER_CAR, Vehicle
 
 VehicleSource = str | os.PathLike[str] | Mapping[str, Any] | Vehicle
@@ -37,7 +37,7 @@ def vehicle_from(source: VehicleSource) -> Vehicle:
         return source
     if isinstance(source, Mapping):
         return _vehicle_of(dict(source))
-    if is_path(source):
+    if is_document(source):
         return _vehicle_in(Path(source))
     if not isinstance(source, str):
         raise TypeError(
@@ -55,8 +55,6 @@ def _vehicle_in(path: Path) -> Vehicle:
             if name in values:
                 raise ValueError(f"{name} must name its convention: {_key(name)}")
         return _vehicle_of({"name": path.stem} | values)
-    except RecursionError:
-        raise ValueError(f"{path}: its base leads back to it") from None
     except (TypeError, ValueError) as error:
         raise type(error)(f"{path}: {error}") from None
 

@@ -7,7 +7,7 @@ import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 from gymnasium.utils import RecordConstructorArgs
-from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker
+from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
 
 from ...envs.task.observation import Entry
 from ...envs.vehicle.vehicles import VehicleSource
@@ -17,7 +17,7 @@ from .kernel import observe_entry
 from .outputs import BETA, STD, outputs_of, titled, write
 from .truth import as_built, set_stiffness
 
-_MAY_STAND_BETWEEN = (PassiveEnvChecker, OrderEnforcing)
+_MAY_STAND_BETWEEN = (PassiveEnvChecker, OrderEnforcing, TimeLimit)
 # stable-baselines3's make_vec_env and rl-zoo put it directly around the environment. It only counts
 # and is known by name: this module loads nothing of theirs.
 _MONITOR = ("stable_baselines3.common.monitor", "Monitor")
@@ -30,7 +30,8 @@ class EstimateObservation(
     """Runs an estimator on the car's record and appends its states to the observation.
 
     It must be the innermost wrapper: the estimator sees every tick of every step. Others of its
-    class may be stacked, each with its own `name`; stable-baselines3's `Monitor` may be inside.
+    class may be stacked, each with its own `name`; `TimeLimit` and stable-baselines3's `Monitor`
+    may be inside.
 
     estimator: a name of `make_estimator`, an entry point "package.module:Name", a factory (see
     `EstimatorFactory`) or an object (see `EstimatorLike`), which is reset at every episode but

@@ -87,6 +87,7 @@ def test_each_kind_is_what_its_name_says() -> None:
         "sweep": np.where(t > 0.5, 0.1 * np.sin(swept(t - 0.5)), 0.0),
         "held-step": 0.1 * steps[0],
         "driver": 0.0 * t,
+        "trace": 0.0 * t,  # behind the programme
     }
     assert set(expected) == set(STEERING_KINDS)
     for kind, angle in expected.items():

@@ -1,0 +1,43 @@
+"""A recorded steering trace as a scenario: what a log's driver did, driven again."""
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from ..recordings.columns import read_quantities
+from ..recordings.log_file import clock_of
+from .scenario import Scenario
+
+TABLES = (".csv", ".parquet")
+
+
+def trace_from(path: str | os.PathLike[str], mapping: Mapping[str, str] | None = None) -> Scenario:
+    """A scenario that steers as a recorded drive, at its first speed, as long as it lasts.
+
+    path: CSV or Parquet (needs the extra `report`) with the columns of `COLUMNS` for time and
+    steering angle (time_s, steer_rad or steer_deg) and, if it is there, speed (speed_x_mps).
+    mapping: our column names to the log's. Everything else is `Scenario`'s default; a mapping over
+    it (`{"base": "drive.csv", "friction": 0.4}`) changes that.
+
+    Raises what `read_log` does: for a file that is no table, a missing column, NaN, and a clock
+    that runs backward, stands still, jumps or is uneven.
+    """
+    source = Path(path)
+    values = read_quantities(source, mapping or {}, ("time", "steer"), {"speed_x"})
+    try:
+        _, step = clock_of(values["time"])
+    except ValueError as error:
+        raise ValueError(f"{source}: {error}") from None
+    speed = values.get("speed_x", np.zeros(0))
+    known = speed[np.isfinite(speed)]
+    trace = tuple(values["steer"].tolist())
+    made = Scenario(
+        name=source.stem,
+        steering="trace",
+        trace=trace,
+        trace_step=step,
+        duration=round((len(trace) - 1) * step, 9),
+    )
+    return made.replace(speed=float(known[0])) if len(known) else made

@@ -1,0 +1,129 @@
+"""A recorded steering trace is driven again: between samples, mirrored, alone and in a batch."""
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from sideslip.agents.clairvoyant.foresight import forecast_of
+from sideslip.envs import StabilityEnv, scenario_from
+from sideslip.envs.device.env import DeviceVectorEnv
+from sideslip.envs.record import FAST
+from sideslip.envs.scenarios.traces import trace_from
+
+from ..helpers import bits
+from ..recordings.drives import drive, saved
+
+VISION = "sideslip/YawVision-v0"
+TRACE: dict[str, Any] = {"steering": "trace", "trace": [0.0, 0.03, -0.02, 0.01], "duration": 0.2}
+
+
+def commands(env: StabilityEnv, seed: int = 0, **options: Any) -> Any:
+    """The driver's steering command at the ticks of an episode but the last, (T,)."""
+    env.reset(seed=seed, options=options)
+    rows, over = [env.record.fast[:, FAST.steer_command]], False
+    while not over:
+        _, _, terminated, truncated, _ = env.step(np.zeros(1, np.float32))
+        rows.append(env.record.fast[:, FAST.steer_command])
+        over = terminated or truncated
+    return np.concatenate(rows)[1:]  # a row has what acted before it
+
+
+def test_a_log_is_driven_again(tmp_path: Path) -> None:
+    """Its angles at its times, from its first row on, at its first speed."""
+    table = drive(rows=41, dt=0.02)
+    path = saved(table, tmp_path)
+    scenario = scenario_from(str(path))
+    assert scenario == trace_from(path)
+    assert scenario.duration == 0.8 and scenario.name == "drive"
+    assert scenario.speed == pytest.approx(table["speed_x_mps"][0], rel=1e-12)
+    driven = commands(StabilityEnv(scenario=str(path), vehicle="passenger-car"))
+    times = table["time_s"] - table["time_s"][0]
+    expected = np.interp(1e-3 * np.arange(800), times, table["steer_rad"])
+    np.testing.assert_allclose(driven, expected, rtol=0.0, atol=1e-15)
+
+
+def test_a_log_needs_time_and_steering_alone_and_a_mapping_changes_the_rest(tmp_path: Path) -> None:
+    table = drive()[["time_s", "steer_rad"]].rename(columns={"steer_rad": "delta"})
+    path = saved(table, tmp_path)
+    made = trace_from(path, {"steer_rad": "delta"})
+    assert made.trace == tuple(table["delta"])
+    with pytest.raises(ValueError, match=r"drive\.csv: no column steer_rad"):
+        scenario_from(path)
+    saved(table.rename(columns={"delta": "steer_rad"}), tmp_path)
+    (tmp_path / "icy.toml").write_text('base = "drive.csv"\nfriction = 0.3\n')
+    assert scenario_from(tmp_path / "icy.toml") == made.replace(name="icy", friction=0.3)
+
+
+@pytest.mark.parametrize(
+    ("column", "value", "message"),
+    [
+        ("steer_rad", np.nan, r"'steer_rad' has no value \(NaN\) in row 8"),
+        ("time_s", 1.0, "time runs backward at row 8"),
+        ("time_s", 3.06, "time stands still at row 8"),
+    ],
+)
+def test_a_bad_log_is_refused(tmp_path: Path, column: str, value: float, message: str) -> None:
+    table = drive()
+    table.loc[7, column] = value
+    with pytest.raises(ValueError, match=rf"drive\.csv: .*{message}"):
+        scenario_from(saved(table, tmp_path))
+
+
+def test_the_last_angle_stays_and_a_mirrored_trace_is_its_negative() -> None:
+    env = StabilityEnv(scenario={**TRACE, "mirror": True})
+    expected = np.interp(np.arange(200), 10 * np.arange(4), TRACE["trace"])
+    signs = set()
+    for seed in range(8):
+        driven = commands(env, seed)
+        sign = np.sign(driven[-1])
+        np.testing.assert_allclose(driven, sign * expected, rtol=0.0, atol=1e-15)
+        signs.add(sign)
+    assert signs == {-1.0, 1.0}
+
+
+def test_rows_of_a_batch_are_the_environment_alone() -> None:
+    """Traces of several lengths beside a programme and a driver, over several episodes."""
+    longer = {**TRACE, "trace": [0.05 * np.sin(k) for k in range(30)], "mirror": True}
+    rows: list[Any] = [TRACE, {"base": "slalom", "duration": 0.3}, longer, "car-iso-3888-1"] * 6
+    together = gym.make_vec(VISION, len(rows), scenario=rows, control_period=7)
+    alone = [StabilityEnv(scenario=each, control_period=7) for each in rows]
+    obs, _ = together.reset(seed=5)
+    over = np.zeros(len(rows), np.bool_)
+    assert bits(list(obs)) == bits([env.reset(seed=5 + i)[0] for i, env in enumerate(alone)])
+    for step in range(100):
+        action = np.random.default_rng(step).uniform(-1, 1, (len(rows), 1)).astype(np.float32)
+        obs, _, terminated, truncated, _ = together.step(action)
+        for i, env in enumerate(alone):
+            expected = env.reset()[0] if over[i] else env.step(action[i])[0]
+            assert bits(obs[i]) == bits(expected), (step, i)
+        over = terminated | truncated
+
+
+def test_a_reset_option_may_bring_a_trace_and_take_it_away() -> None:
+    env = StabilityEnv(scenario={"base": "slalom", "duration": 0.3})
+    before = commands(env)
+    snapshot = env.get_state()
+    assert commands(env, scenario=TRACE)[10] == pytest.approx(0.03, abs=1e-15)
+    assert bits(commands(env)) == bits(before)
+    env.reset(options={"scenario": TRACE})
+    env.set_state(snapshot)
+    assert bits(env.get_state()["params"]) == bits(snapshot["params"])
+    cars: Any = gym.make_vec(VISION, 2)
+    cars.reset(seed=0)
+    snapshot = cars.get_state()
+    cars.reset(seed=0, options={"scenario": [None, TRACE]})
+    cars.set_state(snapshot)
+    assert bits(cars.get_state()["params"]) == bits(snapshot["params"])
+
+
+def test_a_forecast_knows_the_trace_and_a_device_refuses_it() -> None:
+    env = StabilityEnv(scenario=TRACE)
+    env.reset(seed=0)
+    expected = np.interp(np.arange(200), 10 * np.arange(4), TRACE["trace"])
+    np.testing.assert_allclose(forecast_of(env).driver.ravel(), expected, rtol=0.0, atol=1e-15)
+    pytest.importorskip("torch")
+    with pytest.raises(ValueError, match="'custom': no trace is driven on a device"):
+        DeviceVectorEnv.make(VISION, scenario=TRACE)
