@@ -19,7 +19,7 @@ from ..harness.results import check_writable
 
 Frame = npt.NDArray[np.uint8]
 RATES = {".mp4": 50.0, ".gif": 12.5}  # pictures a second, by a file's ending
-_COLOURS = 96  # of a GIF
+_COLOURS = 128  # of a GIF
 
 
 class Driver(NamedTuple):

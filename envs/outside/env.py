@@ -46,6 +46,8 @@ class OutsideEnv(StabilityEnv):
     below 1 m/s or without roll, the reset option "vehicle" or a start off the road's own frame.
     """
 
+    _our_tyres = False
+
     def __init__(
         self,
         model: str = "drift",

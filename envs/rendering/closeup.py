@@ -56,7 +56,9 @@ def draw_closeup(
         foot = np.array([x_0, y_0 + math.copysign(0.5 * box[3] - 34.0, scene.wind)])
         canvas.arrow(foot, foot - (0.0, math.copysign(34.0, scene.wind)), PALETTE[3], 4.0)
         canvas.text((foot[0] + 12.0, foot[1]), f"wind {abs(scene.wind):.0f} N", PALETTE[3], 12)
-    canvas.text((box[0] + 14.0, box[1] + 12.0), "tyre forces in their friction circles", SOFT, 12)
+    if any(wheel.capacity for wheel in scene.wheels):
+        words = "tyre forces in their friction circles"
+        canvas.text((box[0] + 14.0, box[1] + 12.0), words, SOFT, 12)
     degrees = round(math.degrees(beta), 1) + 0.0  # no -0.0
     words = f"sideslip angle {degrees:+.1f} deg, drawn x {MAGNIFIED:.0f}"
     canvas.text((box[0] + 14.0, box[1] + box[3] - 12.0), words, INK, 12)

@@ -32,6 +32,7 @@ class Drawn:
     is missing, RuntimeError where there is no display, ResetNeeded where there was no reset.
     """
 
+    _our_tyres = True  # tyre forces can be drawn
     control_period: int
     render_mode: str | None
     metadata: dict[str, Any] = {"render_modes": list(MODES), "render_fps": 100}  # noqa: RUF012
@@ -73,7 +74,7 @@ class Drawn:
         """What a car's picture is drawn from."""
         if not self._traces:
             self._traces = [Trace() for _ in range(self._cars)]
-        now = Shot(*self._numbers(row), self._traces[row])
+        now = Shot(*self._numbers(row), self._traces[row], self._our_tyres)
         if not now.params[P.car.m] > 0.0:
             raise ResetNeeded("there is nothing to draw yet: call reset() first")
         if now.trace.empty:

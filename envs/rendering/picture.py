@@ -3,11 +3,9 @@
 import math
 from collections.abc import Iterable, Sequence
 
-import numpy as np
 import pygame
 
 from ..engine.layout import FLAGS, P
-from ..record import Array
 from ..task.failures import FAILURES
 from ..task.reference import ZERO_SLIP
 from ..ticks import TICK
@@ -29,14 +27,14 @@ _ROAD, _CLOSEUP, _STRIPS = (
 
 def draw(shot: Shot, name: str = "true", ghosts: Sequence[tuple[str, Shot]] = ()) -> pygame.Surface:
     """The picture of a car, under the name of its driver; ghosts drive beside it, with theirs."""
-    p, _, switches, _, config, trace = shot
+    p, _, switches, _, config, trace, _ = shot
     now = trace.now
     span = min(max(float(p[P.task.duration]) * TICK, 2.0), SPAN)
     first = max(now[MOMENT.t] - span, 0.0)
     truth, estimates = trace.since(first)
     shades = _shades(estimates)
-    scene = _scene(shot)
-    beside = [Driven(_scene(each), each.trace.since(first)[0], GREY, who) for who, each in ghosts]
+    scene = scene_of(shot)
+    beside = [Driven(scene_of(each), each.trace.since(first)[0], GREY, who) for who, each in ghosts]
     canvas = Canvas(SIZE)
     canvas.area((0.0, 0.0, *SIZE), PAPER)
     draw_road(canvas, _ROAD, [*beside, Driven(scene, truth, BLUE)])
@@ -49,12 +47,9 @@ def draw(shot: Shot, name: str = "true", ghosts: Sequence[tuple[str, Shot]] = ()
     strips = strips_of(truth, estimates, shades, others, full, judged)
     draw_strips(canvas, _STRIPS, strips, first, span)
     _legend(canvas, name, [each for each, _ in ghosts], shades)
-    _heading(canvas, scene, config.scenario.name, now)
+    failures = [("", scene.failure), *((each.name, each.scene.failure) for each in beside)]
+    _heading(canvas, scene, config.scenario.name, now[MOMENT.t], failures)
     return canvas.finished()
-
-
-def _scene(shot: Shot) -> Scene:
-    return scene_of(shot.params, shot.state, shot.switches, shot.config)
 
 
 def _shades(labels: Iterable[str]) -> dict[str, str]:
@@ -78,14 +73,18 @@ def _legend(canvas: Canvas, name: str, ghosts: Sequence[str], shades: dict[str, 
         x += 26.0 + canvas.text((x + 26.0, 272.0), words, INK, 12) + 18.0
 
 
-def _heading(canvas: Canvas, scene: Scene, scenario: str, now: Array) -> None:
-    """What is driven, by which car, how fast, and how it failed."""
-    width = canvas.text((16.0, 20.0), scenario, INK, 17, bold=True)
-    speed = 3.6 * np.hypot(scene.motion.v_x, scene.motion.v_y)
-    car = f"{scene.vehicle.name}, {speed:.0f} km/h"
-    width += canvas.text((30.0 + width, 21.0), car, SOFT, 14)
-    if scene.failure:
-        words = FAILURES[scene.failure].replace("-", " ")
-        canvas.area((46.0 + width, 9.0, 16.0 + 8.0 * len(words), 22.0), ORANGE, 11.0)
-        canvas.text((54.0 + width, 20.0), words, "#FFFFFF", 13)
-    canvas.text((SIZE[0] - 16.0, 20.0), f"{now[MOMENT.t]:.2f} s", INK, 17, 1.0, True)
+def _heading(
+    canvas: Canvas, scene: Scene, scenario: str, t: float, failures: list[tuple[str, int]]
+) -> None:
+    """What is driven, by which car, how fast, and whose drive failed."""
+    x = 30.0 + canvas.text((16.0, 20.0), scenario, INK, 17, bold=True)
+    speed = 3.6 * math.hypot(scene.motion.v_x, scene.motion.v_y)
+    car = f"{scene.vehicle.name}, {speed:.0f} km/h, friction {scene.friction:.2f}"
+    x += 16.0 + canvas.text((x, 21.0), car, SOFT, 14)
+    for name, failure in failures:
+        if failure:
+            words = f"{name}: {FAILURES[failure]}" if name else FAILURES[failure]
+            width = canvas.text((x + 10.0, 20.0), words, "#FFFFFF", 13)
+            canvas.area((x, 9.0, width + 20.0, 22.0), ORANGE, 11.0)
+            x += width + 30.0
+    canvas.text((SIZE[0] - 16.0, 20.0), f"{t:.2f} s", INK, 17, 1.0, True)

@@ -1,12 +1,12 @@
 """The road from above: the car in true proportion, its lane or cones, its trail, what its camera
 sees. The road's direction at the car is to the right, left of it is up."""
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 
 from ..record import Array
-from ..task.failures import FAILURES
 from ..vehicle.vehicle import Vehicle
 from .canvas import Box, Canvas
 from .palette import INK, PALETTE, mixed
@@ -16,7 +16,7 @@ from .trace import MOMENT
 BLUE, ORANGE = PALETTE[0], PALETTE[1]
 ASPHALT, GRASS, PAINT, FAINT, SOFT = "#D9DCE0", "#E2E9DA", "#FFFFFF", "#AEB4BA", "#6B7177"
 ROOF, TYRE = "#FFFFFF", "#23272B"
-SCALE = 22.0  # pixels a metre
+CAR, SCALES = 96.0, (22.0, 30.0)  # pixels of a car's length, and of a metre at least and at most
 LANE = 1.75  # m to either side of the centre line, where the scenario sets no limit
 OVERHANG = 1.62  # length of a car in wheelbases
 
@@ -38,13 +38,14 @@ class View(NamedTuple):
     cos: float  # of the direction that is drawn to the right
     sin: float
     centre: tuple[float, float]  # pixels
+    scale: float  # pixels a metre
 
     def __call__(self, points: Array) -> Array:
         """Pixels of places on the ground, (n, 2)."""
         rel = np.asarray(points, float) - (self.x, self.y)
         right = rel[:, 0] * self.cos + rel[:, 1] * self.sin
         up = rel[:, 1] * self.cos - rel[:, 0] * self.sin
-        return np.stack([self.centre[0] + SCALE * right, self.centre[1] - SCALE * up], 1)
+        return np.stack([self.centre[0] + self.scale * right, self.centre[1] - self.scale * up], 1)
 
 
 class Road:
@@ -74,11 +75,13 @@ def draw_road(canvas: Canvas, box: Box, cars: list[Driven]) -> None:
     """The road around the last of the cars, in a box; the others are ghosts beside it."""
     scene, truth, *_ = cars[-1]
     motion, road = scene.motion, Road(scene, truth)
-    reach = box[3] / SCALE / 2.0 - 2.5  # the view follows a car that would leave it
+    front, rear, _ = body(scene.vehicle)
+    scale = min(max(CAR / (front - rear), SCALES[0]), SCALES[1])
+    reach = box[3] / scale / 2.0 - 2.5  # the view follows a car that would leave it
     y = motion.y - min(max(motion.y, -reach), reach)
     x_0, y_0 = road.at(np.array([motion.s]), np.array([y]))[0]
     centre = box[0] + 0.3 * box[2], box[1] + 0.5 * box[3]
-    view = View(x_0, y_0, np.cos(motion.theta), np.sin(motion.theta), centre)
+    view = View(x_0, y_0, np.cos(motion.theta), np.sin(motion.theta), centre, scale)
     s = np.arange(motion.s - 16.0, motion.s + 34.0, 1.0)
     canvas.within(box)
     _surface(canvas, box, view, road, scene, s)
@@ -89,16 +92,27 @@ def draw_road(canvas: Canvas, box: Box, cars: list[Driven]) -> None:
         trail = view(car.truth[-400:, [MOMENT.X, MOMENT.Y]])
         if len(trail) > 1:
             canvas.line(trail, mixed(car.colour, ASPHALT, 0.55), 2.0)
+    below = motion.Y * view.cos - motion.X * view.sin  # a car to the right has its name there
     for car in cars:
         m = car.scene.motion
         pose = view(np.array([[m.X, m.Y]]))[0]
-        draw_car(canvas, pose, m.psi - motion.theta, SCALE, car.scene, car.colour)
-        above = pose - (0.0, 0.5 * SCALE * car.scene.vehicle.width + 16.0)
-        if car.name and box[0] < above[0] < box[0] + box[2] and box[1] < above[1] - 8.0:
-            failure = car.scene.failure
-            words = f"{car.name}: {FAILURES[failure]}" if failure else car.name
-            canvas.text(above, words, mixed(car.colour, INK, 0.6), 12, 0.5)
+        draw_car(canvas, pose, m.psi - motion.theta, scale, car.scene, car.colour)
+        if car.name:
+            side = 1.0 if m.Y * view.cos - m.X * view.sin < below else -1.0
+            _name(canvas, box, car, pose, m.psi - motion.theta, side * scale)
     canvas.within(None)
+
+
+def _name(
+    canvas: Canvas, box: Box, car: Driven, place: Array, heading: float, scale: float
+) -> None:
+    """A car's name below it, or above it where the scale is negative, if the car is in the box."""
+    front, rear, half = body(car.scene.vehicle)
+    reach = half * abs(np.cos(heading)) + 0.5 * (front - rear) * abs(np.sin(heading))
+    away = scale * reach + math.copysign(10.0, scale)
+    x, y = place[0], min(max(place[1] + away, box[1] + 10.0), box[1] + box[3] - 10.0)
+    if box[0] < x < box[0] + box[2] and box[1] < place[1] < box[1] + box[3]:
+        canvas.text((x, y), car.name, mixed(car.colour, INK, 0.6), 12, 0.5)
 
 
 def _band(road: Road, view: View, s: Array, right: float, left: float) -> Array:

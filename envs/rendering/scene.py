@@ -1,7 +1,7 @@
 """What a picture shows of a car now, read from the packed numbers of its episode."""
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from ..vehicle.actuators import torque_limit
 from ..vehicle.dynamics import Motion, curvature_at, gravity_at
 from ..vehicle.tyres import LINEAR, lateral_forces, tyres_at
 from ..vehicle.vehicle import Vehicle
+from .trace import Shot
 
 _fixed_of, _kind_of, _standing_load = plain(fixed_of), plain(kind_of), plain(standing_load)
 _tyres_at, _lateral_forces, _changed = plain(tyres_at), plain(lateral_forces), plain(changed)
@@ -60,6 +61,7 @@ class Scene(NamedTuple):
     torques: tuple[float, float]  # N m, left and right motor
     most: float  # N m, of one motor
     wheels: tuple[Wheel, ...]  # front left and right, rear left and right
+    friction: float  # of the road, the mean of both sides
     wind: float  # N, to the left
     sight: Sight | None  # None without a camera
     lanes: tuple[Section, ...]  # between cones
@@ -69,8 +71,9 @@ class Scene(NamedTuple):
     failure: int
 
 
-def scene_of(p: Array, z: Array, switches: Any, config: EpisodeConfig) -> Scene:
-    """The Scene of an episode's parameters, state and switches (`engine.layout`)."""
+def scene_of(shot: Shot) -> Scene:
+    """The Scene of a Shot."""
+    p, z, switches, _, config, _, ours = shot
     fixed, kind = _fixed_of(p), _kind_of(p, switches)
     motion, drive, tick = read(z, Z.motion), read(z, Z.drive), float(z[Z.clock.tick])
     car = _changed(fixed.car, fixed.change, tick >= fixed.change.tick)
@@ -88,7 +91,8 @@ def scene_of(p: Array, z: Array, switches: Any, config: EpisodeConfig) -> Scene:
         # a tyre's limit is what its drive force leaves of the friction circle
         capacity = 0.0 if kind.law == LINEAR else math.hypot(tyre.limit, F_wx)
         x, y, angle = place
-        wheels.append(Wheel(x, y, angle, F_wx, F_wy, capacity))
+        known = (F_wx, F_wy, capacity) if ours else (0.0, 0.0, 0.0)
+        wheels.append(Wheel(x, y, angle, *known))
     lanes = _lanes_of(fixed.path, config)
     return Scene(
         motion,
@@ -97,6 +101,7 @@ def scene_of(p: Array, z: Array, switches: Any, config: EpisodeConfig) -> Scene:
         (float(drive.T_l), float(drive.T_r)),
         float(_torque_limit(motion.v_x, car)),
         tuple(wheels),
+        0.5 * float(car.mu + car.mu_r),
         float(_wind_at(tick, fixed.wind)[0]),
         _sight_of(p, motion) if "camera" in config.slow else None,
         lanes,

@@ -85,6 +85,7 @@ class Shot(NamedTuple):
     report: Array
     config: EpisodeConfig
     trace: Trace
+    ours: bool = True  # its tyres are those of our plant
 
 
 def _grown(rows: Array) -> Array:

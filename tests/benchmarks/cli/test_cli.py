@@ -27,9 +27,23 @@ def test_run_drives_an_episode_and_draws_it(run: Run, tmp_path: Path) -> None:
     assert picture.read_bytes()[:4] == b"\x89PNG" and table.exists()
 
 
+def test_run_films_a_drive_with_another_beside(run: Run, tmp_path: Path) -> None:
+    pytest.importorskip("moviepy")
+    path = tmp_path / "drive.gif"
+    status, out, _ = run(
+        "run", "--agent", "feedforward", "--scenario", "low-friction", "--beside", "none",
+        "--video", path,
+    )  # fmt: skip
+    assert status == 0 and "film: " in out and "cost" in out
+    assert path.read_bytes()[:6] == b"GIF89a" and len(list(tmp_path.iterdir())) == 1
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
+        (("run", "--video", "film.avi"), "a film ends in .mp4 or .gif, got 'film.avi'"),
+        (("run", "--beside", "none"), "'none' can only drive beside in a film: --video"),
+        (("enjoy", "ppo-yaw-vision", "--video", "film.avi"), "a film ends in .mp4 or .gif"),
         (("run", "--scenario", "moon"), "unknown scenario 'moon'"),
         (("run", "--agent", "pid"), "unknown agent 'pid'"),
         (("run", "--estimator", "dakf"), "dakf needs the slow sensor gps"),

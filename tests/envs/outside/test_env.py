@@ -31,6 +31,20 @@ def test_the_environment_keeps_gymnasiums_contract(model: str) -> None:
     check_env(env, skip_render_check=True)
 
 
+def test_an_outside_plant_is_drawn_without_tyre_forces() -> None:
+    pytest.importorskip("pygame")
+    from sideslip.envs.rendering.scene import scene_of
+
+    env = outside("drift", scenario=STEP | {"duration": 0.3}, render_mode="rgb_array")
+    env.reset(seed=0)
+    env.step([1.0])
+    frame = env.render()
+    assert frame is not None and frame.std() > 10.0
+    scene = scene_of(env.shot())
+    assert [wheel[3:] for wheel in scene.wheels] == [(0.0, 0.0, 0.0)] * 4
+    assert scene.motion == env.motion and scene.torques[1] > 0.0
+
+
 @pytest.mark.parametrize("model", MODELS)
 def test_sensors_and_disturbances_draw_what_ours_draw(model: str) -> None:
     scenario = STEP | {"noise": {}, "duration": 0.2}

@@ -43,8 +43,7 @@ def seen(env: StabilityEnv) -> Any:
 
 
 def scene(env: StabilityEnv) -> Any:
-    shot = env.shot()
-    return scene_of(shot.params, shot.state, shot.switches, shot.config)
+    return scene_of(env.shot())
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
