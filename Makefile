@@ -15,7 +15,7 @@ INSTALL := PIP_CONSTRAINT=constraints.txt PIP_BUILD_CONSTRAINT=constraints.txt \
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
-.PHONY: help bench bench-full test test-all test-stock coverage lint types wheel clean
+.PHONY: help bench bench-full test test-all test-stock coverage lint types docs wheel clean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1\t\2/p' Makefile | expand -t 18
@@ -49,12 +49,15 @@ lint: .venv/ready-all ## style, format, direction of imports
 types: .venv/ready-all ## mypy, strict
 	$(BIN)/mypy
 
+docs: .venv/ready-all ## the documentation with its examples executed, in docs/_build/html/
+	$(BIN)/sphinx-build -W --keep-going -q -b html docs docs/_build/html
+
 wheel: .venv/ready-all ## source distribution and wheel, in dist/
 	rm -rf dist
 	$(BIN)/python -m build --no-isolation
 
 clean: ## remove the virtual environment and everything made here
-	rm -rf .venv .bench dist build report.html results.json .coverage .hypothesis .import_linter_cache .mypy_cache .pytest_cache .ruff_cache
+	rm -rf .venv .bench dist build docs/_build report.html results.json .coverage .hypothesis .import_linter_cache .mypy_cache .pytest_cache .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # One stamp for each set of extras: the benchmark does without torch.

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -15,6 +16,7 @@ from ..envs.record import Log, Record, concatenate
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+    from pandas import DataFrame
 
 
 class Step(NamedTuple):
@@ -117,6 +119,24 @@ class Rollout:
         """Whether the episode ended by a failure."""
         return bool(self.columns["failure"][-1])
 
+    def _repr_png_(self) -> bytes | None:
+        """What a notebook shows; None without matplotlib."""
+        try:
+            figure = self.plot()
+        except ModuleNotFoundError:
+            return None
+        picture = BytesIO()
+        figure.savefig(picture, format="png", dpi=80)
+        return picture.getvalue()
+
+    def to_pandas(self) -> "DataFrame":
+        """The table, a row a step, units in its attribute `attrs["units"]` (needs `report`)."""
+        from pandas import DataFrame
+
+        table = DataFrame(self.columns)
+        table.attrs["units"] = dict(self.units)
+        return table
+
     def to_parquet(self, path: str | Path) -> None:
         """Write the table; units stand in the columns' metadata (needs the extra `report`)."""
         import pyarrow as pa
@@ -170,7 +190,7 @@ def rollout(
 ) -> Rollout:
     """Run one episode.
 
-    env: an environment or its id. agent, options: of `steps_of`.
+    env: an environment or its id. agent, options: of `steps_of`; seed: of the reset.
     """
     if isinstance(env, str):
         env = gym.make(env)

@@ -93,8 +93,8 @@ class Episodes:
         configs: Sequence[EpisodeConfig] | None = None,
         of: Whole | None = None,
     ) -> None:
-        """Reset rows with the next keys of their generators, each with the config of its place
-        `of` in `configs` (None: without options)."""
+        """Reset the chosen rows (M,) with the next keys of their generators, each with the config
+        of its place `of` in `configs` (None: without options)."""
         if configs is None or of is None:
             places, of = np.unique(self._which[chosen], return_inverse=True)
             configs = [self._distinct[place].base for place in places]

@@ -19,13 +19,14 @@ from .draws import DRAWS_WIDTH, KMH, Draws, Range, range_of
 class Scenario:
     """What happens in an episode. Ranges are drawn by the seed; SI units.
 
-    Steering is a kind of `STEERING_KINDS`, built from onset, amplitude, frequency (random: two
-    pairs of sines; sweep: to frequency_2) and hold (of a step, a dwell, a ramp or a sweep, or from
-    one lane change to the next); "trace" follows the angles of `trace` (rad at the wheels, recorded
-    every trace_step seconds, straight between them) and holds the last. mirror: the seed draws the
-    side of steering, track, bend, bank, friction_right and start, and that of the wind.
-    initial_beta, initial_gamma: sideslip angle in rad and yaw rate in rad/s that the car starts
-    with.
+    An episode is `duration` s long. Steering is a kind of `STEERING_KINDS`, built from onset,
+    amplitude, frequency (random: two pairs of sines, of amplitude and amplitude_2, of frequency,
+    frequency_2, frequency_3 and frequency_4; sweep: to frequency_2) and hold (of a step, a dwell, a
+    ramp or a sweep, or from one lane change to the next); "trace" follows the angles of `trace`
+    (rad at the wheels, recorded every trace_step seconds, straight between them) and holds the
+    last. mirror: the seed draws the side of steering, track, bend, bank, friction_right and start,
+    and that of the wind. initial_beta, initial_gamma: sideslip angle in rad and yaw rate in rad/s
+    that the car starts with.
 
     The steering "driver" keeps to a path of `PATHS` (`driver.py`): the road's centre line, or a
     track that begins where the car is at the onset at the speed it starts with, for the vehicle's
@@ -51,12 +52,14 @@ class Scenario:
     road: "straight", or "nominal-path", which bends as the nominal linear car would drive the
     programme's steering at the speed that the driver wants (`roads.py`); its camera reports y_l
     without that bend.
-    wind_*: a side wind, wind_arm ahead of the centre of gravity and wind_height above the roll
-    axis. disturbance_*: an Ornstein-Uhlenbeck force and moment.
+    wind_force (N) from wind_start for wind_length s: a side wind, wind_arm ahead of the centre of
+    gravity and wind_height above the roll axis. disturbance_force (N), disturbance_moment (N m),
+    disturbance_time (s): an Ornstein-Uhlenbeck force and moment.
 
     Sensors: noise replaces the default; gyro_bias (rad/s) and accel_y_bias (m/s2) add to its
     biases. camera_delays: a repeating pattern that replaces the id's, and camera_jitter with it;
-    gps_period and gps_delays likewise. camera_loss: the probability that a frame is lost (0: the
+    gps_period and gps_delays likewise. camera_outage, gps_outage: (from, to) s without packets.
+    camera_loss: the probability that a frame is lost (0: the
     id's). camera_heading (rad, against the road) and camera_offset (m, of the car from the lane's
     centre): beyond either no lane is in view, and a packet's quality is 0. gps_latency: s by which
     all GPS packets of the episode arrive later, their stamps being true; `slow_sensors` describes

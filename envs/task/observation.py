@@ -7,7 +7,7 @@ from ..sensors.slow import SLOW
 
 
 class Entry(NamedTuple):
-    """One number of an observation: its name, unit and finite bounds."""
+    """One number of an observation: its name, unit and finite bounds, low and high."""
 
     name: str
     unit: str

@@ -67,6 +67,15 @@ def test_parquet_carries_units_and_pictures_are_drawn(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["drive.parquet"]
 
 
+def test_a_notebook_shows_a_drive_and_pandas_has_all_of_it() -> None:
+    drive = sideslip.rollout("sideslip/YawVision-v0")
+    picture = drive._repr_png_()
+    assert picture is not None and picture.startswith(b"\x89PNG")
+    table = drive.to_pandas()
+    assert list(table) == list(drive.columns) and table.attrs["units"]["beta"] == "rad"
+    np.testing.assert_array_equal(table["beta"], drive["beta"])
+
+
 def test_the_motion_told_is_the_cars() -> None:
     """tie-vision (4)-(5): y_l integrates v (psi + beta) and looks ahead; beta = v_y / v_x."""
     env = gym.make(
