@@ -1,11 +1,9 @@
 """The estimator object: a filter's compiled memory behind a small face."""
 
 import itertools
-import pickle
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -20,9 +18,9 @@ from .core.memory import Counters, Filters, Memory
 from .core.run import begin_all
 from .core.transition import KINEMATIC, LATERAL, VELOCITY_ROLL
 from .design.config import FilterConfig
-from .design.error_map import MARGINAL, error_map, spectral_radius, unobservable
+from .design.error_map import MARGINAL, designed, spectral_radius, unobservable
 from .design.models import STATES
-from .design.periodic import design, table_shape
+from .design.periodic import table_shape
 from .design.schedule import Schedule, whole_ticks
 from .estimates import Estimates, UnobservableWarning
 
@@ -34,32 +32,14 @@ _NO_NIS = np.zeros(0)
 _NO_PACKETS = np.zeros((0, PACKET_WIDTH))
 
 
-@dataclass(frozen=True)
-class _Task:
-    """What a table of gains depends on: key has all of it."""
-
-    key: bytes
-    f: Memory = field(compare=False)
-    schedule: Schedule = field(compare=False)
-    speed: float = field(compare=False)
-    config: FilterConfig = field(compare=False)
-
-
-@lru_cache(maxsize=64)  # the same filter drives in many envs
-def _designed(task: _Task) -> tuple[Array, Array]:
-    """The table of gains and the map of the error, to be read alone."""
-    table, there = design(task.f, task.schedule, task.speed, task.config)
-    return table, error_map(there, table, task.schedule)
-
-
 class Estimator:
     """A filter at work; built by `make_estimator`.
 
-    `name`, `config`: what it was built from. `names` and `units` of its n states; `x` (n,) and `P`
-    (n, n) at "now"; `tick`, of the last fast row. `unobservable`: directions that its sensors
-    cannot see. `spectral_radius` of its error over a cycle. `dt`: seconds of a tick. `needs`: the
-    fast columns it reads. `filters` (layers,), `gains` (cells, rows, columns): its memory and its
-    tables, as compiled code takes them.
+    `name`, `config`, schedules (of each layer): what it was built from. `names` and `units` of its
+    n states; `x` (n,) and `P` (n, n) at "now"; `tick`, of the last fast row. `unobservable`:
+    directions that its sensors cannot see. `spectral_radius` of its error over a cycle. `dt`:
+    seconds of a tick. `needs`: the fast columns it reads. `filters` (layers,), `gains` (cells,
+    rows, columns): its memory and its tables, as compiled code takes them.
     Counters of what was skipped: `refused` (older than the filter's window), `duplicates`,
     `future`, `invalid` (not finite), `poor` (quality 0, too few satellites), `unknown` (sensor or
     stamp), `gated` (an innovation that the gate does not believe).
@@ -123,9 +103,8 @@ class Estimator:
 
     def _designed(self, f: Memory, schedule: Schedule, speed: float) -> tuple[Array, Array]:
         """The table of gains at a speed and the map of the error; ValueError if that grows."""
-        rest = schedule, speed, self.config
         try:
-            table, M = _designed(_Task(pickle.dumps((f.tobytes(), *rest)), f, *rest))
+            table, M = designed(f, schedule, speed, self.config)
         except ValueError as error:
             raise ValueError(f"{self.name}: {error}") from None
         radius = spectral_radius(M)

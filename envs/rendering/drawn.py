@@ -113,8 +113,8 @@ class DrawnOne(Drawn):
         self.annotations: dict[str, tuple[float, float]] = {}
 
     def annotate(self, label: str, beta: float, std: float) -> None:
-        """A wrapper's estimate of the sideslip angle now and its standard deviation, in rad, to be
-        drawn beside the truth."""
+        """A wrapper's estimate of the sideslip angle now and its standard deviation std, in rad, to
+        be drawn beside the truth under a label."""
         self.annotations[label] = beta, std
         if self._traces:
             self._traces[0].estimate(label, beta, std)
@@ -133,7 +133,7 @@ class DrawnRows(Drawn):
     """A vector environment that draws its cars."""
 
     def annotate(self, label: str, beta: Array, std: Array, rows: npt.NDArray[np.bool_]) -> None:
-        """The same as of a single environment for some rows, each (N,)."""
+        """The same as of a single environment, label, beta and std, for some rows, each (N,)."""
         for row in np.flatnonzero(rows[: len(self._traces)]):
             self._traces[row].estimate(label, beta[row], std[row])
 

@@ -38,7 +38,7 @@ ASSUMED_DELAY = 0.033  # s
 
 @dataclass(frozen=True, kw_only=True)
 class FilterConfig:
-    """What is decided about a filter before it is designed: its row in `FILTERS` and its options.
+    """What is decided about a filter before it is designed: its name in `FILTERS` and its options.
 
     Options, as `make_estimator` takes them
     ---------------------------------------

@@ -4,14 +4,19 @@ Without noise the estimation error after a cycle is a matrix times the error bef
 spectral radius decides: above one the filter diverges; at one it has an unobservable direction.
 """
 
+import pickle
+from dataclasses import dataclass, field
+from functools import lru_cache
+
 import numpy as np
 
 from ..core.delay import CLONE, CONSTANT, STORED
 from ..core.intersample import DUAL_RATE, PSEUDO
 from ..core.memory import Memory
+from .config import FilterConfig
 from .dual_rate import frame_map
 from .kalman import Array
-from .periodic import measured_rows
+from .periodic import design, measured_rows
 from .pole_placement import transition_matrix
 from .schedule import Schedule
 
@@ -34,6 +39,31 @@ def unobservable(M: Array, names: tuple[str, ...]) -> tuple[str, ...]:
         parts = zip(names, v / lead, strict=True)
         found.append(", ".join(f"{name} {part:.4g}" for name, part in parts if abs(part) > 1e-6))
     return tuple(found)
+
+
+@dataclass(frozen=True)
+class _Task:
+    """What a table of gains depends on: key has all of it."""
+
+    key: bytes
+    f: Memory = field(compare=False)
+    schedule: Schedule = field(compare=False)
+    speed: float = field(compare=False)
+    config: FilterConfig = field(compare=False)
+
+
+@lru_cache(maxsize=64)  # the same filter drives in many envs
+def _designed(task: _Task) -> tuple[Array, Array]:
+    table, there = design(task.f, task.schedule, task.speed, task.config)
+    return table, error_map(there, table, task.schedule)
+
+
+def designed(
+    f: Memory, schedule: Schedule, speed: float, config: FilterConfig
+) -> tuple[Array, Array]:
+    """The table of gains and the map of the error at a speed in m/s, to be read alone."""
+    key = pickle.dumps((f.tobytes(), schedule, speed, config))
+    return _designed(_Task(key, f, schedule, speed, config))
 
 
 def error_map(f: Memory, table: Array, schedule: Schedule) -> Array:
