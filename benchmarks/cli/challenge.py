@@ -23,6 +23,9 @@ EnvId = Annotated[str, typer.Option("--env", help="The contests of this id alone
 Fresh = Annotated[
     bool, typer.Option("--fresh", help="Seeds that follow your files too: publishable.")
 ]
+Trust = Annotated[
+    bool, typer.Option("--trust", help="Read policies' zips, which may run code of their makers.")
+]
 Limit = Annotated[float, typer.Option(help="s of wall time for a contestant in a contest.")]
 
 
@@ -37,6 +40,7 @@ def challenge_of(
     limit: float,
     episodes: int | None,
     quick: bool,
+    trust: bool,
 ) -> "Challenge | None":
     """The challenge of a command line, None without contestants; ValueError for options that go
     with them alone, or with the suite `control` alone."""
@@ -49,7 +53,7 @@ def challenge_of(
     from ..control.cells import QUICK_EPISODES
     from ..entrants.challenge import EPISODES, Challenge, pairs_of
 
-    pairs = pairs_of(agents, ["" if each == "none" else each for each in estimators])
+    pairs = pairs_of(agents, ["" if each == "none" else each for each in estimators], trust)
     if not pairs:
         raise ValueError("--estimator none goes with --agent")
     driven = episodes or (QUICK_EPISODES if quick else EPISODES)

@@ -13,7 +13,7 @@ from ... import __version__
 from ..harness.results import check_writable
 from ..suites import SUITES, Request, run_suite
 from .calibrate import calibrate_command
-from .challenge import Agents, EnvId, Estimators, Fresh, Limit, Scenarios, challenge_of
+from .challenge import Agents, EnvId, Estimators, Fresh, Limit, Scenarios, Trust, challenge_of
 from .enjoy import enjoy_command
 from .output import show_episode, write_output
 from .train import train_command
@@ -147,6 +147,7 @@ def bench(
     env_id: EnvId = "",
     fresh: Fresh = False,
     limit: Limit = 600.0,
+    trust: Trust = False,
 ) -> None:
     """Compare estimators and controllers, and a recorded drive with --log; with --agent and
     --estimator your own beside some of the package's."""
@@ -161,6 +162,7 @@ def bench(
         limit,
         episodes,
         quick,
+        trust,
     )
     names = suites or (["control"] if challenge else list(SUITES))
     unknown = [name for name in names if name not in SUITES]

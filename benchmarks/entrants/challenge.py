@@ -10,29 +10,33 @@ import gymnasium as gym
 
 from ...agents import AGENTS
 from ...agents.learned.files import is_policy, load_policy, shipped
+from ...agents.tuned import tuned
 from ...envs.arguments import check_choice
 from ...envs.scenarios.manoeuvres import scenario_from
 from ...envs.vehicle.vehicles import vehicle_from
 from ...estimators.make import ESTIMATORS
 from ...estimators.user_files import find_class, is_user_file
 from ..control.cells import REFERENCE_CONTROLLER, REFERENCE_FILTER, SETUPS, TRUTH, Cell, some_of
-from ..control.contests import STEERING, TIERS, YAW, Contest, contests
+from ..control.contests import NOMINAL, STEERING, TIERS, YAW, Contest, contests
 from .worker import LIMIT
 
 EPISODES = 64
 _IDS = tuple(
     name for name in gym.registry if name.startswith("sideslip/") and "Outside" not in name
 )
+_ZIP = ".zip"
 _COMS, _CAR = "1", "2a"  # tiers, of which a scenario without one has car and reference
 
 
 @dataclass(frozen=True)
 class Pair:
     """A contestant. agent: a name, a file's class or a path, of `make_agent`, or an object or
-    factory; estimator: the same of `make_estimator`, or a name of the matrix, "" for none."""
+    factory; estimator: the same of `make_estimator`, or a name of the matrix, "" for none. trust:
+    of `make_agent`, for a zip."""
 
     agent: Any
     estimator: Any = REFERENCE_FILTER
+    trust: bool = False
 
     @property
     def label(self) -> str:
@@ -44,7 +48,10 @@ class Pair:
         parts = {"controller": self.agent, "estimator": self.estimator}
         objects = {part: each for part, each in parts.items() if not isinstance(each, str)}
         estimator, agent = _label(self.estimator), _label(self.agent)
-        return Cell(contest, estimator, agent, dict(options or {}), objects=objects)
+        best = (
+            tuned(contest.kind, NOMINAL) | {"controller": {"trust": True}} if self.trust else None
+        )
+        return Cell(contest, estimator, agent, dict(options or {}), best, objects)
 
     @property
     def files(self) -> list[Path]:
@@ -54,7 +61,12 @@ class Pair:
         return [path for path in paths if path.is_file()]
 
     def check(self) -> None:
-        """FileNotFoundError or ValueError for a name, file or class that there is not."""
+        """FileNotFoundError or ValueError for a name, file or class that there is not,
+        PermissionError for a zip without trust."""
+        if isinstance(self.agent, str) and _is_zip(self.agent) and not self.trust:
+            raise PermissionError(
+                f"reading {self.agent} may run code of its maker's: trust it first"
+            )
         for each, known in ((self.agent, AGENTS), (self.estimator, ESTIMATORS)):
             if not isinstance(each, str):
                 continue
@@ -68,9 +80,9 @@ class Pair:
 
 def _is_zip(name: str) -> bool:
     """Whether it is a policy of stable-baselines3; FileNotFoundError where there is none."""
-    if name.endswith(".zip") and not Path(name).is_file():
+    if name.endswith(_ZIP) and not Path(name).is_file():
         raise FileNotFoundError(f"there is no file {name}")
-    return name.endswith(".zip")
+    return name.endswith(_ZIP)
 
 
 def _label(each: Any) -> str:
@@ -78,10 +90,14 @@ def _label(each: Any) -> str:
     return each if isinstance(each, str) else str(kind.__qualname__)
 
 
-def pairs_of(agents: Sequence[str], estimators: Sequence[str]) -> list[Pair]:
+def pairs_of(agents: Sequence[str], estimators: Sequence[str], trust: bool = False) -> list[Pair]:
     """Every agent on every estimator, or on the usual one, and the reference controller on every
-    estimator."""
-    pairs = [Pair(agent, each) for agent in agents for each in estimators or [_usual(agent)]]
+    estimator. trust: of zips."""
+    pairs = [
+        Pair(agent, each, trust and agent.endswith(_ZIP))
+        for agent in agents
+        for each in estimators or [_usual(agent)]
+    ]
     pairs += [Pair(REFERENCE_CONTROLLER, each) for each in estimators if each]
     return list(dict.fromkeys(pairs))
 
@@ -90,7 +106,7 @@ def _usual(agent: str) -> str:
     """The estimator for an agent: a policy's own, none for what saw an env alone."""
     if is_policy(agent):
         return load_policy(agent).card.estimator or ""
-    return "" if agent.endswith(".zip") else REFERENCE_FILTER
+    return "" if agent.endswith(_ZIP) else REFERENCE_FILTER
 
 
 @dataclass(frozen=True)

@@ -67,6 +67,7 @@ def score(
     seeds: Sequence[int] | None = None,
     fresh: bool = False,
     limit: float = LIMIT,
+    trust: bool = False,
     jobs: int | None = None,
 ) -> Score:
     """Score a controller, a policy or a filter as `sideslip bench control` does.
@@ -77,7 +78,7 @@ def score(
     both on which the matrix is driven. scenarios: names, files or mappings, or one; default: a
     contest or two of every tier. vehicle: a name, file or mapping instead of the contests' cars.
     seeds: instead of the benchmark's, whose baselines are on file. fresh, limit: of `Challenge`,
-    whose errors it raises.
+    whose errors it raises. trust: whether a policy's zip may be read, which may run code.
 
     What is a file drives in a process of its own, an object in this one. An error while it drives
     is the result's `error`.
@@ -85,7 +86,7 @@ def score(
     alone = isinstance(scenarios, str | os.PathLike | Mapping)
     driven_in = (scenarios,) if alone else tuple(scenarios)
     chosen = None if seeds is None else tuple(map(int, seeds))
-    pair = Pair(agent, estimator)
+    pair = Pair(agent, estimator, trust)
     challenge = Challenge(
         (pair,), vehicle, driven_in, env_id, episodes, chosen, fresh=fresh, limit=limit
     )

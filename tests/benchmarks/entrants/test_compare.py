@@ -203,6 +203,18 @@ def test_an_agent_drives_on_the_estimators_and_these_under_lqr() -> None:
     assert pairs_of(["ppo-yaw-vision"], [])[0].estimator == ""
 
 
+def test_a_zip_is_read_where_it_is_trusted(tmp_path: Path) -> None:
+    """Alone, without a filter that it did not see in training."""
+    mine = str(tmp_path / "mine.zip")
+    Path(mine).touch()
+    (pair, other) = pairs_of([mine, "esc"], [], trust=True)
+    assert pair.estimator == "" and pair.cell(Contest()).best["controller"] == {"trust": True}
+    assert not other.trust
+    Challenge((pair,))
+    with pytest.raises(PermissionError, match="may run code"):
+        Challenge(tuple(pairs_of([mine], [])))
+
+
 def test_contests_are_those_of_the_id() -> None:
     esc = (Pair("esc"),)
     assert list(Challenge(esc).contests) == some_of(contests())
