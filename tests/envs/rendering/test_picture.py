@@ -59,8 +59,11 @@ def test_a_positive_yaw_moment_drives_the_right_wheel(action: float) -> None:
     env = started()
     for _ in range(5):
         env.step([action])
-    left, right = scene(env).torques
+    now = scene(env)
+    left, right = now.torques
     assert right * action > 50.0 > -50.0 > left * action
+    pushed = [wheel.F_x * now.vehicle.wheel_radius for wheel in now.wheels]
+    assert pushed == pytest.approx([0.0, 0.0, left, right], abs=1e-6)
     rows = painted(seen(env), BLUE, (44.0, _CLOSEUP[1], 31.0, _CLOSEUP[3]))[:, 1]
     below = rows.mean() > 0.5 * _CLOSEUP[3]  # bars to the right drive; the right motor is below
     assert below == (action > 0.0)
