@@ -51,7 +51,7 @@ def _filters(*names: str) -> tuple[Filter, ...]:
 
 EXPERIMENTS = (
     Experiment(
-        "late camera",
+        "Late camera",
         "tie-vision-fig7",
         "sideslip/YawVision-v0",
         "tie-vision Fig. 7",
@@ -139,7 +139,7 @@ def run(seeds: int = SEEDS, jobs: int | None = None, console: Console | None = N
         "the first is not. dakf-stability's order (DAKF before KF) holds on its Fig. 6. Intervals "
         "are 95 % bootstrap over seeds.",
     )
-    found: list[tuple[Array, Array]] = []
+    found, examples = list[tuple[Array, Array]](), list[tuple[Rollout, dict[str, Array]]]()
     for e, experiment in enumerate(EXPERIMENTS):
         mine = [r for case, r in zip(cases, results, strict=True) if case.experiment == e]
         squares = np.concatenate([m.squares for m in mine])
@@ -147,9 +147,9 @@ def run(seeds: int = SEEDS, jobs: int | None = None, console: Console | None = N
         cost = np.median(np.concatenate([m.cost for m in mine]), axis=0)
         found.append((squares, best))
         _add(suite, experiment, squares, best, cost)
-        example = next(m.example for m in mine if m.example is not None)
-        _draw(suite, experiment, squares, best, *example)
+        examples += [m.example for m in mine if m.example is not None]
     suite.verdict = answer(found)
+    _draw(suite, found, examples)
     return suite
 
 
@@ -163,9 +163,7 @@ def answer(found: Sequence[tuple[Array, Array]]) -> str:
         over = {other: interval(of[rivals[0]], ratio_of_roots, of[other]) for other in rivals[1:]}
         least = float(ratio_of_roots(of[rivals[0]], best))
         first = leader(rivals[0], over, "error")
-        firsts.append(
-            f"{experiment.brief.capitalize()}: {first}, {least:.2f} of the least possible."
-        )
+        firsts.append(f"{experiment.brief}: {first}, {least:.2f} times the least possible.")
         unaided.append(f"x{ratio_of_roots(of[UNAIDED], of[rivals[0]]):.1f}")
         known.append(f"x{ratio_of_roots(of[TRUE_MODEL], of[rivals[0]]):.2f}")
     return verdict(
@@ -217,40 +215,39 @@ def _add(suite: Suite, experiment: Experiment, squares: Array, best: Array, cost
 
 def _draw(
     suite: Suite,
-    experiment: Experiment,
-    squares: Array,
-    best: Array,
-    drive: Rollout,
-    traces: dict[str, Array],
+    found: Sequence[tuple[Array, Array]],
+    examples: Sequence[tuple[Rollout, dict[str, Array]]],
 ) -> None:
-    """Figures of one experiment; nothing where plotly is not installed."""
+    """Figures of every experiment; nothing where plotly is not installed."""
     try:
-        from .report.figures import bars_with_interval, time_series
+        from .report.figures import error_series, groups_with_interval, time_series
     except ModuleNotFoundError:
         return
-    limit = float(root_mean(best))
-    errors = [interval(column, root_mean) for column in squares.T] + [Estimate(limit, limit, limit)]
-    value, low, high = 1e3 * np.array(errors).T
-    bars = bars_with_interval(
-        [*traces, "the bound"], value, low, high, "RMSE of the sideslip angle / mrad"
-    )
-    t, beta = drive.log.time, drive.log.truth["beta"]
-    estimates = {"truth": 1e3 * beta} | {label: 1e3 * x for label, x in traces.items()}
-    missed = {label: 1e3 * (x - beta) for label, x in traces.items()}
-    angle = "sideslip angle / mrad"
-    suite.figures += [
-        (f"{experiment.paper}: {title}", figure, caption)
-        for title, figure, caption in (
-            ("error of each estimator", bars, experiment.text),
-            (
-                "the sideslip angle and its estimates (seed 0)",
-                time_series(t, estimates, angle),
-                "The paper's figure, redrawn.",
-            ),
-            (
-                "errors (seed 0)",
-                time_series(t, missed, f"error of the {angle}"),
-                "Estimate minus truth.",
-            ),
+    groups, angle = {}, "sideslip angle / mrad"
+    for experiment, (squares, best) in zip(EXPERIMENTS, found, strict=True):
+        over = {
+            each.label: Estimate(*interval(column, ratio_of_roots, best))
+            for each, column in zip(experiment.filters, squares.T, strict=True)
+        }
+        title = f"{experiment.brief} ({experiment.paper})"
+        groups[title] = dict(sorted(over.items(), key=lambda pair: pair[1].value))
+    ratio = "error / the least possible: less is better"
+    bars = groups_with_interval(groups, ratio, {1.0: "the bound"})
+    said = " ".join(suite.verdict.splitlines()[1:-2])
+    suite.answers.append(("Which estimator comes closest to the sideslip angle?", bars, said))
+    for experiment, (drive, traces) in zip(EXPERIMENTS, examples, strict=True):
+        t, beta = drive.log.time, drive.log.truth["beta"]
+        lines = {"truth": 1e3 * beta} | {label: 1e3 * each for label, each in traces.items()}
+        missed = {label: 1e3 * (each - beta) for label, each in traces.items()}
+        over_time = time_series(t, lines, angle)
+        if experiment is EXPERIMENTS[0]:
+            over_time.update_layout(meta="wide")
+            text = f"{experiment.text} The truth lies on top of the estimates."
+            suite.answers.append(("What does one drive look like?", over_time, text))
+        else:
+            title = f"{experiment.paper}: the sideslip angle and its estimates (seed 0)"
+            suite.figures.append((title, over_time, experiment.text))
+        figure = error_series(t, missed, f"error of the {angle}")
+        suite.figures.append(
+            (f"{experiment.paper}: errors (seed 0)", figure, "Estimate minus truth.")
         )
-    ]

@@ -115,7 +115,7 @@ def evaluate(path: str | Path, episodes: int = 256) -> Enjoyed:
 
 
 def suite_of(found: Enjoyed) -> Suite:
-    """Table and rows; the first episode over time and in motion, where plotly is there."""
+    """Table and rows; the first episode over time and in motion."""
     name, card = found.policy.name, found.policy.card
     cell = found.cells[name]
     text = (
@@ -127,17 +127,12 @@ def suite_of(found: Enjoyed) -> Suite:
     if judged != card.reference:
         text += f" Here it is judged by another reference, {judged}: by another cost."
     suite = Suite("enjoy", f"{name} on {cell.contest.env_id}", text, _rows(found), [_table(found)])
-    from .control.figures import in_motion, over_time, run_of
+    from .control.figures import over_time
 
-    runs = {who: run_of(found.cells[who], found.seeds[0]) for who in found.driven}
-    try:
-        suite.figures.append(in_motion(f"In motion: {cell.contest.scenario}, first seed", runs))
-    except ModuleNotFoundError:
-        return suite
     series: dict[tuple[str, ...], Array] = {
         (who,): each.series for who, each in found.driven.items() if each.series is not None
     }
-    suite.explorers.append(over_time("The first seed over time", ("controller",), series))
+    suite.explorers.append(over_time("The first seed, side by side", (), series, name))
     return suite
 
 

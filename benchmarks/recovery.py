@@ -6,7 +6,7 @@ friction. A car is saved that does not fail and ends with a sideslip angle below
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -109,13 +109,26 @@ def run(quick: bool = False, jobs: int | None = None, console: Console | None = 
         shares = {name: each.mean(axis=2) for name, each in mine.items()}
         labels = ("sideslip angle / deg", "yaw rate / (deg/s)")
         suite.maps.append(ShareMap(f"{car}: share of cars saved", beta, gamma, shares, *labels))
+    _draw(suite)
+    return suite
+
+
+def _draw(suite: Suite) -> None:
+    """The maps, those of the best first; nothing where plotly is not installed."""
     try:
         from .report.heat_maps import share_maps
     except ModuleNotFoundError:
-        return suite
+        return
     text = "Colour: the share of seeds on which the car is saved; the line is at one half."
     suite.figures = [(each.title, share_maps(each), text) for each in suite.maps]
-    return suite
+    first, said = suite.maps[0], suite.verdict.splitlines()[1:-2]
+    shown = ["none"]
+    for group in (READING, ORACLES):
+        there = [name for name in group if name in first.shares]
+        shown += sorted(there, key=lambda name: -float(first.shares[name].mean()))[:1]
+    few = replace(first, shares={name: first.shares[name] for name in shown})
+    title = f"From where is a car still saved? ({first.title})"
+    suite.answers.append((title, share_maps(few), " ".join([*said[:1], text])))
 
 
 def answer(cars: Mapping[str, Mapping[str, Array]]) -> str:

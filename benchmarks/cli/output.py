@@ -112,7 +112,7 @@ def print_suite(console: Console, suite: Suite) -> None:
 def _parts(table: Table, width: int) -> list[Table]:
     """The table as it fits into so many columns of text: some columns each, the first in all;
     texts wrap."""
-    from ..report.html import numeric
+    from ..report.tables import numeric
 
     columns = list(zip(table.header, *table.cells, strict=True))
     most = [max(map(len, column)) for column in columns]
@@ -141,7 +141,7 @@ def _parts(table: Table, width: int) -> list[Table]:
 
 def _rich(table: Table) -> RichTable:
     """Columns of numbers to the right and whole, those of text to the left, wrapped if long."""
-    from ..report.html import numeric
+    from ..report.tables import numeric
 
     shown = RichTable(
         title=table.title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0)

@@ -1,4 +1,4 @@
-"""The matrix's figures: heat maps, any cell's time series, price of delay, runs in motion."""
+"""The matrix's figures: a picture for each question, heat maps, any two cells side by side."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -8,33 +8,31 @@ import numpy as np
 from ...agents import make_agent
 from ...agents.rollout import Rollout, rollout
 from ...envs.record import Array
-from ...envs.rendering.palette import INK, colour
+from ...envs.rendering.palette import colour
 from ...envs.vehicle.vehicles import VEHICLES
 from ..harness.drives import make_env
 from ..harness.explorer import Explorer, Panel
 from ..harness.results import Suite
+from ..harness.stats import Estimate, geometric_mean
 from ..report.kml import track_kml
 from .build import agent_options, estimate_options, name_of
-from .cells import REFERENCE_FILTER, Cell
-from .contests import Contest
+from .cells import REFERENCE_CONTROLLER, REFERENCE_FILTER, RUNGS, TRUTH, Cell
+from .contests import NOMINAL, TITLES, Contest
 from .delay_price import DELAYS, PRICE_CONTEST, Price, lines
 from .episodes import SIGNALS
+from .ladder import best_controller
 from .run import Results
 from .tables import Standing
 
-_SHOWN = (  # in motion
-    ("", "none"),
-    ("multirate-kf, camera and gps", "two-dof"),
-    (REFERENCE_FILTER, "lqr"),
-)
-_MOST = 2  # contests in motion
 _PANELS = (
-    Panel("sideslip angle / mrad", (("beta", "true", "#0072B2"), ("beta_ref", "reference", INK))),
-    Panel("yaw rate / (rad/s)", (("gamma", "true", "#0072B2"), ("gamma_ref", "reference", INK))),
-    Panel("yaw moment / (N m)", (("yaw_moment", "delivered", "#D55E00"),)),
-    Panel("front steering / mrad", (("steer", "delivered", "#D55E00"),)),
+    Panel("sideslip / mrad", (("beta", "true"), ("beta_ref", "reference"))),
+    Panel("yaw rate / (rad/s)", (("gamma", "true"), ("gamma_ref", "reference"))),
+    Panel("yaw moment / (N m)", (("yaw_moment", "delivered"),)),
+    Panel("front steering / mrad", (("steer", "delivered"),)),
 )
 _SCALES = {"beta": 1e3, "beta_ref": 1e3, "steer": 1e3}
+_BODY = (1.5, 1.15)  # of a car, over its wheelbase and its track
+_COST = "cost / nominal's, %: less is better"
 
 
 def illustrate(
@@ -42,60 +40,86 @@ def illustrate(
     found: Mapping[str, Sequence[Standing]],
     results: Results,
     prices: Sequence[Price],
-    seed: int,
+    ahead: Mapping[Contest, Array],
 ) -> None:
-    """Add the figures to the suite; without plotly only the tracks.
+    """Add the figures to a suite that has its verdict; without plotly only the tracks.
 
-    seed: of the runs in motion.
+    ahead: (n,) log(J_oracle-state / J_clairvoyant) of calibrated contests.
     """
-    contests = list(dict.fromkeys(cell.contest for cell in results.found))
-    moving = contests[:1] + contests[-1:] if len(contests) > 1 else contests
-    drives = {contest: runs_of(contest, seed) for contest in moving[:_MOST]}
-    for contest, runs in drives.items():
-        tracks = {name: (run["X"], run["Y"]) for name, run in runs.items()}
-        text = track_kml(contest.name, tracks, {name: colour(name) for name in tracks})
-        file = f"{contest.name.replace(', ', '-')}.kml"
-        suite.files.append((file, "application/vnd.google-earth.kml+xml", text))
+    series = {cell: each.series for cell, each in results.found.items() if each.series is not None}
+    best = best_controller(found)
+    suite.files += _tracks(series, best)
     try:
-        from ..report.figures import curves
+        from ..report.figures import curves, groups_with_interval
     except ModuleNotFoundError:
         return
-    suite.explorers.append(_time_series(results))
-    for tier, standings in found.items():
-        suite.figures += _maps(tier, standings)
+    _, estimator, controller, why, *_ = [*suite.verdict.splitlines(), "", "", "", ""]
+    marks = {100.0: "nominal"}
+    asked = (
+        ("Which estimator does a controller drive best with?", _estimators(found), estimator),
+        ("Which controller holds the car?", _controllers(found), controller),
+        ("What would knowing more save?", _ladder(found, ahead), why),
+    )
+    suite.answers += [(title, groups_with_interval(groups, _COST, marks), text)
+                      for title, groups, text in asked if groups]  # fmt: skip
     shown = lines(prices)
     if shown:
         ms, label = 1e3 * np.array(DELAYS), "cost / nominal's with sensors in time"
-        suite.figures.append(
-            (
-                "The price of delay",
-                curves(ms, shown, "further delay of camera and GPS / ms", label),
-                f"{PRICE_CONTEST.name}: camera every 50 ms, GPS every 200 ms. Each filter is "
-                "designed for its delay.",
-            )
+        figure = curves(ms, shown, "further delay of camera and GPS / ms", label)
+        text = (
+            f"{PRICE_CONTEST.name}: camera every 50 ms, GPS every 200 ms; each filter is designed "
+            "for its delay."
         )
-    for contest, runs in drives.items():
-        suite.figures.append(in_motion(f"In motion: {contest.name}, first test seed", runs))
+        suite.answers.append(("What does late sensing cost?", figure, text))
+    suite.explorers.append(_two_cells(series, best))
+    for tier, standings in found.items():
+        suite.figures += _maps(tier, standings)
 
 
-def runs_of(contest: Contest, seed: int) -> dict[str, Rollout]:
-    """One episode of each contestant that is shown in motion and can be driven there."""
-    cells = [Cell(contest, *shown) for shown in _SHOWN]
-    return {cell.label: run_of(cell, seed) for cell in cells}
+def _groups(found: Mapping[str, Sequence[Standing]], name: Any) -> dict[str, dict[str, Estimate]]:
+    """By tier, the cost over nominal's in %, the best first; name: of a cell, "" leaves it out."""
+    groups = {}
+    for tier, standings in found.items():
+        costs = {
+            name(each.cell): Estimate(*(100.0 * n for n in each.overall["cost_vs_nominal"]))
+            for each in standings
+            if name(each.cell) and "cost_vs_nominal" in each.overall
+        }
+        title = f"Tier {tier}: {TITLES[tier]}"
+        groups[title] = dict(sorted(costs.items(), key=lambda pair: pair[1].value))
+    return {title: costs for title, costs in groups.items() if costs}
 
 
-def in_motion(title: str, runs: Mapping[str, Rollout]) -> tuple[str, Any, str]:
-    """A figure of a suite: cars from above; runs: by name. Needs plotly."""
-    from ..report.heat_maps import animation
+def _estimators(found: Mapping[str, Sequence[Standing]]) -> dict[str, dict[str, Estimate]]:
+    def name(cell: Cell) -> str:
+        return cell.estimator if cell.controller == REFERENCE_CONTROLLER else ""
 
-    size = (VEHICLES["coms"].wheelbase, VEHICLES["coms"].front_track)
-    t = max((run["t"] for run in runs.values()), key=len)
-    paths = {name: (run["X"], run["Y"], run["psi"]) for name, run in runs.items()}
-    caption = (
-        "A rectangle has the wheelbase and track of the car, drawn at its centre of gravity. A car "
-        "whose episode ended stays where it was."
-    )
-    return title, animation(t, paths, size), caption
+    return _groups(found, name)
+
+
+def _controllers(found: Mapping[str, Sequence[Standing]]) -> dict[str, dict[str, Estimate]]:
+    def name(cell: Cell) -> str:
+        own = cell.estimator in ("", REFERENCE_FILTER) and cell.controller != NOMINAL
+        return cell.controller if own and cell.estimator != TRUTH else ""
+
+    return _groups(found, name)
+
+
+def _ladder(
+    found: Mapping[str, Sequence[Standing]], ahead: Mapping[Contest, Array]
+) -> dict[str, dict[str, Estimate]]:
+    def name(cell: Cell) -> str:
+        return cell.controller if cell.controller in RUNGS else ""
+
+    groups = _groups(found, name)
+    for tier in found:
+        title = f"Tier {tier}: {TITLES[tier]}"
+        mine = [each for contest, each in ahead.items() if contest.tier == tier]
+        if mine and "oracle-state" in groups.get(title, {}):
+            state = groups[title]["oracle-state"].value
+            over = geometric_mean(*(-each for each in mine))
+            groups[title]["clairvoyant"] = Estimate(*(state * each for each in over))
+    return groups
 
 
 def _maps(tier: str, standings: Sequence[Standing]) -> list[tuple[str, Any, str]]:
@@ -120,27 +144,60 @@ def _maps(tier: str, standings: Sequence[Standing]) -> list[tuple[str, Any, str]
     return figures
 
 
-def _time_series(results: Results) -> Explorer:
-    """Every cell's first test seed."""
-    series: dict[tuple[str, ...], Array] = {
-        (cell.contest.tier, cell.contest.name, cell.controller, cell.estimator): result.series
-        for cell, result in results.found.items()
-        if result.series is not None
+def _tracks(series: Mapping[Cell, Array], best: str) -> list[tuple[str, str, str]]:
+    """The tracks of the first and the last contest, for a map: no control and the best one."""
+    contests = list(dict.fromkeys(cell.contest for cell in series))
+    files = []
+    for contest in dict.fromkeys(contests[:1] + contests[-1:]):
+        places = {
+            cell.label: (each[:, 1 + SIGNALS.index("X")], each[:, 1 + SIGNALS.index("Y")])
+            for cell, each in series.items()
+            if cell.contest == contest and cell.controller in ("none", best)
+            if cell.estimator in ("", REFERENCE_FILTER)
+        }
+        text = track_kml(contest.name, places, {name: colour(name) for name in places})
+        name = f"{contest.name.replace(', ', '-')}.kml"
+        files.append((name, "application/vnd.google-earth.kml+xml", text))
+    return files
+
+
+def _two_cells(series: Mapping[Cell, Array], best: str) -> Explorer:
+    """Every cell's first test seed; at first no control and the best controller."""
+    own = (
+        c.label for c in series if c.controller == best and c.estimator in ("", REFERENCE_FILTER)
+    )
+    keyed: dict[tuple[str, ...], Array] = {
+        (c.contest.tier, c.contest.name, c.label): each for c, each in series.items()
     }
-    menus = ("tier", "contest", "controller", "estimator")
-    return over_time("Any cell over time (its first test seed)", menus, series)
+    bodies: dict[tuple[str, ...], tuple[float, float]] = {}
+    for cell in series:
+        car = VEHICLES[cell.contest.vehicle or "coms"]
+        size = (_BODY[0] * car.wheelbase, _BODY[1] * car.front_track)
+        bodies[cell.contest.tier, cell.contest.name] = size
+    best = next(own, "")
+    return over_time("Any two side by side", ("tier", "contest"), keyed, best, bodies)
 
 
 def over_time(
-    title: str, menus: Sequence[str], series: Mapping[tuple[str, ...], Array]
+    title: str,
+    menus: Sequence[str],
+    series: Mapping[tuple[str, ...], Array],
+    best: str = "",
+    bodies: Mapping[tuple[str, ...], tuple[float, float]] | None = None,
 ) -> Explorer:
-    """Episodes to choose from; series: key (one name a menu) to what `Driven` keeps of one."""
+    """Episodes of which two are shown beside each other, at first `none` and the best.
+
+    series: key (one name a menu, and the contestant) to what `Driven` keeps of one.
+    """
     cells = {}
     for key, values in series.items():
         signals = dict(zip(("t", *SIGNALS), values.T, strict=True))
         cells[key] = {name: _SCALES.get(name, 1.0) * each for name, each in signals.items()}
-    caption = "The same seed in every cell; thinned to 250 samples."
-    return Explorer(title, menus, cells, _PANELS, caption)
+    caption = (
+        "The same seed in both: line the contestant's, dashed the reference. The arrow is where "
+        "the car goes in a quarter of a second, its angle to the body the sideslip."
+    )
+    return Explorer(title, menus, cells, _PANELS, caption, ("none", best), bodies or {})
 
 
 def run_of(cell: Cell, seed: int) -> Rollout:

@@ -159,7 +159,7 @@ def answer(
     """
     filters, others = _estimators(found), _controllers(found)
     none = others.get("none", {})
-    best = next(iter(_ranked(others)), "")
+    best = best_controller(found)
     over = _over(others[best], none) if none and best != "none" else None
     text = f", {100.0 * over.value:.0f} % of no control's" if over else ""
     episodes = max((len(r) for each in others.values() for r in each.values()), default=0)
@@ -171,6 +171,11 @@ def answer(
         f"{_elsewhere(found)}Not covered: other cars and roads, and less than {episodes} "
         "episodes a contest can tell.",
     )
+
+
+def best_controller(found: Mapping[str, Sequence[Standing]]) -> str:
+    """Who leads over all tiers, "" where nobody has a score."""
+    return next(iter(_ranked(_controllers(found))), "")
 
 
 def _estimators(found: Mapping[str, Sequence[Standing]]) -> dict[str, Gains]:
@@ -252,15 +257,16 @@ def _why(
         ("what is ahead", list(ahead.values())),
     )
     texts = [
-        f"{what} {100.0 * (1.0 - geometric_mean(*(-r for r in logs)).value):.0f} %"
+        f"{what} saves {100.0 * (1.0 - geometric_mean(*(-r for r in logs)).value):.0f} %"
         for what, logs in steps
         if logs
     ]
     late = [price.over for price in prices if price.cell.controller == REFERENCE_CONTROLLER]
+    delay = ""
     if late and np.isfinite(late[0][-1].value):
         grown = 100.0 * (late[0][-1].value / late[0][0].value - 1.0)
-        texts.append(f"{DELAYS[-1]:g} s of delay costs {grown:.0f} %")
-    return f"Why: to know saves, one after the other, {', '.join(texts)}." if rung else ""
+        delay = f"; {DELAYS[-1]:g} s of delay costs {grown:.0f} %"
+    return f"Why: knowing {', then '.join(texts)} of the cost{delay}." if rung else ""
 
 
 def refusals_of(results: Results, late: float = 0.0) -> list[list[str]]:

@@ -90,7 +90,7 @@ def run(
     suite.rows += _price_rows(prices, share, salt)
     suite.tables += _refusals(results, late)
     suite.verdict = answer(found, prices, foreseen)
-    illustrate(suite, found, results, prices, seeds[0])
+    illustrate(suite, found, results, prices, foreseen)
     spent = np.nansum([c.seconds for each in (results, there, *late) for c in each.found.values()])
     suite.text = f"{_TEXT} Driven in {spent / 60.0:.1f} CPU-minutes."
     return suite

@@ -1,8 +1,8 @@
 """The figures of the report, as plotly figures: time series, errors, tracks, bars.
 
 Every axis carries its unit, every name has its colour (`colours`). Lines longer than `POINTS` are
-thinned so that no peak is lost, and numbers are stored in single precision: a report of twenty
-figures stays a few megabytes. Importing this module needs plotly, the extra `report`.
+thinned so that no peak is lost, and numbers are stored in single precision.
+Importing this module needs plotly, the extra `report`.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...envs.rendering.palette import FACTS, GREY, INK, colour
+from ...envs.rendering.palette import FACTS, GREY, INK, base, colour
+from ..harness.stats import Estimate
 from .colours import line_styles
 
 try:
@@ -23,8 +24,8 @@ except ModuleNotFoundError as error:
 
 Array = npt.NDArray[np.floating[Any]]
 
-POINTS = 2000
-"""The most points a line is drawn with."""
+POINTS = 1000
+"""The most points a line is drawn with: a figure is no wider in pixels."""
 
 
 def peaks(y: Array, limit: int = POINTS) -> npt.NDArray[np.intp]:
@@ -56,8 +57,9 @@ def time_series(
 ) -> Any:
     """Lines over time, all on one axis.
 
-    t: (n,). series: name to (n,); "truth" is drawn first and thicker. unit_label: quantity and
-    unit, "sideslip angle / mrad". dots: names drawn as dots, for packets (NaN between them).
+    t: (n,). series: name to (n,); "truth" is drawn last, on top of the others, and thicker.
+    unit_label: quantity and unit, "sideslip angle / mrad". dots: names drawn as dots, for packets
+    (NaN between them).
     Raises ValueError for a series that is not as long as t.
     """
     t = np.asarray(t, float)
@@ -74,7 +76,7 @@ def time_series(
             trace.line.width = 1.0  # a dense line is noisy: leave room to see the others
         figure.add_trace(trace)
     figure.update_xaxes(range=[float(t[0]), float(t[-1])] if len(t) > 1 else None)
-    return _finish(_facts_first(figure), x_label, unit_label, 380, hovermode="x unified")
+    return _finish(_facts_last(figure), x_label, unit_label, 380, hovermode="x unified")
 
 
 def error_series(t: Array, errors: Mapping[str, Array], unit_label: str) -> Any:
@@ -127,7 +129,7 @@ def track(paths: Mapping[str, tuple[Array, Array]]) -> Any:
         figure.add_trace(_line(name, across[shown], up[shown], *colour_and_dash))
     figure.update_yaxes(scaleanchor="x", scaleratio=1)
     height = int(np.clip(120 + 900 * _slimness(figure), 280, 640))
-    return _finish(_facts_first(figure), "x / m", "y / m", height, hovermode="closest")
+    return _finish(_facts_last(figure), "x / m", "y / m", height, hovermode="closest")
 
 
 def bars_with_interval(
@@ -180,11 +182,60 @@ def bars_with_interval(
     return _finish(figure, unit, "", 100 + 34 * len(labels), hovermode="closest")
 
 
+def groups_with_interval(
+    groups: Mapping[str, Mapping[str, Estimate]], unit: str, lines: Mapping[float, str]
+) -> Any:
+    """Dots with intervals on a logarithmic axis, group below group, each under its title.
+
+    groups: by title, the numbers by name, drawn in this order. unit: quantity and unit. lines:
+    what certain values mean. A name that is a variant of a known one has a hollow dot.
+    """
+    figure, ticks, row = go.Figure(), dict[int, str](), 0
+    for title, numbers in groups.items():
+        text = {"text": f"<b>{title}</b>", "showarrow": False, "xref": "paper", "x": 1}
+        figure.add_annotation(y=row, xanchor="right", font={"size": 12.5}, **text)
+        for name, (value, low, high) in numbers.items():
+            row += 1
+            ticks[row] = name
+            ends = {"array": [high - value], "arrayminus": [value - low], "symmetric": False}
+            marker = {
+                "color": colour(name),
+                "size": 10,
+                "line": {"width": 2, "color": colour(name)},
+            }
+            marker["symbol"] = "circle" if base(name) in (name, None) else "circle-open"
+            hover = f"{name}: {value:.3g} [{low:.3g}, {high:.3g}]<extra></extra>"
+            pen = {"type": "data", "color": colour(name), "thickness": 1.6, "width": 4}
+            figure.add_trace(
+                go.Scatter(x=[value], y=[row], error_x=pen | ends, marker=marker,
+                           mode="markers", name=name, hovertemplate=hover, showlegend=False)
+            )  # fmt: skip
+        row += 1
+    for value, meaning in lines.items():
+        look = {"line": {"color": GREY, "width": 1.2, "dash": "dot"}, "layer": "below"}
+        figure.add_shape(type="line", x0=value, x1=value, y0=0, y1=1, yref="paper", **look)
+        place = {"x": np.log10(value), "y": 1, "yref": "paper", "yanchor": "bottom"}
+        figure.add_annotation(text=meaning, showarrow=False, font={"size": 11}, **place)
+    _finish(
+        figure,
+        unit,
+        "",
+        110 + 21 * row,
+        hovermode="closest",
+        margin={"t": 28, "b": 12, "l": 12, "r": 12},
+    )
+    figure.update_layout(showlegend=False)
+    figure.update_xaxes(type="log", tickformat="~g", dtick="D2")
+    names = {"tickvals": list(ticks), "ticktext": list(ticks.values())}
+    figure.update_yaxes(range=[row - 0.4, -0.6], showgrid=True, ticks="", **names)
+    return figure
+
+
 def _line(name: str, x: Array, y: Array, colour: str, dash: str, dots: bool = False) -> Any:
     x, y = _single(x), _single(y)
     if dots:
         return go.Scatter(x=x, y=y, name=name, mode="markers", marker={"color": colour, "size": 4})
-    pen = {"color": colour, "dash": dash, "width": 4.0 if name in FACTS else 1.8}
+    pen = {"color": colour, "dash": dash, "width": 2.6 if name in FACTS else 1.8}
     return go.Scatter(x=x, y=y, name=name, mode="lines", line=pen)
 
 
@@ -206,9 +257,10 @@ def _slimness(figure: Any) -> float:
     return spans[0] / max(spans[1], 1e-9)
 
 
-def _facts_first(figure: Any) -> Any:
-    """Truth below the estimates, so that they stay visible."""
-    figure.data = sorted(figure.data, key=lambda trace: trace.name not in FACTS)
+def _facts_last(figure: Any) -> Any:
+    """Truth on top of the estimates; the legend names it first."""
+    figure.data = sorted(figure.data, key=lambda trace: trace.name in FACTS)
+    figure.update_traces(legendrank=1, selector=lambda trace: trace.name in FACTS)
     return figure
 
 

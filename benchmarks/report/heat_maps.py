@@ -1,6 +1,6 @@
-"""The matrix as a heat map, and cars in motion. Needs plotly."""
+"""The matrix as a heat map, and shares over two axes. Needs plotly."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -10,14 +10,11 @@ from plotly.subplots import make_subplots
 
 from ...envs.rendering.palette import INK
 from ..harness.results import ShareMap
-from .colours import SHARE_SCALE, line_styles
+from .colours import SHARE_SCALE
 
 Array = npt.NDArray[np.float64]
 
-_FRAMES = 120
-_WINDOW = (36.0, 11.0)  # m, what is seen of a run in motion
 _GOOD_TO_BAD = [(1.0 - at, shade) for at, shade in SHARE_SCALE][::-1]
-_CAR = np.array([[1.0, 0.5], [1.0, -0.5], [-1.0, -0.5], [-1.0, 0.5], [1.0, 0.5]])
 
 
 def heat_map(
@@ -50,7 +47,9 @@ def heat_map(
     figure = go.Figure(trace)
     figure.update_xaxes(side="top", tickangle=-35, showgrid=False, ticks="", automargin=True)
     figure.update_yaxes(autorange="reversed", showgrid=False, ticks="", automargin=True)
-    figure.update_layout(height=170 + 22 * len(names), hovermode="closest", showlegend=False)
+    figure.update_layout(
+        height=170 + 22 * len(names), hovermode="closest", showlegend=False, meta="scroll"
+    )
     return figure
 
 
@@ -76,82 +75,6 @@ def share_maps(shown: ShareMap) -> Any:
             figure.update_yaxes(title_text=shown.y_label, **place)
     scale = [list(each) for each in SHARE_SCALE]
     bar = {"colorscale": scale, "cmin": 0.0, "cmax": 1.0, "colorbar": {"title": {"text": "share"}}}
-    figure.update_layout(height=120 + 230 * down, coloraxis=bar, showlegend=False)
+    figure.update_layout(height=120 + 230 * down, coloraxis=bar, showlegend=False, meta="scroll")
+    figure.update_layout(margin={"t": 34, "l": 60, "b": 52})
     return figure
-
-
-def animation(
-    t: Array,
-    paths: Mapping[str, tuple[Array, Array, Array]],
-    size: tuple[float, float],
-    lines: Mapping[str, tuple[Array, Array]] | None = None,
-) -> Any:
-    """Cars from above in motion, with a slider for the time.
-
-    t: (n,) s. paths: name to (X, Y in m, psi in rad), at most n long: a car whose episode ended
-    stays where it was. size: length and width in m. lines: borders or cones to draw, name to
-    (x, y).
-    """
-    shades = {name: shade for name, (shade, _) in line_styles(paths).items()}
-    fixed = [
-        go.Scatter(x=x, y=y, name=name, mode="lines", line={"color": INK, "width": 1})
-        for name, (x, y) in (lines or {}).items()
-    ]
-    trails = [
-        go.Scatter(x=X, y=Y, name=name, mode="lines", line={"color": shades[name], "width": 1})
-        for name, (X, Y, _) in paths.items()
-    ]
-    at = np.linspace(0, len(t) - 1, min(_FRAMES, len(t))).astype(int)
-    figure = go.Figure([*fixed, *trails, *_cars(paths, shades, size, 0)])
-    moving = list(range(len(fixed) + len(trails), len(figure.data)))
-    names = [f"{t[k]:.2f}" for k in at]
-    views = [_view(paths, int(k)) for k in at]
-    figure.frames = [
-        go.Frame(name=name, data=_cars(paths, shades, size, int(k)), traces=moving, layout=view)
-        for name, k, view in zip(names, at, views, strict=True)
-    ]
-    pace = {"frame": {"duration": 40, "redraw": False}, "transition": {"duration": 0}}
-    jump = pace | {"mode": "immediate"}
-    steps = [{"label": name, "method": "animate", "args": [[name], jump]} for name in names]
-    play = {"label": "play", "method": "animate", "args": [None, pace | {"fromcurrent": True}]}
-    stop = {"label": "stop", "method": "animate", "args": [[None], jump]}
-    figure.update_layout(
-        views[0],
-        height=480,
-        hovermode="closest",
-        legend={"orientation": "h", "x": 0, "y": 1.02, "yanchor": "bottom"},
-        sliders=[{"steps": steps, "currentvalue": {"prefix": "t = ", "suffix": " s"}, "x": 0.1}],
-        updatemenus=[
-            {"type": "buttons", "buttons": [play, stop], "direction": "left", "x": 0, "y": -0.12}
-        ],
-    )
-    figure.update_xaxes(title_text="X / m", automargin=True)
-    figure.update_yaxes(title_text="Y / m", automargin=True, scaleanchor="x", scaleratio=1)
-    return figure
-
-
-def _view(paths: Mapping[str, tuple[Array, Array, Array]], k: int) -> dict[str, Any]:
-    """The axes' ranges: a window that follows the car that is ahead."""
-    ends = [(X[min(k, len(X) - 1)], Y[min(k, len(Y) - 1)]) for X, Y, _ in paths.values()]
-    x, y = max(ends)
-    low, high = float(x) - 0.7 * _WINDOW[0], float(x) + 0.3 * _WINDOW[0]
-    half = 0.5 * _WINDOW[1]
-    return {"xaxis": {"range": [low, high]}, "yaxis": {"range": [float(y) - half, float(y) + half]}}
-
-
-def _cars(
-    paths: Mapping[str, tuple[Array, Array, Array]],
-    shades: Mapping[str, str],
-    size: tuple[float, float],
-    k: int,
-) -> list[Any]:
-    """Each car's outline at a sample."""
-    drawn = []
-    for name, (X, Y, psi) in paths.items():
-        i = min(k, len(X) - 1)
-        c, s = np.cos(psi[i]), np.sin(psi[i])
-        x, y = (_CAR * [0.5 * size[0], size[1]]).T  # half ahead and behind, half to either side
-        look = {"mode": "lines", "fill": "toself", "line": {"color": shades[name], "width": 2}}
-        outline = {"x": X[i] + c * x - s * y, "y": Y[i] + s * x + c * y}
-        drawn.append(go.Scatter(**outline, **look, showlegend=False, hoverinfo="skip"))
-    return drawn

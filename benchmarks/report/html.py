@@ -1,14 +1,14 @@
 """The report: what the suites found as one HTML file that needs nothing from the network.
 
 The page is `page.html`, its looks `report.css`, what it does `report.js` and `explorer.js`, all
-beside this module and put together into one file. The page's own policy forbids it to load more.
+beside this module and put together into one file. plotly.js and the figures lie in it packed. The
+page's own policy lets no script run but ours, by its hash, and nothing be loaded.
 """
 
 import base64
+import hashlib
 import json
-import math
-import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from datetime import datetime
 from html import escape
 from importlib.resources import files
@@ -16,14 +16,24 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
-from ...envs.rendering.palette import INK, base, colour
-from ..harness.results import Suite, Table, write_text
+import numpy as np
+
+from ...envs.rendering.palette import colour
+from ..harness.explorer import Explorer
+from ..harness.results import Suite, write_text
+from .pack import figure_text, packed, steps
+from .tables import inline, table_html
+
+POINTS = 250
+"""Samples of a cell in a figure with menus."""
+_FEW = 4  # figures of a suite; more are folded
 
 
 def write_report(
     path: str | Path, suites: list[Suite], command: str, environment: Mapping[str, str]
 ) -> None:
-    """Write one self-contained HTML file with every suite's text, tables and figures.
+    """Write one self-contained HTML file: the verdicts, a picture for each question, and every
+    suite's text, figures and tables.
 
     command: the command line that made it. environment: versions by name. A figure's own title
     and template are left out: the page has its title above it and draws it light or dark.
@@ -33,128 +43,96 @@ def write_report(
     if not suites:
         raise ValueError("a report needs at least one suite")
     made = {"made": datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z"), **environment}
-    drawn = any(suite.figures or suite.explorers for suite in suites)
+    drawn = any(suite.answers or suite.figures or suite.explorers for suite in suites)
+    script = _beside("report.js") + "\n\n" + _beside("explorer.js")
+    plotly = _plotly() if drawn else ""
+    linked = [(f"suite-{i}", suite) for i, suite in enumerate(suites, 1)]
+    answers = [answer for suite in suites for answer in suite.answers]
+    answers.sort(key=lambda answer: bool(answer[1].layout.meta))  # the wide ones below
+    opening = [_picture(*answer) for answer in answers]
+    opening += [_explorer(each) for suite in suites for each in suite.explorers]
     page = Template(_beside("page.html") + "\n").substitute(
         suites=", ".join(escape(suite.name) for suite in suites),
         css=_beside("report.css"),
-        js=_beside("report.js") + "\n\n" + _beside("explorer.js"),
-        plotly=f"<script>{_plotly()}</script>\n" if drawn else "",
+        allowed=" ".join(_hash(each) for each in (script, plotly) if each),
+        js=script,
+        plotly=_data("plotly", plotly) if drawn else "",
         command=escape(command),
         made=" · ".join(f"{escape(name)} <b>{escape(value)}</b>" for name, value in made.items()),
         contents="\n".join(
-            f'<li><a href="#{link}">{escape(title)}</a></li>'
-            for link, title in [("summary", "What wins"), *_links(suites)]
+            f'<li><a href="#{link}">{escape(suite.title)}</a></li>' for link, suite in linked
         ),
-        summary="\n".join(
-            f'<h3><a href="#{link}">{escape(title)}</a></h3>\n'
-            + "\n".join(map(_table, suite.tables[:2]))  # a suite's main comparisons
-            for (link, title), suite in zip(_links(suites), suites, strict=True)
-            if suite.tables
-        ),
-        sections="\n".join(
-            _section(link, suite) for (link, _), suite in zip(_links(suites), suites, strict=True)
-        ),
+        verdicts="\n".join(_verdict(*each) for each in linked if each[1].verdict),
+        pictures="\n".join(opening),
+        sections="\n".join(_section(*each) for each in linked),
     )
     write_text(path, page)
 
 
-def number(cell: str) -> float | None:
-    """The number a cell begins with, None for one that begins with none (or with NaN).
-
-    >>> number("0.31 [0.29, 0.33]"), number("-1,250 N m"), number("< 2e-3"), number("2-dof")
-    (0.31, -1250.0, 0.002, None)
-    """
-    found = _NUMBER.match(cell)
-    if not found:
-        return None
-    sign = -1.0 if found["sign"] in ("-", "\u2212") else 1.0
-    if found["inf"]:
-        return sign * math.inf
-    return sign * float(re.sub(r"[,\u00a0\u202f]", "", found["digits"]).replace("\u2212", "-"))
-
-
-_NUMBER = re.compile(
-    r"\s*[\[(<>≤≥~≈±]*\s*(?P<sign>[-+\u2212])?"
-    r"(?:(?P<inf>inf\b|∞)"
-    r"|(?P<digits>(?>\d+(?:[,\u00a0\u202f]\d{3})*(?:\.\d*)?|\.\d+)(?>e[-+\u2212]?\d+)?)(?!-\w))",
-    re.IGNORECASE,
-)
-_LONG = 40  # letters: a longer cell wraps
-_BLANK = {"", "-", "\u2013", "\u2014", "nan", "n/a"}
-
-
-def numeric(cells: Iterable[str]) -> bool:
-    """Whether a column is one of numbers: some, and nothing else but blanks."""
-    texts = [cell for cell in cells if cell.strip().lower() not in _BLANK]
-    return bool(texts) and all(number(cell) is not None for cell in texts)
-
-
-def _table(table: Table) -> str:
-    for row in table.cells:
-        if len(row) != len(table.header):
-            raise ValueError(
-                f"table {table.title!r}: {len(row)} cells under {len(table.header)} headers: {row}"
-            )
-    columns = list(zip(*table.cells, strict=True)) or [()] * len(table.header)
-    are_numbers = [numeric(column) for column in columns]
-    heads = "".join(
-        f'<th scope="col" aria-sort="none"{_number_class(is_number)}>'
-        f'<button type="button">{escape(name)}</button></th>'
-        for name, is_number in zip(table.header, are_numbers, strict=True)
-    )
-    body = "\n".join(f"<tr>{_row(row, are_numbers, table.keyed)}</tr>" for row in table.cells)
-    title = escape(table.title)
-    note = f'\n<p class="note">{_inline(table.note)}</p>' if table.note else ""
-    return (
-        f'<p class="caption">{title}</p>\n'
-        f'<div class="scroll" role="region" tabindex="0" aria-label="{title}">\n'
-        f'<table class="sortable" aria-label="{title}">\n'
-        f"<thead><tr>{heads}</tr></thead>\n<tbody>\n{body}\n</tbody></table></div>{note}"
-    )
-
-
-def _row(row: Sequence[str], numeric: Sequence[bool], keyed: bool) -> str:
-    cells = []
-    for i, (cell, is_number) in enumerate(zip(row, numeric, strict=True)):
-        value = number(cell) if is_number else None
-        data = "" if value is None else f' data-value="{_plain(value)}"'
-        tag, key = ('th scope="row"', _key(cell) if keyed else "") if i == 0 else ("td", "")
-        kind = ' class="long"' if len(cell) > _LONG else _number_class(is_number)
-        cells.append(f"<{tag}{kind}{data}>{key}{escape(cell)}</{tag[:2]}>")
-    return "".join(cells)
-
-
-def _number_class(is_number: bool) -> str:
-    return ' class="number"' if is_number else ""
-
-
-def _plain(value: float) -> str:
-    """A number as JavaScript reads it."""
-    return repr(value) if math.isfinite(value) else "-Infinity" if value < 0 else "Infinity"
-
-
-def _key(cell: str) -> str:
-    """The colour of an estimator or controller in the figures, as a small square."""
-    if base(cell) is None:
-        return ""
-    shade = colour(cell)
-    return f'<i class="key" style="background:{"var(--ink)" if shade == INK else shade}"></i>'
+def _verdict(link: str, suite: Suite) -> str:
+    lines = "\n".join(f"<li>{inline(line)}</li>" for line in suite.verdict.splitlines())
+    title = f'<h3><a href="#{link}">{escape(suite.title)}</a></h3>'
+    return f"<article>\n{title}\n<ul>\n{lines}\n</ul>\n</article>"
 
 
 def _section(link: str, suite: Suite) -> str:
     blocks = [f"<h2>{escape(suite.title)}</h2>"]
-    blocks += [f"<p>{_inline(part)}</p>" for part in suite.text.split("\n\n") if part.strip()]
-    blocks += [_table(table) for table in suite.tables]
-    blocks += [explorer.html() for explorer in suite.explorers]
-    blocks += [
-        f"<figure>\n<h3>{escape(title)}</h3>\n"
-        f'<div class="plot" role="img" aria-label="{escape(title)}"></div>\n'
-        f'<script type="application/json">{_json(figure)}</script>\n'
-        f"<figcaption>{_inline(caption)}</figcaption>\n</figure>"
-        for title, figure, caption in suite.figures
-    ]
+    blocks += [f"<p>{inline(part)}</p>" for part in suite.text.split("\n\n") if part.strip()]
+    figures = [_picture(*each) for each in suite.figures]
+    if len(figures) > _FEW:
+        inside = "\n".join(figures)
+        figures = [f"<details><summary>{len(figures)} figures</summary>\n{inside}\n</details>"]
+    blocks += figures
+    blocks += [table_html(table) for table in suite.tables]
     blocks += [_download(*file) for file in suite.files]
     return f'<section id="{link}">\n' + "\n".join(blocks) + "\n</section>"
+
+
+def _picture(title: str, figure: Any, caption: str) -> str:
+    """A figure; its layout's meta: "wide" or "scroll", one that keeps its width on a phone."""
+    kind = figure.layout.meta or ""
+    return (
+        f'<figure class="{kind}">\n<h3>{escape(title)}</h3>\n<div class="frame">'
+        f'<div class="plot" role="img" aria-label="{escape(title)}"></div></div>\n'
+        f"{_data('figure', figure_text(figure))}\n"
+        f"<figcaption>{inline(caption)}</figcaption>\n</figure>"
+    )
+
+
+def _explorer(explorer: Explorer) -> str:
+    """Two cells side by side; `explorer.js` makes the menus and draws."""
+    content = {
+        "menus": list(explorer.menus),
+        "pair": list(explorer.pair),
+        "panels": [{"label": p.label, "lines": list(map(list, p.lines))} for p in explorer.panels],
+        "bodies": [[list(key), list(size)] for key, size in explorer.bodies.items()],
+        "colours": {key[-1]: colour(key[-1]) for key in explorer.cells},
+        "cells": [
+            [list(key), {name: steps(_thinned(values)) for name, values in signals.items()}]
+            for key, signals in explorer.cells.items()
+        ],
+    }
+    return (
+        f'<figure class="explorer wide">\n<h3>{escape(explorer.title)}</h3>\n'
+        f"{_data('explorer', json.dumps(content, separators=(',', ':')))}\n"
+        f"<figcaption>{inline(explorer.caption)}</figcaption>\n</figure>"
+    )
+
+
+def _thinned(values: Any) -> Any:
+    """At most POINTS samples, of every signal of a cell at the same places."""
+    n = len(values)
+    return values[np.unique(np.linspace(0, n - 1, min(n, POINTS)).astype(int))]
+
+
+def _data(name: str, text: str) -> str:
+    """A packed text, which no browser runs."""
+    return f'<script type="application/gzip" data-name="{name}">{packed(text)}</script>'
+
+
+def _hash(script: str) -> str:
+    """A script as the page's policy names it."""
+    return f"'sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}'"
 
 
 def _download(name: str, media: str, text: str) -> str:
@@ -165,31 +143,10 @@ def _download(name: str, media: str, text: str) -> str:
     )
 
 
-def _links(suites: Sequence[Suite]) -> list[tuple[str, str]]:
-    return [(f"suite-{i}", suite.title) for i, suite in enumerate(suites, 1)]
-
-
-def _inline(text: str) -> str:
-    """Escaped text; what stands in backticks becomes code."""
-    return re.sub(r"`([^`]+)`", r"<code>\1</code>", escape(text))
-
-
-def _json(figure: Any) -> str:
-    """A figure's data and layout; no text in it can end the script that holds it."""
-    from plotly.utils import PlotlyJSONEncoder
-
-    content = figure.to_plotly_json()
-    for name in ("template", "title"):
-        content["layout"].pop(name, None)
-    plain = {name: content[name] for name in ("data", "layout", "frames") if content.get(name)}
-    text = json.dumps(plain, cls=PlotlyJSONEncoder, separators=(",", ":"))
-    return text.replace("<", "\\u003c")
-
-
 def _plotly() -> str:
     from plotly.offline import get_plotlyjs
 
-    return str(get_plotlyjs())
+    return str(get_plotlyjs()).replace("\r\n", "\n")
 
 
 def _beside(name: str) -> str:

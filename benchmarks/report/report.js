@@ -30,6 +30,19 @@ for (const table of document.querySelectorAll("table.sortable")) {
   });
 }
 
+// What is packed: gzip in base64, numbers as steps in whole quanta.
+async function unpack(script) {
+  const bytes = Uint8Array.from(atob(script.textContent), (letter) => letter.charCodeAt(0));
+  const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
+  return new Response(stream).text();
+}
+
+function numbers(values) {
+  if (!values?.steps) return values;
+  let at = 0;
+  return values.steps.map((step) => (step === null ? null : values.from + values.by * (at += step)));
+}
+
 // Figures take the page's colours, light or dark; black, the colour of facts, becomes its ink.
 const DARK = window.matchMedia("(prefers-color-scheme: dark)");
 const TOUCH = window.matchMedia("(hover: none)");
@@ -80,16 +93,26 @@ function broken(text) {
   return text.replace(new RegExp(`(.{1,${length}})(?:\\s+|$)`, "g"), "$1<br>").slice(0, -4);
 }
 
+const DRAWN = new Map(); // figure to the text of its data
+
 function draw(figure) {
-  const { data, layout = {}, frames = [] } = JSON.parse(figure.querySelector("script").textContent);
-  for (const trace of [...data, ...frames.flatMap((frame) => frame.data)]) {
-    for (const pen of [trace.line, trace.marker, trace.error_x]) {
+  const { data, layout = {} } = JSON.parse(DRAWN.get(figure));
+  for (const trace of data) {
+    for (const axis of ["x", "y"]) trace[axis] = numbers(trace[axis]);
+    for (const pen of [trace.line, trace.marker, trace.marker?.line, trace.error_x]) {
       if (pen?.color) pen.color = inked(pen.color);
     }
+  }
+  for (const shape of layout.shapes ?? []) {
+    if (shape.line?.color) shape.line.color = inked(shape.line.color);
   }
   if (NARROW.matches) {
     // The legend becomes a column above the plot, long titles of axes become several lines.
     if (layout.showlegend && layout.height) layout.height += 16 * data.length;
+    if (!layout.showlegend) {
+      for (const axis of [layout.xaxis, layout.yaxis]) if (axis) axis.tickfont = { size: 10 };
+      for (const title of layout.annotations ?? []) title.font = { ...title.font, size: 10 };
+    }
     for (const title of [layout.xaxis?.title, layout.yaxis?.title]) {
       if (title?.text) title.text = broken(title.text);
     }
@@ -97,19 +120,51 @@ function draw(figure) {
   // A finger shall scroll the page, not zoom the figure it lands on.
   const dragmode = TOUCH.matches ? false : "zoom";
   const themed = { dragmode, ...layout, template: template() };
-  // Frames belong to the plot: they are replaced with it, never added a second time.
-  Plotly.react(figure.querySelector(".plot"), { data, layout: themed, frames, config: CONFIG });
+  Plotly.react(figure.querySelector(".plot"), data, themed, CONFIG);
 }
 
 function drawAll() {
-  for (const figure of document.querySelectorAll("figure:not(.explorer)")) draw(figure);
+  for (const figure of DRAWN.keys()) draw(figure);
 }
 
-// One figure a turn, so that the page can be read and scrolled from the start.
-function drawInTurn(figures) {
-  if (!figures.length) return;
-  setTimeout(drawInTurn, 0, figures.slice(1)); // first: a figure that fails stops no other
-  draw(figures[0]);
+// One figure a turn, so that the page can be read and scrolled from the start; what is folded
+// when it is opened. A figure that fails stops no other.
+async function drawInTurn(figures) {
+  for (const figure of figures) {
+    if (DRAWN.has(figure)) continue;
+    const text = await unpack(figure.querySelector("script"));
+    DRAWN.set(figure, text);
+    await new Promise((resolve) => setTimeout(resolve));
+    try {
+      draw(figure);
+    } catch (error) {
+      console.error(error);
+    }
+  }
+}
+
+function figuresIn(place, folded = "details:not([open]) figure") {
+  const hidden = new Set(place.querySelectorAll(folded));
+  return [...place.querySelectorAll("figure:not(.explorer)")].filter((each) => !hidden.has(each));
+}
+
+async function drawEverything() {
+  const packed = document.querySelector("script[data-name=plotly]");
+  if (!packed) return;
+  if (!window.DecompressionStream) {
+    document.getElementById("unable").hidden = false;
+    return;
+  }
+  const library = document.createElement("script");
+  library.textContent = await unpack(packed);
+  document.head.append(library);
+  await drawInTurn(figuresIn(document));
+  for (const figure of document.querySelectorAll("figure.explorer")) await explore(figure);
+  for (const folded of document.querySelectorAll("details")) {
+    folded.addEventListener("toggle", () => folded.open && drawInTurn(figuresIn(folded)));
+    if (folded.open) drawInTurn(figuresIn(folded)); // opened meanwhile
+  }
+  document.body.dataset.drawn = "all";
 }
 
 function setPrinting(printing) {
@@ -117,7 +172,7 @@ function setPrinting(printing) {
   if (DARK.matches) drawAll();
 }
 
-drawInTurn([...document.querySelectorAll("figure:not(.explorer)")]);
+setTimeout(drawEverything);
 DARK.addEventListener("change", drawAll);
 NARROW.addEventListener("change", drawAll);
 window.addEventListener("beforeprint", () => setPrinting(true));

@@ -1,5 +1,8 @@
-"""One colour a name, in every picture, figure and table: the palette of Okabe and Ito, safe for the
-colour-blind. Its yellow is left out (invisible on white); baselines are grey, facts are ink."""
+"""One colour a name, in every picture, figure and table: each method has its own.
+
+The colours were spread as far as possible in OKLab, for eyes without red or green cones too, those
+of names that meet in figures the furthest; every one stands out from white and from the dark page.
+"""
 
 import zlib
 
@@ -7,41 +10,90 @@ INK = "#000000"
 """Truth, reference, bound: black on white; the report turns it white on black."""
 GREY = "#7F7F7F"
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
-
-_NAMES = {
-    INK: "truth, true, reference, bound, ideal",
-    GREY: "none, measured, bicycle-kf, gyro-only, without control",
-    "#D55E00": "single-rate, single-rate-kf, constant-delay-kf, lob, lob-2",
-    "#0072B2": "multirate, multirate-kf, double-layer, pseudo measurement, with control",
-    "#009E73": "multirate-residual, multirate-residual-kf, uneven-delay-kf, pseudo-residuals",
-    "#CC79A7": "course-kf, roll-kf, innovation holding, two-dof",
-    "#E69F00": "dakf, kinematic-velocity-kf, conventional, feedforward",
-    "#56B4E9": "exact-kf, vision-only-kf",
+"""Of things: Okabe and Ito's, safe for the colour-blind, without the yellow that white swallows."""
+STRANGERS = ("#AB1B99", "#907EFC", "#BD3F09", "#D87E12")
+"""Of methods that are not ours, such as a user's own."""
+FILTERS = {
+    "bicycle-kf": "#EA75FC",
+    "single-rate-kf": "#995AFC",
+    "multirate-kf": "#00A275",
+    "multirate-residual-kf": "#BD247E",
+    "uneven-delay-kf": "#BD99B4",
+    "constant-delay-kf": "#90903F",
+    "vision-only-kf": "#E124A2",
+    "course-kf": "#FC5A48",
+    "dakf": "#994824",
+    "double-layer": "#096C5A",
+    "lob-2": "#7587C6",
+    "roll-kf": "#BD5A24",
+    "kinematic-velocity-kf": "#F35190",
+    "dual-rate": "#36B4CF",
+    "lob": "#633FE1",
+    "yaw-moment-observer": "#996C6C",
+    "lateral-force-observer": "#EA9048",
+    "exact-kf": "#0075B4",
 }
-COLOURS = {name: shade for shade, names in _NAMES.items() for name in names.split(", ")}
+CONTROLLERS = {
+    "none": GREY,
+    "feedforward": "#C6A200",
+    "two-dof": "#CF75AB",
+    "model-following": "#1BBD75",
+    "esc": "#755A75",
+    "sliding-mode": "#C61248",
+    "lqr": "#D85A00",
+    "mpc": "#127EE1",
+    "nmpc": "#3F3FFC",
+    "lane-keeping": "#486C3F",
+    "learned": "#D8636C",
+    "ppo-yaw-vision": "#AB6387",
+}
+RUNGS = {
+    "nominal": "#CF00B4",
+    "oracle-parameters": "#63905A",
+    "oracle-state": "#00ABFC",
+    "oracle-state-lqr": "#9090CF",
+    "oracle-state-nmpc": "#5A5ACF",
+    "clairvoyant": "#FC7E99",
+}
+
+# What the papers' figures call them.
+_ALIASES = {
+    "none": "without control",
+    "bicycle-kf": "gyro-only",
+    "single-rate-kf": "single-rate, conventional",
+    "multirate-kf": "multirate, innovation holding",
+    "multirate-residual-kf": "multirate-residual, pseudo-residuals, pseudo measurement",
+    "model-following": "with control, both",
+    "truth": "true, reference, bound, ideal",
+}
+_OWN = {**FILTERS, **CONTROLLERS, **RUNGS, "truth": INK, "measured": GREY}
+COLOURS = _OWN | {
+    alias: _OWN[name] for name, aliases in _ALIASES.items() for alias in aliases.split(", ")
+}
 """Estimators, controllers and facts by name."""
 
 FACTS = ("truth", "true")
 _WITHIN = sorted((name for name in COLOURS if name not in (*FACTS, "none")), key=len, reverse=True)
+_USUAL = "lqr on "  # the controller under which filters are compared
 
 
 def base(name: str) -> str | None:
-    """The name of `COLOURS` that a label speaks of, None for a stranger.
+    """The name of `COLOURS` that a label speaks of, None for a stranger: of a controller on an
+    estimator the controller, unless it is the usual one.
 
     >>> base("exact-kf, true model"), base("the bound"), base("a stranger")
     ('exact-kf', 'bound', None)
+    >>> base("two-dof on multirate-kf"), base("lqr on dakf")
+    ('two-dof', 'dakf')
     """
+    name = name.removeprefix(_USUAL).partition(" on ")[0]
     return name if name in COLOURS else next((known for known in _WITHIN if known in name), None)
 
 
 def colour(name: str) -> str:
-    """The colour of a label, as "#RRGGBB"; a stranger always gets the same one of the palette.
-
-    >>> colour("multirate-kf"), colour("two-dof on multirate-kf")
-    ('#0072B2', '#0072B2')
-    """
+    """The colour of a label, as "#RRGGBB"; a stranger always gets the same one."""
     known = base(name)
-    return COLOURS[known] if known else PALETTE[zlib.crc32(name.encode()) % len(PALETTE)]
+    return COLOURS[known] if known else STRANGERS[zlib.crc32(name.encode()) % len(STRANGERS)]
 
 
 def mixed(shade: str, with_shade: str, share: float) -> str:

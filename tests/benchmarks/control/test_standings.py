@@ -176,7 +176,7 @@ def test_the_answer_names_the_best_and_by_how_much() -> None:
     assert f"estimator: {REFERENCE_FILTER}, with 6" in estimator and "cost of dakf" in estimator
     assert "controller: lqr, with 33 % [" in controller and "of the cost of esc" in controller
     assert ", 16 % of no control's" in controller  # 2 / 12
-    assert "true car and road 50 %, its exact motion 7" in why
+    assert "true car and road saves 50 %, then its exact motion saves 7" in why
     assert "40 episodes a contest" in rest
 
 

@@ -66,7 +66,7 @@ def test_the_best_estimator_is_named_for_each_experiment() -> None:
     ]
     _, camera, gps, why, _ = fits(estimation.answer(found))
     assert camera.startswith("Late camera: multirate-kf, with 50 % [")
-    assert "2.0" in camera and "least possible" in camera
+    assert "2.00 times the least possible" in camera
     assert "a tie of" in gps and "dakf" in gps and "course-kf" in gps
     assert "x4.0 and x2.0" in why
 

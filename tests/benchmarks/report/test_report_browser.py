@@ -1,9 +1,11 @@
 """The report in a browser: every figure is drawn, nothing complains, a click sorts."""
 
 import base64
+import hashlib
 import re
 import shutil
 import subprocess
+from html import unescape
 from pathlib import Path
 
 import numpy as np
@@ -36,40 +38,84 @@ OPTIONS = (
     "--virtual-time-budget=20000",
 )
 
-MENUS = """<script>
+# Each runs when everything is drawn, and leaves what it found in the document.
+OPEN = """
+document.addEventListener("DOMContentLoaded", () => {
+  for (const each of document.querySelectorAll("details")) each.open = true;
+});
+"""
+CHOICES = """
+const [manoeuvre, left, right] = document.querySelectorAll(".explorer select");
+const names = (select) => [...select.options].map((option) => option.value).join("|");
+const found = [names(manoeuvre), names(left), left.value, right.value];
+manoeuvre.value = "step-steer";
+manoeuvre.dispatchEvent(new Event("change"));
+found.push(names(right), right.value);
+right.value = "none";
+right.dispatchEvent(new Event("change"));
+const plots = [...document.querySelectorAll(".explorer .plot")];
+found.push(...plots.map((plot) => plot.data.length), plots[1].data[0].y[0].toFixed(2));
+found.push(String(plots[0].layout.yaxis.range) === String(plots[1].layout.yaxis.range));
+document.body.dataset.found = found.join("; ");
+"""
+MOTION = """
+const [canvas] = document.querySelectorAll(".explorer canvas");
+const clock = document.querySelector(".explorer input");
+const cursor = document.querySelector(".explorer .cursor");
+const seen = [0.1, 0.1, 0.9].map((value) => {
+  clock.value = value;
+  clock.dispatchEvent(new Event("input"));
+  return [canvas.toDataURL(), parseFloat(cursor.style.left)];
+});
+const [first, again, last] = seen;
+document.body.dataset.found = [first[0] === again[0], first[0] !== last[0], last[1] > first[1],
+  document.querySelector(".explorer output").textContent].join("; ");
+"""
+FOLDED = """
+const folded = document.querySelector("details:has(figure)");
+const drawn = () => folded.querySelectorAll(".main-svg").length > 0;
+const before = drawn();
+folded.open = true;
 setTimeout(() => {
-  const [first, second] = document.querySelectorAll(".explorer select");
-  const said = [[...second.options].map((option) => option.value).join("|")];
-  first.value = "step-steer";
-  first.dispatchEvent(new Event("change"));
-  said.push([...second.options].map((option) => option.value).join("|"));
-  second.value = second.options[1].value;
-  second.dispatchEvent(new Event("change"));
-  const plot = document.querySelector(".explorer .plot");
-  said.push(plot.data.length, plot.data[0].y[0].toFixed(3));
-  document.body.dataset.menus = said.join("; ");
-}, 3000);
-</script></body>"""
-FRAMES = """<script>
-setTimeout(() => {
-  const plot = [...document.querySelectorAll("figure:not(.explorer) .plot")].at(-1);
-  const front = () => plot._fullData.at(-1).x[0];
-  const before = front();
-  Plotly.animate(plot, ["8.00"], {
-    mode: "immediate", transition: { duration: 0 }, frame: { duration: 0, redraw: false },
-  });
-  setTimeout(() => {
-    document.body.dataset.moved = `${before.toFixed(2)} to ${front().toFixed(2)}`;
-  }, 2000);
-}, 3000);
-</script></body>"""
-CLICKS = """<script>
-const button = document.querySelectorAll("#summary th button")[%d];
+  document.body.dataset.found = `${before}; ${drawn()}`;
+}, 4000);
+"""
+WIDTH = """
+console.log(`width ${document.documentElement.scrollWidth} of ${window.innerWidth}`);
+"""
+CLICKS = """
+const button = document.querySelectorAll("#suite-1 th button")[%d];
 for (let i = 0; i < %d; i++) button.click();
 const head = button.parentElement;
 const rows = [...head.closest("table").tBodies[0].rows].map((row) => row.cells[0].textContent);
-document.body.dataset.order = head.ariaSort + ": " + rows.join(", ");
-</script></body>"""
+document.body.dataset.found = head.ariaSort + ": " + rows.join(", ");
+"""
+
+
+def add_script(page: Path, script: str, first: bool = False) -> None:
+    """Let a script of the test run too, when everything is drawn or before anything is."""
+    if not first:
+        script = (
+            "const wait = setInterval(() => {\n"
+            'if (document.querySelector("[data-name]") && !document.body.dataset.drawn) return;\n'
+            "clearInterval(wait);\n" + script + "}, 50);"
+        )
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    text = page.read_text(encoding="utf-8")
+    text = text.replace("script-src ", f"script-src 'sha256-{digest}' ")
+    text = text.replace("<body>" if first else "</body>",
+                        f"<body><script>{script}</script>" if first
+                        else f"<script>{script}</script></body>")  # fmt: skip
+    page.write_text(text, encoding="utf-8")
+
+
+def found_by(page: Path, script: str, first: bool = False) -> str:
+    """What a script left in the document; the console stays empty."""
+    add_script(page, script, first)
+    dom, messages = browse(page, "--dump-dom")
+    assert messages == []
+    found = re.search(r'data-found="(.*?)"', dom)
+    return unescape(found[1]) if found else ""
 
 
 def browse(page: Path, *options: str) -> tuple[str, list[str]]:
@@ -96,13 +142,14 @@ def written(folder: Path, suites: list[Suite]) -> Path:
 def test_browser_draws_every_figure(tmp_path: Path, width: int, pointer: str, scheme: str) -> None:
     page = written(tmp_path, [estimation(), control()])
     looks = f"--blink-settings={pointer},{scheme}"
+    add_script(page, OPEN, first=True)
     dom, messages = browse(page, "--dump-dom", f"--window-size={width},900", looks)
     assert messages == []
     plots = re.findall(r'<div class="plot.*?</figure>', dom, flags=re.DOTALL)
-    assert len(plots) == len(drawn())
+    assert len(plots) == len(drawn()) + 1
     assert all('class="main-svg"' in plot for plot in plots)
     ink = "rgb(255, 255, 255)" if scheme == DARK else "rgb(0, 0, 0)"
-    assert f"stroke: {ink}; stroke-opacity: 1; stroke-width: 4px" in plots[2]
+    assert f"stroke: {ink}; stroke-opacity: 1; stroke-width: 2.6px" in plots[3]
     assert all(("modebar--hover" in plot) == (pointer == MOUSE) for plot in plots)
     assert not any("Share" in plot for plot in plots), "the page must offer no upload"
     picture = tmp_path / "report.png"
@@ -111,13 +158,43 @@ def test_browser_draws_every_figure(tmp_path: Path, width: int, pointer: str, sc
     assert picture.stat().st_size > 50_000
 
 
-def test_browser_tells_of_errors_and_forbids_loading(tmp_path: Path) -> None:
+@pytest.mark.parametrize("width", [390, 1280])
+def test_nothing_is_wider_than_the_screen(tmp_path: Path, width: int) -> None:
+    """In a frame of that width, since no window of chromium is as narrow as a phone."""
+    page = written(tmp_path, [estimation(), matrix()])
+    add_script(page, WIDTH)
+    frame = tmp_path / "frame.html"
+    style = f"width: {width}px; height: 800px; border: 0"
+    frame.write_text(f'<body style="margin: 0"><iframe style="{style}" src="report.html">')
+    _, messages = browse(frame, "--dump-dom", "--window-size=1300,900")
+    (line,) = messages
+    found = re.search(r"width (\d+) of (\d+)", line)
+    assert found is not None and int(found[1]) <= int(found[2]) == width
+
+
+def test_a_script_that_is_not_ours_does_not_run_and_nothing_is_loaded(tmp_path: Path) -> None:
     page = written(tmp_path, [control()])
     text = page.read_text(encoding="utf-8")
-    image = '<img src="https://example.org/a.png"></body>'
-    page.write_text(text.replace("</body>", image), encoding="utf-8")
-    _, messages = browse(page, "--dump-dom")
-    assert any("Content Security Policy" in message for message in messages)
+    foreign = (
+        '<img src="https://example.org/a.png"><script>document.title = "taken"</script></body>'
+    )
+    page.write_text(text.replace("</body>", foreign), encoding="utf-8")
+    dom, messages = browse(page, "--dump-dom")
+    assert sum("Content Security Policy" in message for message in messages) == 2
+    assert "<title>taken" not in dom
+
+
+def test_a_browser_that_cannot_unpack_gets_a_sentence(tmp_path: Path) -> None:
+    page = written(tmp_path, [estimation()])
+    add_script(page, "delete window.DecompressionStream;", first=True)
+    dom, messages = browse(page, "--dump-dom")
+    assert messages == []
+    assert re.search('<p class="note" id="unable">This browser cannot unpack', dom)
+    assert 'id="unable" hidden' in written(tmp_path, [estimation()]).read_text(encoding="utf-8")
+
+
+def test_what_is_folded_is_drawn_when_it_is_opened(tmp_path: Path) -> None:
+    assert found_by(written(tmp_path, [estimation()]), FOLDED) == "false; true"
 
 
 @pytest.mark.parametrize(
@@ -133,33 +210,22 @@ def test_browser_tells_of_errors_and_forbids_loading(tmp_path: Path) -> None:
 )
 def test_browser_sorts_tables(tmp_path: Path, column: int, clicks: int, order: str) -> None:
     page = written(tmp_path, [estimation(figures=False)])
-    text = page.read_text(encoding="utf-8").replace("</body>", CLICKS % (column, clicks))
-    page.write_text(text, encoding="utf-8")
-    dom, messages = browse(page, "--dump-dom")
-    assert messages == []
-    assert f'data-order="{order}"' in dom
+    assert found_by(page, CLICKS % (column, clicks)) == order
 
 
-def test_browser_shows_any_cell(tmp_path: Path) -> None:
+def test_two_cells_stand_beside_each_other_on_the_same_axes(tmp_path: Path) -> None:
     page = written(tmp_path, [matrix()])
-    text = page.read_text(encoding="utf-8").replace("</body>", MENUS)
-    page.write_text(text, encoding="utf-8")
-    dom, messages = browse(page, "--dump-dom")
-    assert messages == []
-    hostile = HOSTILE.replace("&", "&amp;")
-    said = f'data-menus="none|lqr; none|{hostile}; 2; {4 * np.sin(4.0):.3f}"'
-    assert said in dom.replace("&lt;", "<").replace("&gt;", ">")
+    last = f"{3 * np.sin(3.0):.2f}"
+    assert found_by(page, CHOICES) == (
+        f"gust|step-steer; none|lqr; none; lqr; none|{HOSTILE}; {HOSTILE}; 2; 2; {last}; true"
+    )
 
 
-def test_browser_moves_the_cars_and_offers_the_track(tmp_path: Path) -> None:
+def test_the_cars_move_and_the_track_is_offered(tmp_path: Path) -> None:
     page = written(tmp_path, [matrix()])
-    text = page.read_text(encoding="utf-8").replace("</body>", FRAMES)
-    page.write_text(text, encoding="utf-8")
-    dom, messages = browse(page, "--dump-dom")
-    assert messages == []
-    moved = re.search(r'data-moved="([-.\d]+) to ([-.\d]+)"', dom)
-    assert moved is not None and float(moved[2]) - float(moved[1]) == pytest.approx(80.0, abs=0.1)
-    link = re.search(r'<a download="run.kml" href="data:[^;]+;base64,([^"]+)"', dom)
+    text = page.read_text(encoding="utf-8")
+    assert found_by(page, MOTION) == "true; true; true; 7.20 s"
+    link = re.search(r'<a download="run.kml" href="data:[^;]+;base64,([^"]+)"', text)
     assert link is not None and base64.b64decode(link[1]).decode() == HOSTILE
     picture = tmp_path / "matrix.png"
     _, messages = browse(page, f"--screenshot={picture}", "--window-size=1280,3600")
