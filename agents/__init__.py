@@ -1,6 +1,7 @@
 """Everything that acts, with stable-baselines3's `predict`: controllers and learned policies."""
 
 from collections.abc import Callable
+from importlib import import_module
 from typing import Any, Protocol, overload
 
 from ..estimators.registry import Registry
@@ -14,7 +15,7 @@ from .controllers.nmpc import Nmpc
 from .controllers.sliding_mode import SlidingMode
 from .controllers.two_dof import Feedforward, TwoDof
 from .env_facts import AnyEnv
-from .learned.files import is_policy, shipped
+from .learned.files import ZIP, is_policy, shipped
 from .learned.policy import Learned
 
 AGENTS = Registry(
@@ -73,23 +74,28 @@ class Agent(Protocol):
 
 
 @overload
-def make_agent(name: str, env: AnyEnv, **options: Any) -> Controller: ...
+def make_agent(name: str, env: AnyEnv, *, trust: bool = False, **options: Any) -> Controller: ...
 
 
 @overload
-def make_agent(name: Agent | Callable[..., Agent], env: AnyEnv, **options: Any) -> Agent: ...
+def make_agent(
+    name: Agent | Callable[..., Agent], env: AnyEnv, *, trust: bool = False, **options: Any
+) -> Agent: ...
 
 
 def make_agent(
-    name: str | Agent | Callable[..., Agent], env: AnyEnv, **options: Any
+    name: str | Agent | Callable[..., Agent], env: AnyEnv, *, trust: bool = False, **options: Any
 ) -> Controller | Agent:
     """An agent for an env, single or vector; ours are designed from the env's nominal vehicle.
 
-    name: of `AGENTS`, a shipped policy, the path of one (`.../NAME.safetensors`), an entry point
-    "package.module:Name", or a class in a file, "FILE.py:Name"; or a factory, called with the env
-    and the options; or an `Agent`, which is returned. options: arguments of that controller.
+    name: of `AGENTS`, a shipped policy, the path of one (`.../NAME.safetensors`), a zip of
+    stable-baselines3 trained on this env (`.../NAME.zip`), an entry point "package.module:Name", or
+    a class in a file, "FILE.py:Name"; or a factory, called with the env and the options; or an
+    `Agent`, which is returned. trust: whether a zip may be read, which runs code of its maker's.
+    options: arguments of that controller, or of `agents.training.zips.policy_from_zip`.
     Raises ValueError for an unknown name or an observation without what the controller needs,
-    TypeError for an unknown option, options beside an `Agent`, or what has no `predict`.
+    TypeError for an unknown option, options beside an `Agent`, or what has no `predict`,
+    PermissionError for a zip without trust.
 
     >>> import gymnasium as gym
     >>> env = gym.make("sideslip/YawVision-v0")
@@ -102,6 +108,9 @@ def make_agent(
     """
     agent: Any = name
     if isinstance(name, str):
+        if name.endswith(ZIP):
+            zips = import_module(".training.zips", __name__)  # by name: a room above `learned`
+            return Learned(env, zips.policy_from_zip(name, env, trust=trust, **options))
         if name not in AGENTS and is_policy(name):
             return Learned(env, policy=name, **options)
         agent = AGENTS.load(name, shipped())(env, **options)
@@ -124,6 +133,6 @@ def register_agent(name: str, factory: Callable[..., Agent] | str) -> None:
     Raises TypeError or ValueError for a name or factory that is none, ValueError for a name that is
     taken.
     """
-    if isinstance(name, str) and is_policy(name):
+    if isinstance(name, str) and (is_policy(name) or name.endswith(ZIP)):
         raise ValueError(f"{name!r} is the name of a policy")
     AGENTS.register(name, factory)

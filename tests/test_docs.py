@@ -23,6 +23,7 @@ MOST_FILES = {
     "tyre law": 2,
     "filter": 1,
     "controller": 2,
+    "policy": 0,
     "scenario": 1,
     "metric": 2,
     "Bring your own": 0,

@@ -9,7 +9,7 @@ import gymnasium as gym
 
 from ... import __version__
 from ...estimators.wrappers.estimate import EstimateObservation
-from ..env_facts import facts_of
+from ..env_facts import AnyEnv, facts_of
 
 JsonMap = dict[str, Any]
 
@@ -84,11 +84,22 @@ class Card:
         env: gym.Env[Any, Any] = gym.make(env_id, **options["env_options"])
         if estimator:
             env = EstimateObservation(env, estimator, **options["estimator_options"])
-        seen = facts_of(env)
+        card = cls.seen(env, **options, **rest)
         env.close()
-        entries = tuple((entry.name, entry.unit) for entry in seen.layout)
-        options |= {"control_period": int(seen.control_period), "reference": seen.reference}
-        return cls(observation=entries, **options, **rest)
+        return card
+
+    @classmethod
+    def seen(cls, env: AnyEnv, **rest: Any) -> "Card":
+        """A card with the observation, control period and reference of an env, single or vector;
+        rest: the other fields."""
+        facts = facts_of(env)
+        entries = tuple((entry.name, entry.unit) for entry in facts.layout)
+        return cls(
+            observation=entries,
+            control_period=int(facts.control_period),
+            reference=facts.reference,
+            **rest,
+        )
 
     @classmethod
     def from_mapping(cls, content: Any) -> "Card":

@@ -25,6 +25,7 @@ network may have memory and more activations."""
 MOST_BYTES = 2**26
 """A larger file is not opened; tensors lie in it as they are, so that it bounds their sizes too."""
 ENDING = ".safetensors"
+ZIP = ".zip"  # of stable-baselines3, which `agents.training.zips` reads
 FOLDER = Path(__file__).resolve().with_name("policies")
 _DENSE = ("hidden", "activation", "output", "clip", "action_width")
 _MEMORY: dict[str, Any] = {"history": 1, "cells": []}  # as in a file of format 1, which has none

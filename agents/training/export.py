@@ -1,20 +1,24 @@
 """The deterministic actor of a stable-baselines3 model as a `Network`, which needs no torch."""
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..learned.memory import Cell
 from ..learned.network import Network
 
 _PRIOR = 1e-4  # samples that a VecNormalize starts with, of mean 0 and variance 1
 
 
-def network_from_sb3(model: Any, normaliser: Any = None) -> Network:
+def network_from_sb3(model: Any, normaliser: Any = None, history: int = 1) -> Network:
     """What `model.predict(..., deterministic=True)` computes of a `normaliser`'s observations.
 
-    model: PPO, A2C, SAC or TD3 with dense layers and an action within [-1, 1], with `Standardised`
-    before them or nothing. normaliser: the VecNormalize of the training, or None. An entry that
-    never varied in training taught the network nothing and is not read: scale 0.
+    model: one of stable-baselines3 or sb3-contrib, or its policy, of a class in `ACTORS`; an action
+    within [-1, 1]; `Standardised` before the layers or nothing. normaliser: the VecNormalize of the
+    training, or None. history: frames that a VecFrameStack stacked, inside or outside of the
+    normaliser. An entry that never varied in training taught the network nothing and is not read:
+    scale 0.
 
     Raises ValueError for a model that is none of these, or an observation of another width,
     ModuleNotFoundError without torch.
@@ -27,55 +31,115 @@ def network_from_sb3(model: Any, normaliser: Any = None) -> Network:
         raise ModuleNotFoundError(
             "networks come from stable-baselines3: pip install 'sideslip[train]'", name=error.name
         ) from error
-    space = model.action_space
+    policy = getattr(model, "policy", model)
+    actor = known_policy(type(policy))(policy)
+    space = policy.action_space
     bounds = getattr(space, "low", 0.0), getattr(space, "high", 0.0)
     if not (np.all(bounds[0] == -1.0) and np.all(bounds[1] == 1.0)):
         raise ValueError(f"an action lies within [-1, 1], got {space}")
-    layers, squashed, extractor = _actor(model.policy)
-    if type(extractor) not in (FlattenExtractor, Standardised):
-        raise ValueError(f"the observation goes through {type(extractor).__name__}, not as it is")
-    weights, biases, activations, output = _dense(layers)
+    if type(actor.extractor) not in (FlattenExtractor, Standardised):
+        name = type(actor.extractor).__name__
+        raise ValueError(f"the observation goes through {name}, not as it is")
+    weights, biases, activations, output = _dense(actor.layers)
     if len(set(activations)) > 1:
         raise ValueError(f"one activation in all layers, got {', '.join(activations)}")
-    wide = weights[0].shape[1]
-    mean, scale, clip = _normalisation(normaliser, wide)
-    if isinstance(extractor, Standardised):
+    cells = _cells(actor.recurrent)
+    wide = (cells[0].weight_in if cells else weights[0]).shape[1]
+    mean, scale, clip = _normalisation(normaliser, wide, history)
+    if isinstance(actor.extractor, Standardised):
         if clip is not None:
             raise ValueError("the observation is normalised twice: outside and by the network")
-        mean, scale, clip = extractor.numbers
+        mean, scale, clip = actor.extractor.numbers
     return Network(
         mean,
         scale,
         weights,
         biases,
         activations[0] if activations else "tanh",
-        "tanh" if squashed else output,
+        "tanh" if actor.squashed else output,
         clip,
+        history,
+        cells,
     )
 
 
-def _actor(policy: Any) -> tuple[list[Any], bool, Any]:
-    """(layers, whether the last one is squashed by tanh, features extractor)."""
-    if hasattr(policy, "mlp_extractor") and hasattr(policy, "action_net"):  # PPO, A2C
-        if policy.squash_output:
-            raise ValueError("a squashed policy of PPO or A2C is not known here")
-        extractor = getattr(policy, "pi_features_extractor", policy.features_extractor)
-        return [*policy.mlp_extractor.policy_net, policy.action_net], False, extractor
-    actor = getattr(policy, "actor", None)
-    if actor is not None and hasattr(actor, "latent_pi"):  # SAC
-        if actor.use_sde and actor.clip_mean > 0.0:
-            raise ValueError("SAC with state-dependent exploration clips its mean: not known here")
-        return [*actor.latent_pi, actor.mu], True, actor.features_extractor
-    if actor is not None and hasattr(actor, "mu"):  # TD3, whose layers end in tanh
-        return list(actor.mu), False, actor.features_extractor
-    raise ValueError(f"{type(policy).__name__} has no actor of dense layers")
+class _Actor(NamedTuple):
+    """What acts in a policy: layers, whether tanh follows, features extractor, recurrent layers."""
+
+    layers: list[Any]
+    squashed: bool
+    extractor: Any
+    recurrent: Any = None
+
+
+def _on_policy(policy: Any) -> _Actor:
+    layers = [*policy.mlp_extractor.policy_net, policy.action_net]
+    return _Actor(layers, bool(policy.squash_output), policy.pi_features_extractor)
+
+
+def _recurrent(policy: Any) -> _Actor:
+    return _on_policy(policy)._replace(recurrent=policy.lstm_actor)
+
+
+def _gaussian(policy: Any) -> _Actor:
+    actor = policy.actor
+    if actor.use_sde and actor.clip_mean > 0.0:
+        raise ValueError("state-dependent exploration (gSDE) clips the mean: not known here")
+    return _Actor([*actor.latent_pi, actor.mu], True, actor.features_extractor)
+
+
+def _certain(policy: Any) -> _Actor:
+    return _Actor(list(policy.actor.mu), False, policy.actor.features_extractor)  # tanh is a layer
+
+
+ACTORS: dict[str, Callable[[Any], _Actor]] = {
+    "stable_baselines3.common.policies.ActorCriticPolicy": _on_policy,
+    "stable_baselines3.sac.policies.SACPolicy": _gaussian,
+    "stable_baselines3.td3.policies.TD3Policy": _certain,
+    "sb3_contrib.tqc.policies.TQCPolicy": _gaussian,
+    "sb3_contrib.common.recurrent.policies.RecurrentActorCriticPolicy": _recurrent,
+}
+"""The policies whose actor is known: "MlpPolicy" and "MlpLstmPolicy" of PPO, A2C, SAC, TD3, DDPG,
+TQC and RecurrentPPO. A subclass may compute anything and is none of them."""
+
+
+def known_policy(kind: type) -> Callable[[Any], _Actor]:
+    """How the actor of this class of policy is found; ValueError for a class not in `ACTORS`."""
+    name = f"{kind.__module__}.{kind.__qualname__}"
+    if name not in ACTORS:
+        known = ", ".join(each.rpartition(".")[2] for each in ACTORS)
+        raise ValueError(f"the actor of {name} is not known; known: {known}")
+    return ACTORS[name]
+
+
+def _cells(module: Any) -> list[Cell]:
+    """The cells of torch's LSTM, None for a policy without one."""
+    if module is None:
+        return []
+    if module.bidirectional or module.proj_size or module.batch_first or not module.bias:
+        raise ValueError(f"an LSTM with further arguments is not known: {module}")
+    names = ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
+    return [
+        Cell("lstm", *(_array(getattr(module, f"{name}_l{i}")) for name in names))
+        for i in range(module.num_layers)
+    ]
+
+
+def _array(parameter: Any) -> Any:
+    return parameter.detach().cpu().numpy().copy()
 
 
 def _dense(layers: list[Any]) -> tuple[list[Any], list[Any], list[str], str]:
     """(weights, biases, activations between, output) of a stack of linear layers."""
     from torch import nn
 
-    names: dict[Any, str] = {nn.Tanh: "tanh", nn.ReLU: "relu"}
+    names: dict[Any, str] = {
+        nn.Tanh: "tanh",
+        nn.ReLU: "relu",
+        nn.ELU: "elu",
+        nn.LeakyReLU: "leaky-relu",
+        nn.SiLU: "silu",
+    }
     weights: list[Any] = []
     biases: list[Any] = []
     bends: list[str] = []
@@ -83,25 +147,32 @@ def _dense(layers: list[Any]) -> tuple[list[Any], list[Any], list[str], str]:
         if isinstance(layer, nn.Linear):
             if len(bends) != len(weights):
                 raise ValueError("two linear layers without an activation between")
-            weights.append(layer.weight.detach().cpu().numpy().copy())
-            biases.append(layer.bias.detach().cpu().numpy().copy())
-        elif type(layer) in names:
+            weights.append(_array(layer.weight))
+            biases.append(_array(layer.bias))
+        elif type(layer) in names and _plain(layer):
             bends.append(names[type(layer)])
         else:
             raise ValueError(
-                f"layer {type(layer).__name__} is not known; known: linear, tanh, relu"
+                f"layer {layer} is not known; known: linear, {', '.join(names.values())}"
             )
     if len(bends) == len(weights):  # the last one is the output's
         return weights, biases, bends[:-1], bends[-1]
     return weights, biases, bends, "linear"
 
 
-def _normalisation(normaliser: Any, wide: int) -> tuple[Any, Any, float | None]:
-    """(mean, scale, clip) of a VecNormalize."""
+def _plain(activation: Any) -> bool:
+    """Whether an activation has torch's default arguments."""
+    return getattr(activation, "alpha", 1.0) == 1.0 and (
+        getattr(activation, "negative_slope", 0.01) == 0.01
+    )
+
+
+def _normalisation(normaliser: Any, wide: int, history: int) -> tuple[Any, Any, float | None]:
+    """(mean, scale, clip) of a VecNormalize, around the stack of frames or inside of it."""
     if normaliser is None or not normaliser.norm_obs:
         return np.zeros(wide), np.ones(wide), None
     stats = normaliser.obs_rms
-    if getattr(stats, "mean", np.zeros(0)).shape != (wide,):
+    if getattr(stats, "mean", np.zeros(0)).shape not in ((wide,), (wide // history,)):
         raise ValueError(f"the normaliser is of another observation than the network's {wide}")
     prior = _PRIOR * (1.0 + stats.mean**2) / stats.count  # what it leaves of a constant's variance
     scale = 1.0 / np.sqrt(stats.var + normaliser.epsilon)

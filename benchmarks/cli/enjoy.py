@@ -12,6 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from ..harness.results import check_writable
+from .export import Trust, as_policy, sizes_of
 from .output import show_episode, write_output
 
 if TYPE_CHECKING:
@@ -19,7 +20,9 @@ if TYPE_CHECKING:
 
 
 def enjoy_command(
-    policy: Annotated[str, typer.Argument(help="A shipped policy's name or a file's path.")],
+    policy: Annotated[
+        str, typer.Argument(help="A shipped policy's name, or a file's or zip's path.")
+    ],
     env: Annotated[str | None, typer.Option(help="Another id than the policy's own.")] = None,
     episodes: Annotated[int, typer.Option(min=1, help="How many.")] = 256,
     scenario: Annotated[str | None, typer.Option(help="A scenario's name.")] = None,
@@ -35,44 +38,48 @@ def enjoy_command(
         Path | None, typer.Option(help="Write it as a film, .mp4 or .gif, no control beside it.")
     ] = None,
     card: Annotated[bool, typer.Option("--card", help="Show the policy's card, no more.")] = False,
+    trust: Trust = False,
 ) -> None:
-    """Drive a learned policy: its cost against no control and the best classical line."""
+    """Drive a learned policy: its cost against no control and the best classical line.
+
+    A zip drives the id that it was trained on (--env); `sideslip export` takes further options.
+    """
     from ...agents.learned.files import load_policy
     from ..control.figures import contestant_of, run_of
     from ..policies import enjoy, suite_of
     from ..report.film import Driver, check_film, film
 
     console = Console()
-    if card:
-        _show_card(console, load_policy(policy))
-        return
     check_writable(html, json, parquet, plot)
     check_film(video)
-    found = enjoy(policy, episodes, env_id=env, scenario=scenario, seed=seed)
-    write_output(console, [suite_of(found)], html, json, parquet)
-    first = found.cells[found.policy.name]
-    show_episode(console, run_of(first, found.seeds[0]), found.policy.name, plot)
-    if video is not None:
-        cars = (found.policy.name, first), ("no control", found.cells["none"])
-        film(
-            video,
-            [Driver(name, *contestant_of(cell)) for name, cell in cars],
-            found.seeds[0],
-            console,
-        )
-        console.print(f"film: {video}", highlight=False, soft_wrap=True)
+    with as_policy(policy, env, trust) as path:
+        if card:
+            _show_card(console, load_policy(path))
+            return
+        found = enjoy(path, episodes, env_id=env, scenario=scenario, seed=seed)
+        write_output(console, [suite_of(found)], html, json, parquet)
+        first = found.cells[found.policy.name]
+        show_episode(console, run_of(first, found.seeds[0]), found.policy.name, plot)
+        if video is not None:
+            cars = (found.policy.name, first), ("no control", found.cells["none"])
+            film(
+                video,
+                [Driver(name, *contestant_of(cell)) for name, cell in cars],
+                found.seeds[0],
+                console,
+            )
+            console.print(f"film: {video}", highlight=False, soft_wrap=True)
 
 
 def _show_card(console: Console, policy: "Policy") -> None:
     """A line a field of the card, and the size of the network."""
     network = policy.network
-    sizes = " x ".join(map(str, (network.inputs, *network.hidden, network.width)))
     unread = [name for (name, _), read in zip(policy.card.observation, policy.reads, strict=True)
               if not read]  # fmt: skip
     fields = asdict(policy.card) | {
         "observation": ", ".join(f"{name} / {unit}" for name, unit in policy.card.observation),
         "not read": ", ".join(unread) or "none",
-        "network": f"{sizes}, {network.activation}, {network.output} output",
+        "network": f"{sizes_of(network)}, {network.activation}, {network.output} output",
         "observation clipped at": network.clip,
     }
     table = Table("field", "value", box=box.SIMPLE_HEAD, title=policy.name, title_justify="left")

@@ -1,4 +1,4 @@
-"""The command line: list, run, bench, replay, train, enjoy, tune, calibrate."""
+"""The command line: list, run, bench, replay, train, export, enjoy, tune, calibrate."""
 
 import sys
 from pathlib import Path
@@ -15,6 +15,7 @@ from ..suites import SUITES, Request, run_suite
 from .calibrate import calibrate_command
 from .challenge import Agents, EnvId, Estimators, Fresh, Limit, Scenarios, Trust, challenge_of
 from .enjoy import enjoy_command
+from .export import Trust, export_command
 from .output import show_episode, write_output
 from .train import train_command
 from .tune import tune_app
@@ -23,6 +24,7 @@ app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_
 app.add_typer(tune_app, name="tune")
 app.command("calibrate")(calibrate_command)
 app.command("enjoy")(enjoy_command)
+app.command("export")(export_command)
 app.command("train")(train_command)
 console = Console()
 
@@ -100,6 +102,7 @@ def run(
     kml: Annotated[Path | None, typer.Option(help="Write the track for a map.")] = None,
     video: Annotated[Path | None, typer.Option(help="Write a film, .mp4 or .gif.")] = None,
     beside: Annotated[str | None, typer.Option(help="Another agent, a ghost in the film.")] = None,
+    trust: Trust = False,
 ) -> None:
     """Drive one episode, print its score, draw it."""
     import gymnasium as gym
@@ -115,7 +118,7 @@ def run(
     env: gym.Env[Any, Any] = gym.make(env_id, control_period=control_period, **options)
     if estimator is not None:
         env = EstimateObservation(env, estimator)
-    driver = Driver(agent, env, make_agent(agent, env))
+    driver = Driver(agent, env, make_agent(agent, env, trust=trust))
     show_episode(console, rollout(env, driver.agent, seed), agent, plot, parquet, kml)
     film_drive(video, driver, beside, seed, console)
 

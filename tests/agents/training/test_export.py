@@ -110,8 +110,12 @@ def test_what_is_no_dense_actor_is_refused(monkeypatch: pytest.MonkeyPatch) -> N
     env = normalised()
     ppo = stable_baselines3.PPO
     cases: list[tuple[Any, Any, str]] = [
-        (ppo("MlpPolicy", env, policy_kwargs={"activation_fn": torch.nn.ELU}), env, "layer ELU"),
-        (stable_baselines3.DQN("MlpPolicy", "CartPole-v1", buffer_size=10), None, r"\[-1, 1\]"),
+        (ppo("MlpPolicy", env, policy_kwargs={"activation_fn": torch.nn.GELU}), env, "layer GELU"),
+        (
+            stable_baselines3.DQN("MlpPolicy", "CartPole-v1", buffer_size=10),
+            None,
+            "DQNPolicy is not known",
+        ),
     ]
     for model, normaliser, said in cases:
         with pytest.raises(ValueError, match=said):
@@ -120,7 +124,7 @@ def test_what_is_no_dense_actor_is_refused(monkeypatch: pytest.MonkeyPatch) -> N
     with pytest.raises(ValueError, match="of another observation"):
         network_from_sb3(ppo("MlpPolicy", env), other)
     wide = ppo("MlpPolicy", env)
-    wide.action_space = spaces.Box(-2.0, 2.0, (1,), np.float32)
+    wide.policy.action_space = spaces.Box(-2.0, 2.0, (1,), np.float32)
     with pytest.raises(ValueError, match=r"within \[-1, 1\]"):
         network_from_sb3(wide, env)
     monkeypatch.setitem(sys.modules, "stable_baselines3.common.torch_layers", None)

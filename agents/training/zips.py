@@ -1,0 +1,220 @@
+"""Zips of stable-baselines3 and sb3-contrib as policies of ours; reading one runs code.
+
+A zip holds pickles, and what unpickles them does whatever their maker wrote. So nothing is read
+without `trust`, and `export_zip` writes a file that anybody can read without it.
+"""
+
+import json
+import pickle
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile, ZipFile
+
+import gymnasium as gym
+import numpy as np
+
+from ...envs.task.observation import Entry
+from ...estimators.wrappers.estimate import EstimateObservation
+from ..env_facts import AnyEnv, facts_of
+from ..learned.card import Card
+from ..learned.files import ENDING, Policy, save_policy
+from .export import known_policy, network_from_sb3
+
+_NEEDED = ("policy_class", "policy_kwargs", "observation_space", "action_space")
+_MEMBERS = {"data", "policy.pth"}
+_NORMALISER = "vecnormalize.pkl"
+
+
+def policy_from_zip(
+    path: str | Path,
+    env: AnyEnv,
+    *,
+    trust: bool = False,
+    normalise: str | Path | None = None,
+    **about: Any,
+) -> Policy:
+    """The deterministic actor of a stable-baselines3 zip, for the env that it was trained on.
+
+    env: single or vector; its observation names what the zip merely numbers. trust: whether code in
+    the zip may run. normalise: a pickle of the training's VecNormalize; default: NAME.pkl or
+    vecnormalize.pkl beside the zip, if there is one. about: fields of the policy's `Card`.
+
+    A policy trained on a VecFrameStack around the env has that many frames of history.
+
+    Raises FileNotFoundError where there is no file, PermissionError without trust, ValueError for a
+    file that is no such zip, a policy trained on another observation, or one that
+    `network_from_sb3` refuses, ModuleNotFoundError without stable-baselines3.
+    """
+    file = Path(path)
+    check_zip(file, trust)
+    content, weights = _read(file)
+    policy = _built(file, content, weights)
+    frames = _frames(file, policy.observation_space, facts_of(env).layout)
+    found = normaliser_of(file, normalise)
+    normaliser = None if found is None else _unpickled(found)
+    network = network_from_sb3(policy, normaliser, frames)
+    described = {
+        "algorithm": f"stable-baselines3's {type(policy).__name__}",
+        "steps": int(content.get("num_timesteps", 0)),
+    }
+    return Policy(file.stem, network, Card.seen(env, **{"env_id": "", **described, **about}))
+
+
+def export_zip(
+    path: str | Path,
+    target: str | Path,
+    env_id: str,
+    env_options: Mapping[str, Any] | None = None,
+    estimator: str = "",
+    *,
+    trust: bool = False,
+    normalise: str | Path | None = None,
+    command: str = "",
+) -> Policy:
+    """Write a zip's actor as a policy's file, which runs no code where it is read.
+
+    env_id, env_options, estimator: what it was trained on. command: for the card. Raises what
+    `policy_from_zip` and `save_policy` raise.
+    """
+    check_zip(Path(path), trust)
+    if Path(target).suffix != ENDING:
+        raise ValueError(f"a policy's file is NAME{ENDING}, got {target}")
+    options = dict(env_options or {})
+    env: gym.Env[Any, Any] = gym.make(env_id, **options)
+    if estimator:
+        env = EstimateObservation(env, estimator)
+    about = {"env_id": env_id, "env_options": options, "estimator": estimator, "command": command}
+    policy = policy_from_zip(path, env, trust=trust, normalise=normalise, **about)
+    env.close()
+    save_policy(target, policy.network, policy.card)
+    return replace(policy, name=Path(target).stem)
+
+
+def normaliser_of(path: Path, normalise: str | Path | None = None) -> Path | None:
+    """The pickle of a zip's VecNormalize: the argument, else one beside the zip, else None."""
+    if normalise is not None:
+        return Path(normalise)
+    beside = (path.with_suffix(".pkl"), path.with_name(_NORMALISER))
+    return next((file for file in beside if file.is_file()), None)
+
+
+def check_zip(file: Path, trust: bool) -> None:
+    """What can be known of a file before anything in it is unpickled.
+
+    Raises FileNotFoundError, ValueError for what is no zip of stable-baselines3, PermissionError
+    without trust.
+    """
+    if not file.is_file():
+        raise FileNotFoundError(f"{file}: {'a folder' if file.is_dir() else 'no such file'}")
+    try:
+        with ZipFile(file) as archive:
+            missing = _MEMBERS - set(archive.namelist())
+    except BadZipFile as error:
+        raise ValueError(f"{file} is no zip, or is cut short: {error}") from None
+    if missing:
+        names = " and ".join(sorted(missing))
+        raise ValueError(
+            f"{file} is no zip of stable-baselines3, or is cut short: it holds no {names}"
+        )
+    if not trust:
+        raise PermissionError(
+            f"{file} holds pickles: reading them runs whatever code its maker put there. If you "
+            f"trust it, say --trust (trust=True); `sideslip export {file} --trust` makes a file "
+            "of it that cannot run code"
+        )
+
+
+def _read(file: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """(what the zip holds about the model, the policy's weights); nothing else is unpickled."""
+    from .normalise import Standardised  # noqa: F401  first: it says which extra is missing
+
+    from stable_baselines3.common.save_util import load_from_zip_file  # isort: skip
+
+    try:
+        with ZipFile(file) as archive:
+            names = json.loads(archive.read("data"))
+        skipped = {name: None for name, value in names.items()
+                   if name not in _NEEDED and isinstance(value, dict)}  # fmt: skip
+        with warnings.catch_warnings():
+            warnings.filterwarnings("error", message="Could not deserialize")
+            content, weights, _ = load_from_zip_file(file, device="cpu", custom_objects=skipped)
+    except Exception as error:  # a pickle raises what its maker wrote
+        text = " ".join(str(error).split()) or type(error).__name__
+        raise ValueError(f"{file} cannot be read: {text}") from error
+    lacking = [name for name in _NEEDED if name not in (content or {})]
+    if lacking:
+        raise ValueError(f"{file} is no zip of stable-baselines3: no {', '.join(lacking)} in it")
+    return content or {}, (weights or {})["policy"]
+
+
+def _built(file: Path, content: dict[str, Any], weights: dict[str, Any]) -> Any:
+    """The policy with its weights, without the algorithm and its environments."""
+    from stable_baselines3.common.policies import ActorCriticPolicy
+
+    kind = content["policy_class"]
+    options = {**content["policy_kwargs"]}
+    options.pop("device", None)
+    if not isinstance(kind, type):
+        raise ValueError(f"{file}: its policy is of no class, but {kind!r}")
+    known_policy(kind)
+    if issubclass(kind, ActorCriticPolicy):
+        options.setdefault("use_sde", bool(content.get("use_sde", False)))
+    spaces = content["observation_space"], content["action_space"]
+    try:
+        policy = kind(*spaces, lambda _: 0.0, **options)
+        policy.load_state_dict(weights)
+    except Exception as error:
+        raise ValueError(
+            f"{file}: its weights are not those of its {kind.__name__}: {error}"
+        ) from error
+    return policy
+
+
+def _unpickled(file: Path) -> Any:
+    """A VecNormalize."""
+    from stable_baselines3.common.vec_env import VecNormalize
+
+    if not file.is_file():
+        raise FileNotFoundError(f"{file}: no such file")
+    try:
+        found = pickle.loads(file.read_bytes())
+    except Exception as error:  # a pickle raises what its maker wrote
+        raise ValueError(f"{file} cannot be read as a VecNormalize: {error}") from error
+    if not isinstance(found, VecNormalize):
+        raise ValueError(f"{file} holds a {type(found).__name__}, not a VecNormalize")
+    return found
+
+
+def _frames(file: Path, space: Any, layout: Sequence[Entry]) -> int:
+    """How many frames of the layout the policy takes; ValueError where it takes something else."""
+    if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
+        raise ValueError(f"{file} was trained on {space}, not on an observation of one dimension")
+    frames, rest = divmod(space.shape[0], len(layout))
+    if frames > 0 and rest == 0 and space == _box(layout, frames):
+        return frames
+    here = ", ".join(entry.name for entry in layout)
+    raise ValueError(
+        f"{file} was trained on {space.shape[0]} numbers{_known(space)}; the observation here has "
+        f"{len(layout)}: {here}"
+    )
+
+
+def _box(layout: Sequence[Entry], frames: int = 1) -> gym.spaces.Box:
+    """The space of a VecFrameStack, which repeats each bound in place."""
+    low, high = np.array([(entry.low, entry.high) for entry in layout], np.float32).T
+    return gym.spaces.Box(np.repeat(low, frames), np.repeat(high, frames), dtype=np.float32)
+
+
+def _known(space: Any) -> str:
+    """The id of ours that has this observation, with the names, as far as there is one."""
+    for env_id in [name for name in gym.registry if name.startswith("sideslip/")]:
+        try:
+            layout = facts_of(gym.make(env_id)).layout
+        except ModuleNotFoundError:  # of an extra
+            continue
+        if space == _box(layout):
+            return f", those of {env_id}: {', '.join(entry.name for entry in layout)}"
+    return " that no environment here has by itself (with an estimator, say which)"

@@ -1,0 +1,310 @@
+"""Zips of stable-baselines3: driven as its own `predict` drives them, or refused by name."""
+
+import functools
+import json
+import pickle
+import zipfile
+from copy import deepcopy
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import sideslip
+from sideslip.agents.learned.files import load_policy
+from sideslip.agents.training.zips import export_zip
+
+sb3 = pytest.importorskip("stable_baselines3")
+contrib = pytest.importorskip("sb3_contrib")
+import torch  # noqa: E402
+from stable_baselines3.common import envs  # noqa: E402
+from stable_baselines3.common.policies import ActorCriticPolicy  # noqa: E402
+from stable_baselines3.common.torch_layers import FlattenExtractor  # noqa: E402
+from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize  # noqa: E402
+
+from sideslip.agents.vec_env.env import make_vec_env  # noqa: E402
+
+torch.set_num_threads(1)
+ID, GUST = "sideslip/YawVision-v0", {"base": "gust", "duration": 0.3}
+SMALL: dict[str, Any] = {"net_arch": [8]}
+OFF: dict[str, Any] = {"buffer_size": 10}
+LSTM = SMALL | {"lstm_hidden_size": 6}
+MODELS: dict[str, tuple[Any, str, dict[str, Any]]] = {
+    "PPO": (sb3.PPO, "MlpPolicy", {}),
+    "PPO, gSDE": (sb3.PPO, "MlpPolicy", {"use_sde": True}),
+    "PPO, squashed gSDE": (
+        sb3.PPO,
+        "MlpPolicy",
+        {"use_sde": True, "policy_kwargs": SMALL | {"squash_output": True}},
+    ),
+    "PPO, two extractors": (
+        sb3.PPO,
+        "MlpPolicy",
+        {
+            "policy_kwargs": {
+                "net_arch": {"pi": [8, 4], "vf": [3]},
+                "share_features_extractor": False,
+            }
+        },
+    ),
+    "A2C": (sb3.A2C, "MlpPolicy", {}),
+    "SAC": (sb3.SAC, "MlpPolicy", OFF),
+    "TD3": (sb3.TD3, "MlpPolicy", OFF),
+    "TQC": (contrib.TQC, "MlpPolicy", OFF),
+    "RecurrentPPO": (contrib.RecurrentPPO, "MlpLstmPolicy", {"policy_kwargs": LSTM}),
+    "RecurrentPPO, two layers": (
+        contrib.RecurrentPPO,
+        "MlpLstmPolicy",
+        {"policy_kwargs": LSTM | {"n_lstm_layers": 2}},
+    ),
+} | {
+    f"PPO, {each.__name__}": (
+        sb3.PPO,
+        "MlpPolicy",
+        {"policy_kwargs": SMALL | {"activation_fn": each}},
+    )
+    for each in (torch.nn.ReLU, torch.nn.ELU, torch.nn.LeakyReLU, torch.nn.SiLU)
+}
+
+
+def bridged(rows: int = 3, env_id: str = ID) -> Any:
+    return make_vec_env(env_id, rows, seed=0, env_kwargs={"scenario": GUST})
+
+
+def normalised(env: Any) -> VecNormalize:
+    """With the statistics of a hundred steps."""
+    normaliser = VecNormalize(env)
+    normaliser.reset()
+    rng = np.random.default_rng(0)
+    for _ in range(100):
+        normaliser.step(rng.uniform(-1.0, 1.0, (env.num_envs, *env.action_space.shape)))
+    normaliser.training = False
+    return normaliser
+
+
+def made(kind: Any, policy: Any, env: Any, **options: Any) -> Any:
+    """Weights as large as training makes them: a fresh actor hardly acts at all."""
+    options = deepcopy({"policy_kwargs": SMALL} | options)  # stable-baselines3 writes into them
+    model = kind(policy, env, device="cpu", seed=0, **options)
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for weight in model.policy.parameters():
+            weight.add_(0.2 * torch.randn(weight.shape, generator=generator))
+    return model
+
+
+def difference(model: Any, zipped: Path, seen: Any, raw: Any) -> float:
+    """The largest between the model's actions and the zip's over 80 steps, 2 episodes a row.
+
+    seen: what the model was trained on. raw: the env's own observations after each step.
+    """
+    agent = sideslip.make_agent(str(zipped), bridged(), trust=True)
+    obs, start = seen.reset(), np.ones(3, np.bool_)
+    theirs_state: Any = None
+    state: Any = None
+    worst, acted = 0.0, []
+    for _ in range(80):
+        theirs, theirs_state = model.predict(obs, theirs_state, start, deterministic=True)
+        ours, state = agent.predict(raw(), state, start)
+        worst = max(worst, float(np.abs(theirs - ours).max()))
+        acted.append(theirs)
+        obs, _, start, _ = seen.step(theirs)
+    assert np.ptp(acted) > 0.1 and np.mean(np.abs(acted) < 1.0) > 0.5
+    return worst
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_a_zip_drives_as_its_model_predicts(name: str, tmp_path: Path) -> None:
+    kind, policy, options = MODELS[name]
+    env = normalised(bridged())
+    model = made(kind, policy, env, **options)
+    model.save(tmp_path / "mine.zip")
+    env.save(str(tmp_path / "mine.pkl"))
+    assert difference(model, tmp_path / "mine.zip", env, env.get_original_obs) < 1e-6
+
+
+@pytest.mark.parametrize("inside", [True, False], ids=["frames scaled", "stack scaled"])
+def test_a_stack_of_frames_is_recognised(tmp_path: Path, inside: bool) -> None:
+    if inside:
+        normaliser = normalised(bridged())
+        env: Any = VecFrameStack(normaliser, 3)
+    else:
+        env = normaliser = normalised(VecFrameStack(bridged(), 3))
+    model = made(sb3.PPO, "MlpPolicy", env)
+    model.save(tmp_path / "mine.zip")
+    normaliser.save(str(tmp_path / "vecnormalize.pkl"))
+
+    def newest() -> Any:
+        return normaliser.get_original_obs()[:, -22:]
+
+    assert difference(model, tmp_path / "mine.zip", env, newest) < 1e-6
+
+
+@pytest.fixture(scope="module")
+def zipped(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("zips") / "mine.zip"
+    made(contrib.RecurrentPPO, "MlpLstmPolicy", bridged(), policy_kwargs=LSTM).save(path)
+    return path
+
+
+def test_an_export_is_the_zip_and_needs_no_trust(zipped: Path, tmp_path: Path) -> None:
+    target = tmp_path / "mine.safetensors"
+    export_zip(zipped, target, ID, {"scenario": "gust"}, trust=True, command="sideslip export")
+    card = load_policy(target).card
+    assert card.env_id == ID and card.env_options == {"scenario": "gust"}
+    assert "RecurrentActorCriticPolicy" in card.algorithm and card.command == "sideslip export"
+    env = gym.make(ID)
+    drives = [
+        sideslip.rollout(env, sideslip.make_agent(str(path), env, trust=trusted))
+        for path, trusted in ((zipped, True), (target, False))
+    ]
+    assert np.array_equal(drives[0]["action"], drives[1]["action"])
+    assert np.ptp(drives[0]["action"]) > 0.0
+
+
+class Fires:
+    """Unpickled, it writes a file."""
+
+    def __init__(self, trace: Path) -> None:
+        self.trace = trace
+
+    def __reduce__(self) -> Any:
+        return Path.write_text, (self.trace, "ran")
+
+
+def test_nothing_is_read_without_trust(zipped: Path, tmp_path: Path) -> None:
+    import base64
+
+    trace, path = tmp_path / "trace", tmp_path / "mine.zip"
+    fires = base64.b64encode(pickle.dumps(Fires(trace))).decode()
+    with zipfile.ZipFile(zipped) as source, zipfile.ZipFile(path, "w") as target:
+        for name in source.namelist():
+            target.writestr(name, source.read(name))
+        data = json.loads(source.read("data"))
+    data["policy_class"] = {":type:": "type", ":serialized:": fires}
+    with zipfile.ZipFile(path, "a") as target, pytest.warns(UserWarning, match="Duplicate"):
+        target.writestr("data", json.dumps(data))
+    env = gym.make(ID)
+    said = r"runs whatever code .*--trust \(trust=True\); `sideslip export .*mine.zip --trust`"
+    with pytest.raises(PermissionError, match=said):
+        sideslip.make_agent(str(path), env)
+    assert not trace.exists()
+    with pytest.raises(ValueError, match=r"mine\.zip: its policy is of no class, but 3"):
+        sideslip.make_agent(str(path), env, trust=True)
+    assert trace.exists()
+
+
+def test_a_file_that_is_no_policy_is_refused_before_trust(zipped: Path, tmp_path: Path) -> None:
+    env, path = gym.make(ID), tmp_path / "other.zip"
+    with pytest.raises(FileNotFoundError, match="no such file"):
+        sideslip.make_agent(str(path), env)
+    for length in (0, 100, zipped.stat().st_size - 30):
+        path.write_bytes(zipped.read_bytes()[:length])
+        with pytest.raises(ValueError, match=r"other\.zip is no zip.*, or is cut short"):
+            sideslip.make_agent(str(path), env)
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("data", "{}")
+    with pytest.raises(ValueError, match=r"no zip of stable-baselines3.* holds no policy\.pth"):
+        sideslip.make_agent(str(path), env)
+    with zipfile.ZipFile(path, "a") as archive:
+        archive.writestr("policy.pth", "weights")
+    with pytest.raises(ValueError, match=r"other\.zip cannot be read"):
+        sideslip.make_agent(str(path), env, trust=True)
+
+
+class Mine(ActorCriticPolicy):
+    """Computes what it likes."""
+
+
+class Shy(FlattenExtractor):
+    """So does this."""
+
+
+REFUSED: dict[str, tuple[Any, Any, Any, dict[str, Any], str]] = {
+    "CNN": (
+        sb3.PPO,
+        "CnnPolicy",
+        functools.partial(envs.FakeImageEnv, discrete=False),
+        {"policy_kwargs": {}, "n_steps": 8},
+        "the actor of .*ActorCriticCnnPolicy is not known; known: ActorCriticPolicy, SACPolicy",
+    ),
+    "several inputs": (
+        sb3.PPO,
+        "MultiInputPolicy",
+        functools.partial(envs.SimpleMultiObsEnv, discrete_actions=False),
+        {"policy_kwargs": {}, "n_steps": 8},
+        "actor of .*MultiInputActorCriticPolicy is not known",
+    ),
+    "own policy": (sb3.PPO, Mine, bridged, {}, "the actor of .*Mine is not known"),
+    "own extractor": (
+        sb3.PPO,
+        "MlpPolicy",
+        bridged,
+        {"policy_kwargs": {"features_extractor_class": Shy}},
+        "the observation goes through Shy",
+    ),
+    "DQN": (
+        sb3.DQN,
+        "MlpPolicy",
+        lambda: "CartPole-v1",
+        OFF,
+        "DQNPolicy is not known",
+    ),
+    "gSDE": (sb3.SAC, "MlpPolicy", bridged, OFF | {"use_sde": True}, "gSDE.* clips the mean"),
+    "activation": (
+        sb3.PPO,
+        "MlpPolicy",
+        bridged,
+        {"policy_kwargs": {"activation_fn": functools.partial(torch.nn.ELU, 0.5)}},
+        r"layer ELU\(alpha=0.5\) is not known; known: linear, tanh, relu, elu",
+    ),
+    "both ways": (
+        contrib.RecurrentPPO,
+        "MlpLstmPolicy",
+        bridged,
+        {"policy_kwargs": LSTM | {"lstm_kwargs": {"batch_first": True}}},
+        "an LSTM with further arguments",
+    ),
+    "another env": (
+        sb3.PPO,
+        "MlpPolicy",
+        functools.partial(bridged, env_id="sideslip/YawFusion-v0"),
+        {},
+        r"trained on 30 numbers, those of sideslip/YawFusion-v0: gyro, .*gps_\w+.*; "
+        "the observation here has 22: gyro, ",
+    ),
+    "other bounds": (
+        sb3.PPO,
+        "MlpPolicy",
+        functools.partial(envs.IdentityEnvBox, -1, 1),
+        {},
+        "trained on 1 numbers that no environment here has",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_cannot_be_exported_is_refused_by_name(name: str, tmp_path: Path) -> None:
+    kind, policy, env, options, said = REFUSED[name]
+    options = deepcopy({"policy_kwargs": SMALL} | options)
+    model = kind(policy, env(), device="cpu", **options)
+    model.save(tmp_path / "mine.zip")
+    with pytest.raises(ValueError, match=said):
+        sideslip.make_agent(str(tmp_path / "mine.zip"), gym.make(ID), trust=True)
+
+
+def test_another_normaliser_is_refused(zipped: Path, tmp_path: Path) -> None:
+    make = functools.partial(sideslip.make_agent, str(zipped), gym.make(ID), trust=True)
+    path = tmp_path / "other.pkl"
+    with pytest.raises(FileNotFoundError, match="no such file"):
+        make(normalise=path)
+    for content, said in (
+        (b"nonsense", "cannot be read as a VecNormalize"),
+        (pickle.dumps({}), "holds a dict, not a VecNormalize"),
+        (pickle.dumps(VecNormalize(bridged(1, "sideslip/YawGps-v0"))), "of another observation"),
+    ):
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match=said):
+            make(normalise=path)
