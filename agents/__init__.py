@@ -74,13 +74,11 @@ class Agent(Protocol):
 
 
 @overload
-def make_agent(name: str, env: AnyEnv, *, trust: bool = False, **options: Any) -> Controller: ...
+def make_agent(name: str, env: AnyEnv, **options: Any) -> Controller: ...
 
 
 @overload
-def make_agent(
-    name: Agent | Callable[..., Agent], env: AnyEnv, *, trust: bool = False, **options: Any
-) -> Agent: ...
+def make_agent(name: Agent | Callable[..., Agent], env: AnyEnv, **options: Any) -> Agent: ...
 
 
 def make_agent(

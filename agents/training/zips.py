@@ -127,7 +127,7 @@ def check_zip(file: Path, trust: bool) -> None:
         )
 
 
-def _read(file: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+def _read(file: Path) -> tuple[dict[str, Any], Any]:
     """(what the zip holds about the model, the policy's weights); nothing else is unpickled."""
     from .normalise import Standardised  # noqa: F401  first: it says which extra is missing
 
@@ -150,7 +150,7 @@ def _read(file: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     return content or {}, (weights or {})["policy"]
 
 
-def _built(file: Path, content: dict[str, Any], weights: dict[str, Any]) -> Any:
+def _built(file: Path, content: dict[str, Any], weights: Any) -> Any:
     """The policy with its weights, without the algorithm and its environments."""
     from stable_baselines3.common.policies import ActorCriticPolicy
 
@@ -198,7 +198,8 @@ def _frames(file: Path, space: Any, layout: Sequence[Entry]) -> int:
     here = ", ".join(entry.name for entry in layout)
     raise ValueError(
         f"{file} was trained on {space.shape[0]} numbers{_known(space)}; the observation here has "
-        f"{len(layout)}: {here}"
+        f"{len(layout)}: {here}. An export (`sideslip export`) reads its entries by name and "
+        "drives a wider observation too"
     )
 
 

@@ -31,7 +31,7 @@ ID, GUST = "sideslip/YawVision-v0", {"base": "gust", "duration": 0.3}
 SMALL: dict[str, Any] = {"net_arch": [8]}
 OFF: dict[str, Any] = {"buffer_size": 10}
 LSTM = SMALL | {"lstm_hidden_size": 6}
-MODELS: dict[str, tuple[Any, str, dict[str, Any]]] = {
+MODELS: dict[str, tuple[Any, str, Any]] = {
     "PPO": (sb3.PPO, "MlpPolicy", {}),
     "PPO, gSDE": (sb3.PPO, "MlpPolicy", {"use_sde": True}),
     "PPO, squashed gSDE": (
@@ -137,7 +137,8 @@ def test_a_stack_of_frames_is_recognised(tmp_path: Path, inside: bool) -> None:
     normaliser.save(str(tmp_path / "vecnormalize.pkl"))
 
     def newest() -> Any:
-        return normaliser.get_original_obs()[:, -22:]
+        obs: Any = normaliser.get_original_obs()
+        return obs[:, -22:]
 
     assert difference(model, tmp_path / "mine.zip", env, newest) < 1e-6
 
