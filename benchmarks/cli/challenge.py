@@ -23,9 +23,6 @@ EnvId = Annotated[str, typer.Option("--env", help="The contests of this id alone
 Fresh = Annotated[
     bool, typer.Option("--fresh", help="Seeds that follow your files too: publishable.")
 ]
-Trust = Annotated[
-    bool, typer.Option("--trust", help="Read policies' zips, which may run code of their makers.")
-]
 Limit = Annotated[float, typer.Option(help="s of wall time for a contestant in a contest.")]
 
 

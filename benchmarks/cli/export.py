@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 ENV = "sideslip/YawVision-v0"
 Trust = Annotated[
-    bool, typer.Option("--trust", help="Read a zip, which may run code of its maker's.")
+    bool, typer.Option("--trust", help="Read policies' zips, which may run code of their makers.")
 ]
 
 

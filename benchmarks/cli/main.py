@@ -13,7 +13,7 @@ from ... import __version__
 from ..harness.results import check_writable
 from ..suites import SUITES, Request, run_suite
 from .calibrate import calibrate_command
-from .challenge import Agents, EnvId, Estimators, Fresh, Limit, Scenarios, Trust, challenge_of
+from .challenge import Agents, EnvId, Estimators, Fresh, Limit, Scenarios, challenge_of
 from .enjoy import enjoy_command
 from .export import Trust, export_command
 from .output import show_episode, write_output

@@ -9,7 +9,8 @@ from typing import Any
 import gymnasium as gym
 
 from ...agents import AGENTS
-from ...agents.learned.files import is_policy, load_policy, shipped
+from ...agents.learned.files import ZIP, is_policy, load_policy, shipped
+from ...agents.training.zips import check_zip
 from ...agents.tuned import tuned
 from ...envs.arguments import check_choice
 from ...envs.scenarios.manoeuvres import scenario_from
@@ -24,7 +25,6 @@ EPISODES = 64
 _IDS = tuple(
     name for name in gym.registry if name.startswith("sideslip/") and "Outside" not in name
 )
-_ZIP = ".zip"
 _COMS, _CAR = "1", "2a"  # tiers, of which a scenario without one has car and reference
 
 
@@ -63,10 +63,6 @@ class Pair:
     def check(self) -> None:
         """FileNotFoundError or ValueError for a name, file or class that there is not,
         PermissionError for a zip without trust."""
-        if isinstance(self.agent, str) and _is_zip(self.agent) and not self.trust:
-            raise PermissionError(
-                f"reading {self.agent} may run code of its maker's: trust it first"
-            )
         for each, known in ((self.agent, AGENTS), (self.estimator, ESTIMATORS)):
             if not isinstance(each, str):
                 continue
@@ -74,15 +70,10 @@ class Pair:
                 find_class(each)
             elif known is AGENTS and is_policy(each):
                 load_policy(each)
-            elif each not in ("", TRUTH, *SETUPS) and ":" not in each and not _is_zip(each):
+            elif known is AGENTS and each.endswith(ZIP):
+                check_zip(Path(each), self.trust)
+            elif each not in ("", TRUTH, *SETUPS) and ":" not in each:
                 known.load(each, shipped() if known is AGENTS else SETUPS)
-
-
-def _is_zip(name: str) -> bool:
-    """Whether it is a policy of stable-baselines3; FileNotFoundError where there is none."""
-    if name.endswith(_ZIP) and not Path(name).is_file():
-        raise FileNotFoundError(f"there is no file {name}")
-    return name.endswith(_ZIP)
 
 
 def _label(each: Any) -> str:
@@ -94,7 +85,7 @@ def pairs_of(agents: Sequence[str], estimators: Sequence[str], trust: bool = Fal
     """Every agent on every estimator, or on the usual one, and the reference controller on every
     estimator. trust: of zips."""
     pairs = [
-        Pair(agent, each, trust and agent.endswith(_ZIP))
+        Pair(agent, each, trust and agent.endswith(ZIP))
         for agent in agents
         for each in estimators or [_usual(agent)]
     ]
@@ -106,7 +97,7 @@ def _usual(agent: str) -> str:
     """The estimator for an agent: a policy's own, none for what saw an env alone."""
     if is_policy(agent):
         return load_policy(agent).card.estimator or ""
-    return "" if agent.endswith(_ZIP) else REFERENCE_FILTER
+    return "" if agent.endswith(ZIP) else REFERENCE_FILTER
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
+from zipfile import ZipFile
 
 import numpy as np
 import pandas as pd
@@ -206,12 +207,14 @@ def test_an_agent_drives_on_the_estimators_and_these_under_lqr() -> None:
 def test_a_zip_is_read_where_it_is_trusted(tmp_path: Path) -> None:
     """Alone, without a filter that it did not see in training."""
     mine = str(tmp_path / "mine.zip")
-    Path(mine).touch()
+    with ZipFile(mine, "w") as archive:
+        archive.writestr("data", "{}")
+        archive.writestr("policy.pth", "")
     (pair, other) = pairs_of([mine, "esc"], [], trust=True)
     assert pair.estimator == "" and pair.cell(Contest()).best["controller"] == {"trust": True}
     assert not other.trust
     Challenge((pair,))
-    with pytest.raises(PermissionError, match="may run code"):
+    with pytest.raises(PermissionError, match=r"`sideslip export .*mine.zip --trust`"):
         Challenge(tuple(pairs_of([mine], [])))
 
 
@@ -283,3 +286,21 @@ def test_the_baselines_on_file_still_cost_the_same() -> None:
     cells = baselines.cells_of(some_of(contests()))
     assert len(baselines.read_baselines()) == len(cells)
     assert baselines.on_file(cells, EPISODES) is not None
+
+
+def test_a_zip_drives_as_its_export_does(tmp_path: Path) -> None:
+    """On the observation that it was trained on."""
+    sb3 = pytest.importorskip("stable_baselines3")
+    from sideslip.agents.training.zips import export_zip
+    from sideslip.agents.vec_env.env import make_vec_env
+
+    zipped, exported = tmp_path / "mine.zip", tmp_path / "mine.safetensors"
+    sb3.A2C("MlpPolicy", make_vec_env(YAW, 1), policy_kwargs={"net_arch": [4]}).save(zipped)
+    export_zip(zipped, exported, YAW, trust=True)
+    short = {"base": "gust", "duration": 0.3}
+    options: dict[str, Any] = {"scenarios": short, "seeds": (1, 2), "jobs": 1, "estimator": ""}
+    found = [
+        sideslip.score(str(path), YAW, trust=path == zipped, **options)
+        for path in (zipped, exported)
+    ]
+    assert not found[0].error and found[0].cost == found[1].cost
