@@ -1,6 +1,6 @@
 """The suites by name, each loaded when it is asked for."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
+from .harness.parallel import one_bar
 from .harness.results import Suite
 
 if TYPE_CHECKING:
@@ -66,6 +67,12 @@ SUITES: dict[str, tuple[str, _Run]] = {
     "speed": (".speed.suite", lambda suite, r: suite.run(r.quick, r.console)),
 }
 """The module of each suite, and how a request runs it."""
+
+
+def run_suites(names: Sequence[str], request: Request) -> list[Suite]:
+    """Run suites of `SUITES` one after the other, with one progress bar for all of them."""
+    with one_bar(request.console):
+        return [run_suite(name, request) for name in names]
 
 
 def run_suite(name: str, request: Request) -> Suite:

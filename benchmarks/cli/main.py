@@ -11,7 +11,7 @@ from rich.markup import escape
 
 from ... import __version__
 from ..harness.results import check_writable
-from ..suites import SUITES, Request, run_suite
+from ..suites import SUITES, Request, run_suites
 from .calibrate import calibrate_command
 from .challenge import Agents, EnvId, Estimators, Fresh, Limit, Scenarios, challenge_of
 from .enjoy import enjoy_command
@@ -178,7 +178,7 @@ def bench(
 
         done.append(replay_file(log, vehicle, mapping=mapping))
     request = Request(quick, jobs, console, episodes, keep, clairvoyant, challenge)
-    done += [run_suite(name, request) for name in names]
+    done += run_suites(names, request)
     order = [*names, "replay"]
     done.sort(key=lambda suite: order.index(suite.name))
     write_output(console, done, html, json, parquet)

@@ -93,18 +93,22 @@ def environment() -> dict[str, str]:
 
 
 _NAME = 32  # letters: a longer text in a table's first column is no name and may wrap
-_LEAST = 22  # letters that the first column keeps on a narrow screen
+_LEAST = 22  # letters that a column of text has at least, and the first one on a narrow screen
+_NARROW = 80  # columns
 
 
 def print_suite(console: Console, suite: Suite) -> None:
     """The title, the verdict, the text, and each table with its note."""
-    console.rule(f"[bold]{escape(suite.title)}")
+    if len(suite.title) + 4 <= console.width:
+        console.rule(f"[bold]{escape(suite.title)}")
+    else:  # a rule would cut it
+        console.print(f"\n[bold]{escape(suite.title)}[/]", highlight=False)
     if suite.verdict:
         console.print(f"[bold]{escape(suite.verdict)}[/]\n", highlight=False)
     console.print(f"{escape(suite.text)}\n", highlight=False)
     for table in suite.tables:
         for part in _parts(table, console.width):
-            console.print(_rich(part))
+            console.print(_rich(part, console.width))
         if table.note:
             console.print(f"[dim]{escape(table.note)}[/]\n", highlight=False)
 
@@ -121,7 +125,7 @@ def _parts(table: Table, width: int) -> list[Table]:
         for each, column in zip(most, columns, strict=True)
     ]
     groups: list[list[int]] = [[0]]
-    used = first = min(widths[0], _NAME + 2) + 2
+    used = first = min(widths[0], _first(width) + 2) + 2
     for i in range(1, len(columns)):
         if used + widths[i] > width and len(groups[-1]) > 1:
             groups.append([0])
@@ -139,7 +143,12 @@ def _parts(table: Table, width: int) -> list[Table]:
     ]
 
 
-def _rich(table: Table) -> RichTable:
+def _first(width: int) -> int:
+    """Letters that the first column has, if it needs them, on a screen of so many columns."""
+    return _NAME if width >= _NARROW else _LEAST
+
+
+def _rich(table: Table, width: int) -> RichTable:
     """Columns of numbers to the right and whole, those of text to the left, wrapped if long."""
     from ..report.tables import numeric
 
@@ -153,8 +162,9 @@ def _rich(table: Table) -> RichTable:
         shown.add_column(
             name,
             justify="right" if right else "left",
-            no_wrap=right or (i == 0 and longest <= _NAME),
-            min_width=min(longest, _LEAST) if i == 0 else None,
+            no_wrap=right,
+            min_width=min(longest, _first(width)) if i == 0 else None,
+            overflow="fold",  # a long word goes on in the next line
         )
     for row in table.cells:
         shown.add_row(*map(escape, row))

@@ -1,7 +1,9 @@
 """A benchmark's work as a list of independent cases, run side by side with a progress bar."""
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
+from contextvars import ContextVar
 from typing import TypeVar
 
 import joblib
@@ -28,6 +30,20 @@ def progress(console: Console | None) -> Progress:
     return Progress(*columns, TimeElapsedColumn(), console=console, disable=console is None)
 
 
+_SHARED: ContextVar[Progress | None] = ContextVar("shared", default=None)
+
+
+@contextmanager
+def one_bar(console: Console | None) -> Iterator[None]:
+    """One progress bar for every `run_cases` inside, which shows the one that runs."""
+    with progress(console) as bar:
+        token = _SHARED.set(bar)
+        try:
+            yield
+        finally:
+            _SHARED.reset(token)
+
+
 def run_cases(
     function: Callable[[Case], Result],
     cases: Sequence[Case],
@@ -38,10 +54,12 @@ def run_cases(
     """function(case) for every case, in the order of the cases.
 
     function: importable by workers. jobs: processes (default: the processors at hand); 1 runs in
-    this process. console: where the progress bar goes; None shows none.
+    this process. console: where the progress bar goes, unless inside `one_bar`; None shows none.
     """
-    jobs = min(jobs or cores(), len(cases))
-    with progress(console) as bar:
+    jobs, shared = min(jobs or cores(), len(cases)), _SHARED.get()
+    with progress(console) if shared is None else nullcontext(shared) as bar:
+        for before in bar.task_ids:
+            bar.remove_task(before)
         task = bar.add_task(title, total=len(cases))
         results = []
         pool = joblib.Parallel(n_jobs=jobs, return_as="generator")

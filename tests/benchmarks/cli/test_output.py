@@ -1,18 +1,22 @@
 """What commands print: every column of every row, on a narrow screen too."""
 
 import io
+import re
+from typing import Any
 
 import pytest
 from rich.console import Console
 
 from sideslip.benchmarks.cli.output import print_suite
+from sideslip.benchmarks.harness.parallel import one_bar, run_cases
 from sideslip.benchmarks.harness.results import Suite, Table
+from sideslip.estimators.make import ESTIMATORS
 
 HEADER = ("controller and estimator", *(f"column {i} / %" for i in range(12)))
 ROWS = [[f"contestant {k} on a filter", *(f"{100 * k + i}.5" for i in range(12))] for k in (1, 2)]
 
 
-@pytest.mark.parametrize("width", [80, 120, 400])
+@pytest.mark.parametrize("width", [80, 100, 120, 400])
 def test_nothing_of_a_wide_table_is_cut(width: int) -> None:
     """It is printed in parts, each with the names."""
     suite = Suite("wide", "A wide table", "")
@@ -35,3 +39,51 @@ def test_long_texts_wrap_and_are_no_part_of_their_own() -> None:
     print_suite(Console(file=written, width=80), suite)
     assert "(continued)" not in written.getvalue()
     assert written.getvalue().count("grows") == 9
+
+
+LONG = "Fig. 9 (twin): multirate-residual-kf/constant-delay-kf"
+
+
+@pytest.mark.parametrize("width", [40, 80, 100, 120])
+@pytest.mark.parametrize("colour", ["truecolor", None])
+def test_no_name_is_lost_on_a_narrow_screen(width: int, colour: Any) -> None:
+    """However narrow, with and without colour: words wrap, and go on where they are too long."""
+    names = [*ESTIMATORS, "model-following on exact-kf, all sensors", LONG]
+    cells = [[name, "0.31", "0.29 .. 0.33", "why it is so, in a few words"] for name in names]
+    header = ("controller and estimator", "score", "95 % interval", "remark")
+    title = "A title that is longer than a narrow screen"
+    suite = Suite("names", title, "Text.", verdict="Best: `a`.\nNot covered: [b].")
+    suite.tables.append(Table("Numbers", header, cells))
+    written = io.StringIO()
+    print_suite(
+        Console(file=written, width=width, force_terminal=bool(colour), color_system=colour), suite
+    )
+    text = re.sub(r"\x1b\[[0-9;]*m", "", written.getvalue())
+    assert ("\x1b" in written.getvalue()) == bool(colour)
+    lines = text.splitlines()
+    assert max(map(len, lines)) <= width
+    assert "\u2026" not in text
+    start = lines.index("Best: `a`.")
+    assert lines[start + 1] == "Not covered: [b]." and start <= 3  # first of all
+    assert title in " ".join(" ".join(lines[:start]).split())
+    first = "".join(re.sub(r"\s", "", line[: line_end(text, width)]) for line in lines)
+    for name in names:
+        assert re.sub(r"\s", "", name) in first
+
+
+def line_end(text: str, width: int) -> int:
+    """Where the first column ends: at the gap before the second one's header."""
+    head = next(line for line in text.splitlines() if "score" in line)
+    return head.index("score") - 1
+
+
+def test_a_run_has_one_progress_bar() -> None:
+    """It shows what runs; nothing of the phases before it stays."""
+    written = io.StringIO()
+    console = Console(file=written, width=80, force_terminal=True)
+    with one_bar(console):
+        for phase in ("first", "second", "third"):
+            assert run_cases(abs, [-1, -2], phase, jobs=1, console=console) == [1, 2]
+    last = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", written.getvalue()).splitlines()[-1]
+    assert "third" in last and "2/2" in last
+    assert "\n" not in re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", written.getvalue()).strip()
