@@ -1,4 +1,4 @@
-"""What a network is given instead of SI units: standardised observations, rewards per second.
+"""What a network reads instead of SI units: standardised observations, rewards per second.
 
 The scales are measured once, before the training, and stay: they are part of the network, which
 reads plain observations.

@@ -89,8 +89,8 @@ def test_cells_are_torchs_over_whole_episodes(kind: str, layers: int) -> None:
             state[:, :, start], ours[start] = 0.0, 0.0
             with torch.no_grad():
                 taken = torch.from_numpy(z[step]).to(precision)[None]
-                given = (state[0], state[1]) if kind == "lstm" else state[0]
-                output, after = module(taken, given)
+                before = (state[0], state[1]) if kind == "lstm" else state[0]
+                output, after = module(taken, before)
             state = torch.stack(after) if kind == "lstm" else torch.stack([after, after])
             hidden = output[0].numpy().astype(np.float64)
             action = network(x[step].astype(np.float64), ours)
