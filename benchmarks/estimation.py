@@ -233,8 +233,8 @@ def _draw(
         groups[title] = dict(sorted(over.items(), key=lambda pair: pair[1].value))
     ratio = "error / the least possible: less is better"
     bars = groups_with_interval(groups, ratio, {1.0: "the bound"})
-    said = " ".join(suite.verdict.splitlines()[1:-2])
-    suite.answers.append(("Which estimator comes closest to the sideslip angle?", bars, said))
+    firsts = " ".join(suite.verdict.splitlines()[1:-2])
+    suite.answers.append(("Which estimator comes closest to the sideslip angle?", bars, firsts))
     for experiment, (drive, traces) in zip(EXPERIMENTS, examples, strict=True):
         t, beta = drive.log.time, drive.log.truth["beta"]
         lines = {"truth": 1e3 * beta} | {label: 1e3 * each for label, each in traces.items()}

@@ -121,14 +121,14 @@ def _draw(suite: Suite) -> None:
         return
     text = "Colour: the share of seeds on which the car is saved; the line is at one half."
     suite.figures = [(each.title, share_maps(each), text) for each in suite.maps]
-    first, said = suite.maps[0], suite.verdict.splitlines()[1:-2]
+    first, best = suite.maps[0], suite.verdict.splitlines()[1:-2]
     shown = ["none"]
     for group in (READING, ORACLES):
         there = [name for name in group if name in first.shares]
         shown += sorted(there, key=lambda name: -float(first.shares[name].mean()))[:1]
     few = replace(first, shares={name: first.shares[name] for name in shown})
     title = f"From where is a car still saved? ({first.title})"
-    suite.answers.append((title, share_maps(few), " ".join([*said[:1], text])))
+    suite.answers.append((title, share_maps(few), " ".join([*best[:1], text])))
 
 
 def answer(cars: Mapping[str, Mapping[str, Array]]) -> str:

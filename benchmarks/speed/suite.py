@@ -43,8 +43,8 @@ def answer(taken: Mapping[str, Taken], goals: Table) -> str:
     own = us[env_steps.FUSION]
     over = [f"{three(us[name] / own)} for {name}" for name in RIVALS if name in us]
     met = [line[0] for line in goals.cells if line[-1] == "met"]
-    missed = [f"{name} ({measured} of {goal})" for name, goal, measured, _, said in goals.cells
-              if said == "not met"]  # fmt: skip
+    missed = [f"{name} ({measured} of {goal})" for name, goal, measured, _, outcome in goals.cells
+              if outcome == "not met"]  # fmt: skip
     least = f"; not met: {some(missed, 1)}" if missed else ""
     return verdict(
         f"10 ms of driving cost {three(own)} us on one core, {three(us[env_steps.AT_ONCE])} us "
