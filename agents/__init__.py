@@ -4,6 +4,7 @@ from collections.abc import Callable
 from importlib import import_module
 from typing import Any, Protocol, overload
 
+from ..envs.arguments import check_options
 from ..estimators.registry import Registry
 from .controllers.base import Controller, NoControl
 from .controllers.esc import Esc
@@ -111,7 +112,9 @@ def make_agent(
             return Learned(env, zips.policy_from_zip(name, env, trust=trust, **options))
         if name not in AGENTS and is_policy(name):
             return Learned(env, policy=name, **options)
-        agent = AGENTS.load(name, shipped())(env, **options)
+        factory = AGENTS.load(name, shipped())
+        check_options(name, factory, options)
+        agent = factory(env, **options)
     elif isinstance(name, type) or not hasattr(name, "predict"):
         agent = name(env, **options) if callable(name) else name
     elif options:

@@ -1,10 +1,11 @@
 """Arguments of environments, for one or for rows, checked; and how messages write them."""
 
 import difflib
+import inspect
 import operator
 import reprlib
 import textwrap
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -68,6 +69,17 @@ def check_choice(what: str, value: Any, known: Iterable[str]) -> None:
     """ValueError for a value that is none of the known names, with the nearest of them."""
     if not isinstance(value, str) or value not in known:
         raise ValueError(unknown_names(what, [value], known))
+
+
+def check_options(what: str, function: Callable[..., Any], options: Iterable[str]) -> None:
+    """TypeError for an option that a function does not take beside its first argument, with the
+    nearest of those that it does."""
+    parameters = list(inspect.signature(function).parameters.values())[1:]
+    if any(each.kind is each.VAR_KEYWORD for each in parameters):
+        return
+    known = [each.name for each in parameters]
+    if unknown := [name for name in options if name not in known]:
+        raise TypeError(f"{what}: {unknown_names('option', unknown, known)}")
 
 
 def count_of(num_envs: Any) -> int:

@@ -19,8 +19,8 @@ def ends_in(source: object, endings: tuple[str, ...]) -> bool:
 
 
 def is_document(source: object) -> bool:
-    """Whether a value is a path: any `Path`, or a text that ends as documents do."""
-    return isinstance(source, os.PathLike) or ends_in(source, ENDINGS)
+    """Whether a value is a path: any `Path`, or a text with an ending, which no name has."""
+    return isinstance(source, os.PathLike) or (isinstance(source, str) and "." in source[-8:])
 
 
 def read_document(source: "str | os.PathLike[str]", what: str) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from ...envs.arguments import check_choice
-from ..harness.results import check_writable
+from .output import check_files, wrote
 
 
 def calibrate_command(
@@ -32,7 +32,7 @@ def calibrate_command(
     from ..control.contests import contests
 
     path = FILE if write else out
-    check_writable(path)
+    check_files(json=path)
     known = {each.name: each for each in contests()}
     for name in contest or []:
         check_choice("contest", name, known)
@@ -49,4 +49,4 @@ def calibrate_command(
         best = f"{entry.costs.mean():.4g}"
         table.add_row(entry.contest.name, f"{none:.4g}", best, f"{wins} of {seeds}")
     console.print(table)
-    console.print(f"calibration: {path}", highlight=False, soft_wrap=True)
+    wrote(console, path)

@@ -5,12 +5,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from .names import complete
+
 if TYPE_CHECKING:
     from ..entrants.challenge import Challenge
 
 Agents = Annotated[
     list[str] | None,
-    typer.Option("--agent", help="Your own: FILE.py:Class, a policy's path, a name; repeatable."),
+    typer.Option(
+        "--agent",
+        help="Your own: FILE.py:Class, a policy's path, a name; repeatable.",
+        autocompletion=complete("agents", "policies"),
+    ),
 ]
 Estimators = Annotated[
     list[str] | None,

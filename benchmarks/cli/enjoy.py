@@ -11,9 +11,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from ..harness.results import check_writable
 from .export import Trust, as_policy, sizes_of
-from .output import show_episode, write_output
+from .output import check_files, show_episode, write_output, wrote
 
 if TYPE_CHECKING:
     from ...agents.learned.files import Policy
@@ -50,7 +49,7 @@ def enjoy_command(
     from ..report.film import Driver, check_film, film
 
     console = Console()
-    check_writable(html, json, parquet, plot)
+    check_files(html=html, json=json, parquet=parquet, plot=plot)
     check_film(video)
     with as_policy(policy, env, trust) as path:
         if card:
@@ -68,7 +67,7 @@ def enjoy_command(
                 found.seeds[0],
                 console,
             )
-            console.print(f"film: {video}", highlight=False, soft_wrap=True)
+            wrote(console, video)
 
 
 def _show_card(console: Console, policy: "Policy") -> None:

@@ -10,8 +10,7 @@ import typer
 from rich.console import Console
 
 from ..harness.results import check_writable
-from .output import command_line
-from .tune import option_of
+from .output import command_line, options_of, wrote
 
 if TYPE_CHECKING:
     from ...agents.learned.network import Network
@@ -43,7 +42,7 @@ def export_command(
 
     target = out or zipped.with_suffix(".safetensors")
     check_writable(target)
-    options = dict(map(option_of, option or []))
+    options = options_of(option)
     policy = export_zip(
         zipped, target, env, options, estimator,
         trust=trust, normalise=normalise, command=command_line(),
@@ -53,7 +52,7 @@ def export_command(
         f"network: {sizes_of(policy.network)}; observations normalised by: {scaled or 'nothing'}",
         highlight=False,
     )
-    console.print(f"policy: {target}", highlight=False)
+    wrote(console, target)
 
 
 def sizes_of(network: "Network") -> str:

@@ -2,25 +2,27 @@
 
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 from gymnasium.error import Error as GymnasiumError
 from rich.console import Console
 from rich.markup import escape
+from rich.table import Table
 
 from ... import __version__
-from ..harness.results import check_writable
+from ...envs.arguments import check_choice
 from ..suites import SUITES, Request, run_suites
 from .calibrate import calibrate_command
 from .challenge import Agents, EnvId, Estimators, Fresh, Limit, Scenarios, challenge_of
 from .enjoy import enjoy_command
 from .export import Trust, export_command
-from .output import show_episode, write_output
+from .names import KINDS, complete
+from .output import check_files, options_of, show_episode, write_output, wrote
 from .train import train_command
 from .tune import tune_app
 
-app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
+app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False)
 app.add_typer(tune_app, name="tune")
 app.command("calibrate")(calibrate_command)
 app.command("enjoy")(enjoy_command)
@@ -36,15 +38,26 @@ Mapping = Annotated[
     list[str] | None,
     typer.Option("--map", help="NAME_UNIT=COLUMN of the log (yaw_rate_degps=r); repeatable."),
 ]
-Vehicle = Annotated[str | None, typer.Option(help="The car: a name or a TOML or JSON file.")]
+Vehicle = Annotated[
+    str | None,
+    typer.Option(
+        help="The car: a name or a TOML or JSON file.", autocompletion=complete("vehicles")
+    ),
+]
+Options = list[str] | None
 Jobs = Annotated[int | None, typer.Option("--jobs", "-j", min=1, help="Processes.")]
+
+
+_OF_USERS = (
+    ValueError, TypeError, ModuleNotFoundError, OSError, RecursionError, GymnasiumError,
+)  # fmt: skip
 
 
 def main() -> None:
     """Entry point of `sideslip`; a user's error is one line and exit status 2."""
     try:
         app()
-    except (ValueError, TypeError, ModuleNotFoundError, OSError, GymnasiumError) as error:
+    except _OF_USERS as error:
         Console(stderr=True, soft_wrap=True).print(
             "[bold red]error:[/]", escape(str(error)), highlight=False
         )
@@ -67,37 +80,67 @@ def face(
 
 
 @app.command("list")
-def list_names() -> None:
-    """The names of environments, scenarios, vehicles, estimators, agents, policies, suites."""
-    import gymnasium as gym
-
-    from ...agents import AGENTS
-    from ...agents.learned.files import shipped
-    from ...envs.scenarios.manoeuvres import SCENARIOS
-    from ...envs.vehicle.vehicles import VEHICLES
-    from ...estimators.make import ESTIMATORS
-
-    for title, names in {
-        "environments": [name for name in gym.registry if name.startswith("sideslip/")],
-        "scenarios": list(SCENARIOS),
-        "vehicles": list(VEHICLES),
-        "estimators": list(ESTIMATORS),
-        "agents": list(AGENTS),
-        "policies": shipped(),
-        "suites": list(SUITES),
-    }.items():
-        console.print(f"[bold]{title}[/]: {', '.join(names)}", highlight=False)
+def list_names(
+    kinds: Annotated[
+        list[str] | None,
+        typer.Argument(help=f"{', '.join(KINDS)}; default: all.", autocompletion=lambda: [*KINDS]),
+    ] = None,
+) -> None:
+    """Everything that has a name, with a line on each."""
+    for kind in kinds or []:
+        check_choice("kind of name", kind, KINDS)
+    for kind in kinds or KINDS:
+        table = Table(box=None, show_header=False, padding=(0, 2, 0, 0))
+        table.add_column(no_wrap=True)
+        table.add_column()
+        for name, line in KINDS[kind]().items():
+            table.add_row(name, escape(line))
+        console.print(f"[bold]{kind}[/]")
+        console.print(table)
 
 
 @app.command()
 def run(
-    env_id: Annotated[str, typer.Argument(help="An environment's id.")] = "sideslip/YawVision-v0",
-    agent: Annotated[str, typer.Option(help="A name, a policy's path, module:Name.")] = "none",
-    estimator: Annotated[str | None, typer.Option(help="A name or module:Name.")] = None,
-    scenario: Annotated[str | None, typer.Option(help="A scenario's name.")] = None,
+    env_id: Annotated[
+        str | None,
+        typer.Argument(
+            help="An environment's id; default: the first of YawVision and AfsYawFusion that fits.",
+            autocompletion=complete("environments"),
+        ),
+    ] = None,
+    agent: Annotated[
+        str,
+        typer.Option(
+            help="A name, a policy's path, FILE.py:Class or module:Name.",
+            autocompletion=complete("agents", "policies"),
+        ),
+    ] = "none",
+    estimator: Annotated[
+        str | None,
+        typer.Option(
+            help="A name, FILE.py:Class or module:Name.", autocompletion=complete("estimators")
+        ),
+    ] = None,
+    vehicle: Vehicle = None,
+    scenario: Annotated[
+        str | None,
+        typer.Option(
+            help="A name, a TOML or JSON file, or a recorded drive (CSV, Parquet) to steer as.",
+            autocompletion=complete("scenarios"),
+        ),
+    ] = None,
+    option: Annotated[
+        Options, typer.Option(help="NAME=VALUE of the environment (reference=model); repeatable.")
+    ] = None,
+    agent_option: Annotated[
+        Options, typer.Option(help="NAME=VALUE of the agent (grip=0.6); repeatable.")
+    ] = None,
+    estimator_option: Annotated[
+        Options, typer.Option(help="NAME=VALUE of the estimator (q_beta=1e-4); repeatable.")
+    ] = None,
     seed: Annotated[int, typer.Option(help="Seed of the episode.")] = 0,
     control_period: Annotated[int, typer.Option(help="Ticks of 1 ms.")] = 10,
-    plot: Annotated[Path | None, typer.Option(help="Write a PNG.")] = None,
+    plot: Annotated[Path | None, typer.Option(help="Write a PNG, PDF or SVG.")] = None,
     parquet: Annotated[Path | None, typer.Option(help="Write every signal.")] = None,
     kml: Annotated[Path | None, typer.Option(help="Write the track for a map.")] = None,
     video: Annotated[Path | None, typer.Option(help="Write a film, .mp4 or .gif.")] = None,
@@ -105,27 +148,31 @@ def run(
     trust: Trust = False,
 ) -> None:
     """Drive one episode, print its score, draw it."""
-    import gymnasium as gym
-
-    from ...agents import make_agent
     from ...agents.rollout import rollout
-    from ...estimators.wrappers.estimate import EstimateObservation
     from ..report.film import Driver, check_film, film_drive
+    from .contestant import Contestant
 
-    check_writable(plot, parquet, kml)
+    check_files(plot=plot, parquet=parquet, kml=kml)
     check_film(video)
-    options: dict[str, Any] = {} if scenario is None else {"scenario": scenario}
-    env: gym.Env[Any, Any] = gym.make(env_id, control_period=control_period, **options)
-    if estimator is not None:
-        env = EstimateObservation(env, estimator)
-    driver = Driver(agent, env, make_agent(agent, env, trust=trust))
-    show_episode(console, rollout(env, driver.agent, seed), agent, plot, parquet, kml)
+    chosen = {"scenario": scenario, "vehicle": vehicle, "control_period": control_period}
+    asked = {name: value for name, value in chosen.items() if value is not None}
+    who = Contestant(
+        agent, options_of(agent_option), estimator, options_of(estimator_option), trust
+    )
+    driver = Driver(agent, *who.on(env_id, asked | options_of(option)))
+    if env_id is None and driver.env.spec is not None:
+        console.print(f"on {driver.env.spec.id}", highlight=False)
+    drive = rollout(driver.env, driver.agent, seed)
+    show_episode(console, drive, agent, plot, parquet, kml)
     film_drive(video, driver, beside, seed, console)
 
 
 @app.command()
 def bench(
-    suites: Annotated[list[str] | None, typer.Argument(help="Suites; default: all.")] = None,
+    suites: Annotated[
+        list[str] | None,
+        typer.Argument(help="Suites; default: all.", autocompletion=complete("suites")),
+    ] = None,
     quick: Quick = False,
     log: Annotated[Path | None, typer.Option(help="Replay this recorded drive too.")] = None,
     vehicle: Vehicle = None,
@@ -133,7 +180,7 @@ def bench(
     html: Html = None,
     json: Json = None,
     parquet: Parquet = None,
-    picture: Annotated[Path | None, typer.Option(help="Write the summary as a PNG.")] = None,
+    picture: Annotated[Path | None, typer.Option(help="The summary: PNG, PDF or SVG.")] = None,
     jobs: Jobs = None,
     episodes: Annotated[
         int | None, typer.Option(min=4, help="Episodes a cell of the suite control (1000).")
@@ -168,10 +215,9 @@ def bench(
         trust,
     )
     names = suites or (["control"] if challenge else list(SUITES))
-    unknown = [name for name in names if name not in SUITES]
-    if unknown:
-        raise ValueError(f"unknown suite {', '.join(unknown)}; known: {', '.join(SUITES)}")
-    check_writable(html, json, parquet, picture)
+    for name in names:
+        check_choice("suite", name, SUITES)
+    check_files(html=html, json=json, parquet=parquet, picture=picture)
     done = []
     if log is not None:  # first: a log that cannot be read should not cost minutes
         from ..recorded.suite import replay_file
@@ -186,7 +232,7 @@ def bench(
         from ..picture import write_picture
 
         write_picture(picture, done)
-        console.print(f"picture: {picture}", highlight=False)
+        wrote(console, picture)
 
 
 @app.command()
@@ -206,7 +252,7 @@ def replay(
     """Run the estimators over a recorded drive and score them."""
     from ..recorded.suite import replay_file
 
-    check_writable(html, json, parquet)
+    check_files(html=html, json=json, parquet=parquet)
     suite = replay_file(
         log,
         vehicle,

@@ -1,5 +1,6 @@
 """The output of commands: tables and lines on the screen, and files."""
 
+import json
 import platform
 import shlex
 import sys
@@ -7,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich import box
@@ -17,12 +18,62 @@ from rich.table import Table as RichTable
 
 from ... import __version__
 from ...envs.backend.files import whole
-from ..harness.results import Row, Suite, Table, write_json, write_parquet, write_text
+from ..harness.results import (
+    Row,
+    Suite,
+    Table,
+    check_writable,
+    write_json,
+    write_parquet,
+    write_text,
+)
 
 if TYPE_CHECKING:
     from ...agents.rollout import Rollout
 
+_ENDINGS = {
+    "html": (".html", ".htm"),
+    "json": (".json",),
+    "kml": (".kml",),
+    "parquet": (".parquet",),
+    "picture": (".png", ".pdf", ".svg"),
+    "plot": (".png", ".pdf", ".svg"),
+    "toml": (".toml",),
+}
 _SHOWN = ("numpy", "scipy", "numba", "gymnasium", "control", "plotly")
+
+
+def check_files(**paths: Path | None) -> None:
+    """Before the work: by option or kind, the file to be written has its ending and can be written.
+
+    Raises ValueError for another ending, OSError where it cannot be written.
+    """
+    for option, path in paths.items():
+        known = _ENDINGS[option]
+        if path and path.suffix.lower() not in known and not path.is_char_device():
+            raise ValueError(f"{path}: expected a file that ends in {' or '.join(known)}")
+    check_writable(*paths.values())
+
+
+def wrote(console: Console, path: Path) -> None:
+    """Print what was written."""
+    console.print(f"wrote {path}", highlight=False, soft_wrap=True, markup=False)
+
+
+def option_of(text: str) -> tuple[str, Any]:
+    """NAME=VALUE; a value that is no JSON is a word."""
+    name, equals, value = text.partition("=")
+    if not (name and equals):
+        raise ValueError(f"an option is NAME=VALUE, got {text!r}")
+    try:
+        return name, json.loads(value)
+    except json.JSONDecodeError:
+        return name, value
+
+
+def options_of(texts: Sequence[str] | None) -> dict[str, Any]:
+    """The options in texts of NAME=VALUE; ValueError for a text of another form."""
+    return dict(map(option_of, texts or ()))
 
 
 def show_episode(
@@ -46,10 +97,13 @@ def show_episode(
     if plot is not None:
         with whole(plot) as file:
             drive.plot().savefig(file, format=plot.suffix[1:] or "png", dpi=120)
+        wrote(console, plot)
     if parquet is not None:
         drive.to_parquet(parquet)
+        wrote(console, parquet)
     if kml is not None:
         write_text(kml, track_kml(drive.log.name, {who: (drive["X"], drive["Y"])}))
+        wrote(console, kml)
 
 
 def write_output(
@@ -65,15 +119,15 @@ def write_output(
     rows: list[Row] = [row for suite in suites for row in suite.rows]
     if json is not None:
         write_json(json, rows)
-        console.print(f"rows: {json}", highlight=False)
+        wrote(console, json)
     if parquet is not None:
         write_parquet(parquet, rows)
-        console.print(f"rows: {parquet}", highlight=False)
+        wrote(console, parquet)
     if html is not None:
         from ..report.html import write_report
 
         write_report(html, list(suites), command_line(), environment())
-        console.print(f"report: {html}", highlight=False)
+        wrote(console, html)
 
 
 def command_line() -> str:

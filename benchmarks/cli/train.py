@@ -10,7 +10,8 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from .tune import option_of
+from .names import check_env
+from .output import options_of, wrote
 
 if TYPE_CHECKING:
     from ...agents.training.train import Progress as Now
@@ -50,11 +51,13 @@ def train_command(
         "env_id": env,
         "algo": algo,
         "estimator": estimator,
-        "env_options": dict(map(option_of, option)) if option else None,
+        "env_options": options_of(option) or None,
         "seed": seed,
         "num_envs": num_envs,
     }
     options = {name: value for name, value in options.items() if value is not None}
+    if env is not None:
+        check_env(env)
     task = with_defaults(**options)
     folder = out or Path(_name_of(task))
     if resume:
@@ -66,8 +69,8 @@ def train_command(
     costs = evaluation(evaluate(folder / POLICY, EPISODES))["cost"]
     means = ", ".join(f"{name} {each['mean']:.4g}" for name, each in costs.items())
     console.print(f"mean cost on test seeds: {means}", highlight=False, soft_wrap=True)
-    console.print(f"policy: {folder / POLICY}", highlight=False, soft_wrap=True)
-    console.print(f"curve: {folder / CURVE}", highlight=False, soft_wrap=True)
+    wrote(console, folder / POLICY)
+    wrote(console, folder / CURVE)
 
 
 def _name_of(task: "Task") -> str:

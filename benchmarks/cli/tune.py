@@ -1,6 +1,5 @@
 """`sideslip tune`: what a user types, turned into a tuning's task; what it found, into a file."""
 
-import json
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,7 +9,7 @@ import typer
 from rich.console import Console
 
 from ..harness.results import check_writable
-from .output import print_suite
+from .output import check_files, options_of, print_suite, wrote
 
 tune_app = typer.Typer(no_args_is_help=True)
 Texts = list[str] | None
@@ -24,17 +23,6 @@ Seed = Annotated[int, typer.Option(help="Of the sampler; another on each machine
 @tune_app.callback()
 def face() -> None:
     """Find the numbers of a method by search."""
-
-
-def option_of(text: str) -> tuple[str, Any]:
-    """NAME=VALUE; a value that is no JSON is a word."""
-    name, equals, value = text.partition("=")
-    if not (name and equals):
-        raise ValueError(f"an option is NAME=VALUE, got {text!r}")
-    try:
-        return name, json.loads(value)
-    except json.JSONDecodeError:
-        return name, value
 
 
 def _searched(text: str) -> tuple[str, tuple[float, float] | None]:
@@ -84,13 +72,14 @@ def tune_estimator(
     from ..tuning.task import STORAGE, make_task
 
     files = [*([out] if out else []), *([tunings.FILE] if write else [])]
+    check_files(toml=out)
     check_writable(*files)
     task = make_task(
         name,
         scenario,
         env or None,
         target,
-        dict(map(option_of, option or [])),
+        options_of(option),
         dict(map(_searched, search)) if search else None,
         dict(map(_searched, noise or [])),
         seeds,
@@ -116,7 +105,7 @@ def tune_estimator(
     made = entry(task, found, command, note)
     for path in files:
         update(path, made)
-        console.print(f"tuning: {path}", highlight=False, soft_wrap=True)
+        wrote(console, path)
 
 
 @tune_app.command("controller")
@@ -146,7 +135,7 @@ def tune_controller(
     from ..tuning.spaces import KINDS
     from ..tuning.task import STORAGE
 
-    check_writable(out)
+    check_files(toml=out)
     console, tables, logs = Console(), [out, FILE] if write else [out], [log]
     if write:
         logs.append(controllers.LOGS)

@@ -67,7 +67,7 @@ def film_drive(
         name = "no control" if beside == "none" else beside
         drivers.append(Driver(name, env, make_agent(beside, env)))
     film(path, drivers, seed, console)
-    console.print(f"film: {path}", highlight=False, soft_wrap=True)
+    console.print(f"wrote {path}", highlight=False, soft_wrap=True)
 
 
 def film(

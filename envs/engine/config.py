@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from ..arguments import brief, check_choice, is_finite, listed, mapping_of, number_of
+from ..arguments import brief, check_choice, is_finite, listed, mapping_of, number_of, unknown_names
 from ..record import Array
 from ..scenarios.checks import SHORTEST_GPS_PERIOD
 from ..scenarios.draws import range_of
 from ..scenarios.manoeuvres import scenario_from
 from ..scenarios.scenario import Scenario
 from ..sensors.link import IN_FLIGHT, SlowSensor
-from ..sensors.slow import SENSOR_SETS, with_changes
+from ..sensors.slow import SENSOR_SETS, SLOW_NAMES, with_changes
 from ..task.observation import Entry, observation_layout
 from ..ticks import TICK, ticks
 from ..vehicle.dynamics import Motion
@@ -81,6 +81,9 @@ class EnvConfig:
 
     def __post_init__(self) -> None:
         check_choice("sensors", self.sensors, SENSOR_SETS)
+        if unknown := [name for name in self.slow_changes if name not in SLOW_NAMES]:
+            known = [entry.name for entry in dataclasses.fields(self)][:-1]
+            raise TypeError(unknown_names("argument", unknown, [*known, *SLOW_NAMES]))
         n = self.control_period
         if isinstance(n, bool) or not isinstance(n, int | np.integer):
             raise TypeError(f"control_period is a number of ticks, got {brief(n)}")

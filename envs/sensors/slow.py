@@ -102,12 +102,9 @@ SENSOR_SETS: dict[str, dict[str, SlowSensor]] = {
 def with_changes(
     sensors: dict[str, SlowSensor], changes: Mapping[str, Mapping[str, Any] | None]
 ) -> dict[str, SlowSensor]:
-    """The sensors with some of their fields replaced; ValueError for a sensor that is absent,
-    TypeError for a name that is no sensor's."""
+    """The sensors with some of their fields replaced; ValueError for a sensor that is absent."""
     changed = dict(sensors)
     for name, fields in changes.items():
-        if name not in SLOW_NAMES:
-            raise TypeError(f"got an unexpected keyword argument {name!r}")
         if fields is None:
             continue
         if name not in sensors:

@@ -6,6 +6,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ...envs.arguments import unknown_names
+
 Fits = Callable[[float], bool]
 
 
@@ -81,7 +83,5 @@ class Options:
     def done(self) -> None:
         """TypeError for options that nothing has read."""
         if self._left:
-            raise TypeError(
-                f"{self.name} has no option {', '.join(map(repr, sorted(self._left)))}; "
-                f"it has: {', '.join(sorted(self._known))}"
-            )
+            message = unknown_names("option", sorted(self._left), sorted(self._known))
+            raise TypeError(f"{self.name}: {message}")

@@ -2,11 +2,53 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
+from rich.console import Console
 
+from sideslip.benchmarks.cli import main as cli
+from sideslip.benchmarks.cli.names import KINDS, complete
 from sideslip.benchmarks.suites import SUITES
 from tests.benchmarks.conftest import Run
+
+LQR = ("run", "--agent", "lqr", "--estimator", "exact-kf")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_there_is_a_line_on_each_name(run: Run, kind: str, monkeypatch: Any) -> None:
+    """In 80 columns a name is whole, and shells complete it."""
+    monkeypatch.setattr(cli, "console", Console(width=80))
+    status, out, _ = run("list", kind)
+    lines = KINDS[kind]()
+    assert status == 0 and lines and all(len(line) > 3 for line in lines.values())
+    assert {name for name in lines if f"\n{name}  " in out} == set(lines)
+    assert max(map(len, out.splitlines())) <= 80
+    first = next(iter(lines))
+    assert (first, lines[first]) in list(complete(kind)(first[:-1]))
+    assert not list(complete(kind)("no such"))
+
+
+def test_run_takes_files_and_options(run: Run, tmp_path: Path) -> None:
+    car, scenario = tmp_path / "car.toml", tmp_path / "short.json"
+    car.write_text('base = "coms"\nfront_stiffness_axle = 11000.0\n')
+    scenario.write_text('{"base": "gust", "duration": 0.2}')
+    status, out, _ = run(
+        *LQR, "--vehicle", car, "--scenario", scenario, "--option", "reference=model",
+        "--agent-option", "grip=0.6", "--estimator-option", "q_beta=1e-4",
+    )  # fmt: skip
+    assert status == 0 and "on sideslip/YawVision-v0\nshort: 0.20 s" in out
+
+
+def test_the_papers_own_pair_runs(run: Run, tmp_path: Path) -> None:
+    """model-following reads dakf's disturbances and steers: neither needs to be asked for."""
+    scenario = tmp_path / "short.toml"
+    scenario.write_text('base = "dakf-fig6"\nduration = 0.2\n')
+    status, out, err = run(
+        "run", "--agent", "model-following", "--estimator", "dakf", "--scenario", scenario
+    )
+    assert status == 0 and "on sideslip/AfsYawFusion-v0\nshort: 0.20 s" in out
+    assert "Warning" not in err
 
 
 @pytest.mark.smoke
@@ -24,6 +66,7 @@ def test_run_drives_an_episode_and_draws_it(run: Run, tmp_path: Path) -> None:
         "--plot", picture, "--parquet", table,
     )  # fmt: skip
     assert status == 0 and "lane-change" in out and "peak" in out
+    assert f"wrote {picture}\nwrote {table}\n" in out
     assert picture.read_bytes()[:4] == b"\x89PNG" and table.exists()
 
 
@@ -34,7 +77,7 @@ def test_run_films_a_drive_with_another_beside(run: Run, tmp_path: Path) -> None
         "run", "--agent", "feedforward", "--scenario", "low-friction", "--beside", "none",
         "--video", path,
     )  # fmt: skip
-    assert status == 0 and "film: " in out and "cost" in out
+    assert status == 0 and "wrote " in out and "cost" in out
     assert path.read_bytes()[:6] == b"GIF89a" and len(list(tmp_path.iterdir())) == 1
 
 
@@ -46,9 +89,30 @@ def test_run_films_a_drive_with_another_beside(run: Run, tmp_path: Path) -> None
         (("enjoy", "ppo-yaw-vision", "--video", "film.avi"), "a film ends in .mp4 or .gif"),
         (("run", "--scenario", "moon"), "unknown scenario 'moon'"),
         (("run", "--agent", "pid"), "unknown agent 'pid'"),
-        (("run", "--estimator", "dakf"), "dakf needs the slow sensor gps"),
-        (("run", "--agent", "two-dof"), "beta_hat"),
-        (("bench", "weather"), "unknown suite weather"),
+        (("run", "sideslip/YawVision-v0", "--estimator", "dakf"), "dakf needs the slow sensor gps"),
+        (("run", "--agent", "two-dof"), "add --estimator, for example --estimator exact-kf"),
+        (("run", "--agent", "lqr"), "lqr works on an estimate: add --estimator"),
+        (("run", "--agent", "lqrr"), "unknown agent 'lqrr'; did you mean 'lqr'"),
+        (("run", "YawVison-v0"), "did you mean 'sideslip/YawVision-v0'"),
+        (("run", "--scenario", "gusts"), "unknown scenario 'gusts'; did you mean 'gust'"),
+        (("run", "--scenario", "nowhere.toml"), "nowhere.toml: there is no such scenario file"),
+        (("run", "--vehicle", "comms"), "unknown vehicle 'comms'; did you mean 'coms'"),
+        (("run", "--vehicle", "nowhere.toml"), "nowhere.toml: there is no such vehicle file"),
+        (("run", "--option", "reverence=model"), "'reverence'; did you mean 'reference'?"),
+        (("run", "--option", "reference"), "an option is NAME=VALUE, got 'reference'"),
+        ((*LQR, "--agent-option", "grib=1"), "lqr: unknown option 'grib'; did you mean 'grip'"),
+        (
+            (*LQR, "--estimator-option", "q_bta=1"),
+            "unknown option 'q_bta'; did you mean 'q_beta'",
+        ),
+        (("run", "--estimator-option", "q_beta=1"), "--estimator-option needs --estimator"),
+        (("run", "--plot", "drive.txt"), "drive.txt: expected a file that ends in .png or"),
+        (("bench", "--html", "report.json"), "report.json: expected a file that ends in .html"),
+        (("calibrate", "costs.toml"), "costs.toml: expected a file that ends in .json"),
+        (("train", "--env", "YawVison-v0"), "did you mean 'sideslip/YawVision-v0'"),
+        (("run", "--scenario", "gust.txt"), "gust.txt: the file of a scenario ends in .toml or"),
+        (("list", "scenario"), "unknown kind of name 'scenario'; did you mean 'scenarios'"),
+        (("bench", "weather"), "unknown suite 'weather'; known: estimation"),
         (("replay", "nowhere.csv"), "nowhere.csv"),
         (("bench", "--log", "nowhere.csv"), "nowhere.csv"),
     ],

@@ -34,7 +34,7 @@ ARGUMENTS: list[tuple[dict[str, Any], type[Exception], str]] = [
     ({"dtype": torch.int64}, ValueError, "dtype is 'float64' or 'float32', got torch.int64"),
     ({"autoreset_mode": "Later"}, ValueError, "'Later'; known: 'NextStep'"),
     ({"scenario": "slalon"}, ValueError, "unknown scenario 'slalon'"),
-    ({"estimator": "dakf"}, TypeError, "unexpected keyword argument 'estimator'"),
+    ({"estimator": "dakf"}, TypeError, "unknown argument 'estimator'"),
 ]
 
 

@@ -25,7 +25,7 @@ ARGUMENTS: list[tuple[dict[str, Any], type[Exception], str]] = [
     ({"scenario": "slalon"}, ValueError, "unknown scenario 'slalon'"),
     ({"render_mode": "ansi"}, ValueError, "unknown render_mode 'ansi'; known: human, rgb_array"),
     ({"on_bad_action": "shrug"}, ValueError, "on_bad_action is 'raise' or 'fail'"),
-    ({"estimator": "dakf"}, TypeError, "unexpected keyword argument 'estimator'"),
+    ({"estimator": "dakf"}, TypeError, "unknown argument 'estimator'"),
 ]
 
 

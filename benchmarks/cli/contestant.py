@@ -1,0 +1,69 @@
+"""Who drives in `sideslip run`: an agent and its estimator, on an environment that suits both."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+
+from ...agents import make_agent
+from ...estimators.wrappers.arguments import usual_estimator
+from ...estimators.wrappers.estimate import EstimateObservation
+from ..control.build import outputs_for
+from ..harness.drives import quietly
+from .names import check_env
+
+_USUAL = ("sideslip/YawVision-v0", "sideslip/AfsYawFusion-v0")
+
+
+@dataclass(frozen=True)
+class Contestant:
+    """The names of an agent and its estimator (None: without one), and their options.
+
+    trust: whether a policy's zip may be read, which runs code of its maker's.
+    """
+
+    agent: str
+    agent_options: dict[str, Any]
+    estimator: str | None
+    estimator_options: dict[str, Any]
+    trust: bool = False
+
+    def on(self, env_id: str | None, options: dict[str, Any]) -> tuple[gym.Env[Any, Any], Any]:
+        """(the env with the estimator, the agent), on the first of the usual ids that fits.
+
+        options: of the env. Raises ValueError or TypeError for what is unknown or does not fit.
+        """
+        if env_id is not None:
+            check_env(env_id)
+            return self._built(env_id, options)
+        first, *others = _USUAL
+        try:
+            return self._built(first, options)
+        except ValueError:
+            for other in others:
+                try:
+                    return self._built(other, options)
+                except (TypeError, ValueError):
+                    continue
+            raise
+
+    def _built(self, env_id: str, options: dict[str, Any]) -> tuple[gym.Env[Any, Any], Any]:
+        try:
+            env: gym.Env[Any, Any] = gym.make(env_id, **options)
+        except TypeError as error:  # of which Gymnasium makes a longer one
+            raise TypeError(str(error).partition(" was raised from the environment")[0]) from None
+        sensors = env.get_wrapper_attr("slow_sensors")
+        if self.estimator is not None:
+            outputs, own = outputs_for(self.estimator), self.estimator_options
+            env = quietly(EstimateObservation, env, self.estimator, outputs, options=own or None)
+        elif self.estimator_options:
+            raise ValueError("--estimator-option needs --estimator")
+        try:
+            return env, make_agent(self.agent, env, trust=self.trust, **self.agent_options)
+        except ValueError as error:
+            if self.estimator is None and "_hat" in str(error):
+                raise ValueError(
+                    f"{self.agent} works on an estimate: add --estimator, for example "
+                    f"--estimator {usual_estimator(sensors)}"
+                ) from None
+            raise
