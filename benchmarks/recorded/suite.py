@@ -55,6 +55,10 @@ def replay(log: Log, vehicle: Vehicle, **settings: Any) -> Suite:
     suite.verdict = answer(result, "gps" in drives[0].slow and "gps" not in log.slow)
     if how.figures:
         suite.figures = _figures(result, log)
+        if result.squares and suite.figures:
+            (_, bars, text), *suite.figures = suite.figures
+            title = f"Which estimator is closest on a recorded drive? ({log.name})"
+            suite.answers = [(title, bars, f"{suite.verdict.splitlines()[1]} {text}")]
     return suite
 
 

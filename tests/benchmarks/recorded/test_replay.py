@@ -104,7 +104,10 @@ def test_all_estimators_are_scored_tabled_and_drawn(log: Log) -> None:
     numbers = [float(line[1]) for line in table.cells]
     assert numbers == sorted(numbers)
     assert "cannot see" in table.note  # dakf's unobservable direction
-    assert len(suite.figures) == 5
+    ((question, bars, closest),) = suite.answers
+    assert log.name in question and len(bars.data) > 0
+    assert closest.startswith("Closest to the recorded angle: ")
+    assert len(suite.figures) == 4
     for title, figure, text in suite.figures:
         assert title.startswith(log.name)
         assert len(figure.data) > 0
@@ -121,7 +124,7 @@ def test_a_log_without_truth_or_slow_sensors_runs_and_says_what_it_leaves_out(
     assert "no sideslip truth, so nothing is scored" in suite.text
     assert "`course-kf` left out: needs gps" in suite.tables[0].note
     assert "`exact-kf` left out: needs gps or camera" in suite.tables[0].note
-    assert len(suite.figures) == 3
+    assert len(suite.figures) == 3 and suite.answers == []
     with pytest.raises(ValueError, match="corners are scored against sideslip truth"):
         corners(log, PASSENGER_CAR)
 
