@@ -77,6 +77,7 @@ def score(
     factory, "" for none; a filter is scored under "lqr". env_id: the contests of one id; default:
     both on which the matrix is driven. scenarios: names, files or mappings, or one; default: a
     contest or two of every tier. vehicle: a name, file or mapping instead of the contests' cars.
+    episodes: a contest. jobs: processes, None for all processors.
     seeds: instead of the benchmark's, whose baselines are on file. fresh, limit: of `Challenge`,
     whose errors it raises. trust: whether a policy's zip may be read, which may run code.
 

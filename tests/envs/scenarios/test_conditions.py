@@ -81,6 +81,7 @@ def test_gps_packets_arrive_later_by_one_latency_and_keep_their_stamps(
     assert len(latencies) > 8
 
 
+@pytest.mark.compiled
 def test_filters_take_whatever_latency_is_drawn() -> None:
     env = StabilityEnv("fusion", scenario=FULL | {"gps_latency": (0.1, 0.3), "noise": {}})
     estimate = EstimateObservation(env, "exact-kf", outputs=["beta"])

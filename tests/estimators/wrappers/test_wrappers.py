@@ -29,7 +29,7 @@ def still(env: Any) -> Any:
 @pytest.mark.parametrize(
     ("env_id", "name"),
     [
-        (VISION, "bicycle-kf"),
+        pytest.param(VISION, "bicycle-kf", marks=pytest.mark.plain),
         (VISION, "single-rate-kf"),
         (VISION, "multirate-kf"),
         (VISION, "multirate-residual-kf"),
