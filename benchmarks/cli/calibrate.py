@@ -11,6 +11,8 @@ from rich.console import Console
 from rich.table import Table
 
 from ...envs.arguments import check_choice
+from ..harness.engines import PROCESSES, engine
+from .cluster import Address, EngineName
 from .output import check_files, wrote
 
 
@@ -22,6 +24,8 @@ def calibrate_command(
     seeds: Annotated[int, typer.Option(help="Seeds a contest.")] = 64,
     write: Annotated[bool, typer.Option("--write", help="Into the package instead.")] = False,
     jobs: Annotated[int | None, typer.Option("--jobs", "-j", min=1, help="Processes.")] = None,
+    engine_name: EngineName = PROCESSES,
+    address: Address = "",
 ) -> None:
     """Find the cost of the clairvoyant, the ladder's highest rung, in the scored contests.
 
@@ -39,7 +43,8 @@ def calibrate_command(
     asked = [known[name] for name in contest or known]
     console, folder = Console(), Path(f".{path.name}.cases")
     command = shlex.join(["sideslip", *sys.argv[1:]])
-    made = calibrate(asked, folder, seeds, command, jobs, console)
+    with engine(engine_name, address):
+        made = calibrate(asked, folder, seeds, command, jobs, console)
     update(path, made)
     forget(cases_of(asked, folder, seeds))
     table = Table("contest", "none", "clairvoyant", "a plan wins")

@@ -12,9 +12,11 @@ from rich.table import Table
 
 from ... import __version__
 from ...envs.arguments import check_choice
+from ..harness.engines import PROCESSES, engine
 from ..suites import SUITES, Request, run_suites
 from .calibrate import calibrate_command
 from .challenge import Agents, EnvId, Estimators, Fresh, Limit, Scenarios, challenge_of
+from .cluster import Address, EngineName
 from .enjoy import enjoy_command
 from .export import Trust, export_command
 from .names import KINDS, complete
@@ -198,6 +200,8 @@ def bench(
     fresh: Fresh = False,
     limit: Limit = 600.0,
     trust: Trust = False,
+    engine_name: EngineName = PROCESSES,
+    address: Address = "",
 ) -> None:
     """Compare estimators and controllers, and a recorded drive with --log; with --agent and
     --estimator your own beside some of the package's."""
@@ -224,7 +228,8 @@ def bench(
 
         done.append(replay_file(log, vehicle, mapping=mapping))
     request = Request(quick, jobs, console, episodes, keep, clairvoyant, challenge)
-    done += run_suites(names, request)
+    with engine(engine_name, address):
+        done += run_suites(names, request)
     order = [*names, "replay"]
     done.sort(key=lambda suite: order.index(suite.name))
     write_output(console, done, html, json, parquet)

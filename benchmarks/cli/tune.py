@@ -8,7 +8,9 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
+from ..harness.engines import PROCESSES, engine
 from ..harness.results import check_writable
+from .cluster import Address, EngineName
 from .output import check_files, options_of, print_suite, wrote
 
 tune_app = typer.Typer(no_args_is_help=True)
@@ -122,6 +124,8 @@ def tune_controller(
     out: Annotated[Path | None, typer.Option(help="Write the options to this TOML file.")] = None,
     log: Annotated[Path | None, typer.Option(help="A folder for every study's log.")] = None,
     write: Annotated[bool, typer.Option("--write", help="Into the package: both.")] = False,
+    engine_name: EngineName = PROCESSES,
+    address: Address = "",
 ) -> None:
     """Find a contestant's weights, bandwidths, levels and grip over the contests of a class.
 
@@ -142,7 +146,8 @@ def tune_controller(
     for each in kind or KINDS:
         task = controllers.contestant(name, each, tuning_seeds(seeds))
         try:
-            found = controllers.tune(task, trials, storage or STORAGE, seed, jobs, console)
+            with engine(engine_name, address):
+                found = controllers.tune(task, trials, storage or STORAGE, seed, jobs, console)
         except ValueError as error:
             if kind:
                 raise

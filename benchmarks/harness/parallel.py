@@ -1,22 +1,17 @@
 """A benchmark's work as a list of independent cases, run side by side with a progress bar."""
 
-import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from contextvars import ContextVar
 from typing import TypeVar
 
-import joblib
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
+from .engines import completed
+
 Case = TypeVar("Case")
 Result = TypeVar("Result")
-
-
-def cores() -> int:
-    """The processors this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def chunked(seeds: int, size: int) -> list[tuple[int, ...]]:
@@ -47,23 +42,22 @@ def one_bar(console: Console | None) -> Iterator[None]:
 def run_cases(
     function: Callable[[Case], Result],
     cases: Sequence[Case],
-    title: str,
+    title: str = "",
     jobs: int | None = None,
     console: Console | None = None,
 ) -> list[Result]:
     """function(case) for every case, in the order of the cases.
 
-    function: importable by workers. jobs: processes (default: the processors at hand); 1 runs in
-    this process. console: where the progress bar goes, unless inside `one_bar`; None shows none.
+    function: importable by workers. jobs: processes (default: the processors at hand; a cluster has
+    its own); 1 runs in this process. console: where the progress bar goes, unless inside
+    `one_bar`; None shows none.
     """
-    jobs, shared = min(jobs or cores(), len(cases)), _SHARED.get()
+    shared, found = _SHARED.get(), dict[int, Result]()
     with progress(console) if shared is None else nullcontext(shared) as bar:
         for before in bar.task_ids:
             bar.remove_task(before)
         task = bar.add_task(title, total=len(cases))
-        results = []
-        pool = joblib.Parallel(n_jobs=jobs, return_as="generator")
-        for result in pool(joblib.delayed(function)(case) for case in cases):
-            results.append(result)
+        for place, result in completed(function, cases, jobs):
+            found[place] = result
             bar.advance(task)
-    return results
+    return [found[place] for place in range(len(cases))]

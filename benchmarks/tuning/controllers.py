@@ -14,7 +14,6 @@ from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
-import joblib
 import numpy as np
 from rich.console import Console
 
@@ -27,7 +26,7 @@ from ..control.cells import REFERENCE_FILTER, Cell
 from ..control.contests import Contest, candidates, contests
 from ..control.episodes import Chunk, Driven, drive
 from ..control.scores import gains
-from ..harness.parallel import cores
+from ..harness.parallel import run_cases
 from ..harness.results import Suite, Table, write_text
 from .spaces import SLOW, Number, options_of, space
 from .task import STORAGE
@@ -96,7 +95,7 @@ def _nominal(contest: Contest, seeds: tuple[int, ...]) -> Array:
     return driven(contest, NOMINAL, _UNTUNED, seeds).costs
 
 
-def objective(task: Contestant, found: dict[str, float], count: int) -> float:
+def objective(task: Contestant, count: int, found: dict[str, float]) -> float:
     """The mean over contests and the first seeds, infinite where nothing can be designed."""
     options, seeds, logs = task.options(found), task.seeds[:count], []
     for contest in task.contests:
@@ -109,7 +108,7 @@ def objective(task: Contestant, found: dict[str, float], count: int) -> float:
 
 
 def judge(
-    task: Contestant, pool: Any, batch: Sequence[dict[str, float]]
+    task: Contestant, jobs: int | None, batch: Sequence[dict[str, float]]
 ) -> list[tuple[float, int]]:
     """(objective, seeds driven) of each of a batch's trials.
 
@@ -118,7 +117,7 @@ def judge(
     stages = [each for each in STAGES if task.name in SLOW and each < len(task.seeds)]
     judged, going = [(math.inf, 0)] * len(batch), list(range(len(batch)))
     for count in (*stages, len(task.seeds)):
-        values = pool(joblib.delayed(objective)(task, batch[i], count) for i in going)
+        values = run_cases(partial(objective, task, count), [batch[i] for i in going], jobs=jobs)
         for i, value in zip(going, values, strict=True):
             judged[i] = value, count
         going = sorted(going, key=lambda i: judged[i])[: (len(going) + 1) // 2]
@@ -149,8 +148,7 @@ def tune(
     study = open_study(task, storage, "tpe", seed)
     if not study.trials:
         study.enqueue_trial(task.start)
-    with joblib.Parallel(n_jobs=jobs or cores()) as pool:
-        search_on(study, task, trials, partial(judge, task, pool), len(task.seeds), console)
+    search_on(study, task, trials, partial(judge, task, jobs), len(task.seeds), console)
     return log_of(task, study.trials)
 
 

@@ -17,7 +17,7 @@ import joblib
 from rich.console import Console
 
 from ..harness.drives import Drive
-from ..harness.parallel import cores, progress
+from ..harness.parallel import progress, run_cases
 from ..harness.stats import root_mean
 from .task import SAMPLERS, STORAGE, Task, squares
 
@@ -98,13 +98,12 @@ def search(
     with tempfile.TemporaryDirectory() as folder:
         path = str(Path(folder) / "drives")
         joblib.dump(list(drives), path)
-        with joblib.Parallel(n_jobs=min(jobs or cores(), BATCH)) as pool:
 
-            def judge(batch: Sequence[dict[str, float]]) -> list[tuple[float, int]]:
-                values = pool(joblib.delayed(score)(path, task, numbers) for numbers in batch)
-                return [(value, len(drives)) for value in values]
+        def judge(batch: Sequence[dict[str, float]]) -> list[tuple[float, int]]:
+            values = run_cases(functools.partial(score, path, task), batch, jobs=jobs)
+            return [(value, len(drives)) for value in values]
 
-            search_on(study, task, trials, judge, len(drives), console)
+        search_on(study, task, trials, judge, len(drives), console)
     with _storage_errors(study.study_name):
         best = study.best_trial
     if best.value is None or not math.isfinite(best.value):

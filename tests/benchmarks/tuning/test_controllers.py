@@ -42,7 +42,7 @@ def test_a_planted_bad_weight_is_found_and_left(tmp_path: Path) -> None:
     assert log["best"]["objective"] < log["start"] - 0.5
     assert log["best"]["numbers"]["grip"] > 0.1
     best = log["options"]["controller"]
-    assert objective(planted, best, 2) == pytest.approx(log["best"]["objective"], abs=1e-4)
+    assert objective(planted, 2, best) == pytest.approx(log["best"]["objective"], abs=1e-4)
     assert "cost" in controllers.suite_of(planted, log).text
 
 
@@ -52,7 +52,7 @@ def test_the_objective_is_the_mean_log_of_paired_costs() -> None:
     costs = driven(SHORT, "two-dof", nothing | {"controller": {"gain": 3.0}}, SEEDS).costs
     nominal = driven(SHORT, "nominal", nothing, SEEDS).costs
     wanted = np.clip(np.log((costs + 1e-3) / (nominal + 1e-3)), -3.0, 3.0).mean()
-    assert objective(gain, {"gain": 3.0}, 2) == pytest.approx(wanted, rel=1e-12)
+    assert objective(gain, 2, {"gain": 3.0}) == pytest.approx(wanted, rel=1e-12)
 
 
 def test_a_failure_costs_twenty_times_nominal(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -64,14 +64,14 @@ def test_a_failure_costs_twenty_times_nominal(monkeypatch: pytest.MonkeyPatch) -
 
     monkeypatch.setattr(controllers, "driven", fake)
     controllers._nominal.cache_clear()
-    found = objective(task(Number("gain", 1.0, 0.1, 10.0)), {"gain": 1.0}, 2)
+    found = objective(task(Number("gain", 1.0, 0.1, 10.0)), 2, {"gain": 1.0})
     controllers._nominal.cache_clear()
     assert found == pytest.approx(0.5 * (math.log(0.501 / 1.001) + math.log(20.0)))
 
 
 def test_what_cannot_be_designed_is_infinitely_dear(monkeypatch: pytest.MonkeyPatch) -> None:
     bad = task(Number("pole", 1.0, 0.1, 10.0))
-    assert objective(bad, {"pole": -1.0}, 2) == math.inf
+    assert objective(bad, 2, {"pole": -1.0}) == math.inf
 
 
 def test_of_a_slow_contestant_the_worse_half_stops_early(

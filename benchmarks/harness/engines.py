@@ -1,0 +1,87 @@
+"""What runs a list of independent cases: processes of this machine, or an existing Ray cluster.
+
+The same results on any engine and with any number of workers.
+"""
+
+import os
+import socket
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import Any, TypeVar
+
+import joblib
+
+from ...envs.arguments import check_choice
+
+Case = TypeVar("Case")
+Result = TypeVar("Result")
+
+PROCESSES, RAY = ENGINES = ("processes", "ray")
+_CLUSTER: ContextVar[Any] = ContextVar("cluster", default=None)
+
+
+def cores() -> int:
+    """The processors this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@contextmanager
+def engine(name: str = PROCESSES, address: str = "") -> Iterator[None]:
+    """What runs the cases within: of `ENGINES`.
+
+    address: of an existing Ray cluster, "host:port"; "": the one that runs on this machine. Its
+    nodes need this version of sideslip, and a folder for finished cases that all of them see.
+    Raises ValueError for another name, an address without Ray, and a cluster that is not there;
+    ModuleNotFoundError without ray.
+    """
+    check_choice("engine", name, ENGINES)
+    if name == PROCESSES:
+        if address:
+            raise ValueError(f"an address is of a Ray cluster (engine {RAY!r}), got {address!r}")
+        yield
+        return
+    try:
+        import ray
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(
+            "the engine 'ray' needs ray: pip install 'sideslip[scale]'", name=error.name
+        ) from error
+    quiet = {"env_vars": {"SIDESLIP_QUIET": "1", "OPENBLAS_NUM_THREADS": "1"}}
+    try:
+        if address:  # Ray itself asks for minutes, then ends the process
+            host, _, port = address.removeprefix("ray://").rpartition(":")
+            socket.create_connection((host, int(port)), timeout=5.0).close()
+        ray.init(address or "auto", runtime_env=quiet, log_to_driver=False, logging_level="error")
+    except (OSError, ValueError, RuntimeError) as error:
+        where = f"at {address}" if address else "on this machine (`ray start --head`)"
+        raise ValueError(f"there is no Ray cluster {where}: {error}") from None
+    token = _CLUSTER.set(ray)
+    try:
+        yield
+    finally:
+        _CLUSTER.reset(token)
+        ray.shutdown()
+
+
+def completed(
+    function: Callable[[Case], Result], cases: Sequence[Case], jobs: int | None = None
+) -> Iterator[tuple[int, Result]]:
+    """(place, function(case)) of every case as it is done; arguments of `run_cases`."""
+    ray = _CLUSTER.get()
+    if ray is None:
+        jobs = max(min(jobs or cores(), len(cases)), 1)
+        pool = joblib.Parallel(n_jobs=jobs, return_as="generator")
+        yield from enumerate(pool(joblib.delayed(function)(case) for case in cases))
+        return
+    remote = ray.remote(num_cpus=1, max_retries=-1)(_call)  # a dead node's cases run again
+    asked, waiting = ray.put(function), {}
+    for place, case in enumerate(cases):
+        waiting[remote.remote(asked, case)] = place
+    while waiting:
+        (done,), _ = ray.wait(list(waiting), num_returns=1)
+        yield waiting.pop(done), ray.get(done)
+
+
+def _call(function: Callable[[Case], Result], case: Case) -> Result:
+    return function(case)

@@ -1,0 +1,92 @@
+"""The same results on any engine; on a cluster a dead node's running cases run again, no others."""
+
+import os
+import time
+from collections import Counter
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sideslip.benchmarks.estimation import run
+from sideslip.benchmarks.harness.engines import completed, engine
+from sideslip.benchmarks.harness.parallel import run_cases
+
+CASES = [float(k) for k in range(12)]
+
+
+def noted(folder: str, seconds: float, case: float) -> float:
+    """A case that leaves a line for each time it starts and each time it is done."""
+    for what, wait in (("started", seconds), ("done", 0.0)):
+        with open(f"{folder}/{case:.0f}.{what}", "a") as file:
+            file.write(f"{os.getppid()}\n")
+        time.sleep(wait)
+    return case / 3.0
+
+
+def counted(folder: Path, what: str) -> Counter[str]:
+    return Counter({each.stem: len(each.read_text().split()) for each in folder.glob(f"*.{what}")})
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_results_come_in_the_order_of_the_cases(tmp_path: Path, jobs: int) -> None:
+    assert run_cases(partial(noted, str(tmp_path), 0.0), CASES, jobs=jobs) == [
+        case / 3.0 for case in CASES
+    ]
+    assert set(counted(tmp_path, "done").values()) == {1}
+    assert run_cases(abs, [], jobs=jobs) == []
+
+
+def test_an_engine_that_is_none_is_refused() -> None:
+    with pytest.raises(ValueError, match="unknown engine 'rai'"), engine("rai"):
+        pass
+    with pytest.raises(ValueError, match="an address is of a Ray cluster"), engine(address="x:1"):
+        pass
+
+
+@pytest.fixture
+def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """Two nodes of one processor each on this machine."""
+    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    from ray.cluster_utils import Cluster
+
+    memory = {"object_store_memory": 80 * 2**20}
+    made = Cluster(
+        initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False} | memory
+    )
+    yield made, made.add_node(num_cpus=1, **memory)
+    made.shutdown()
+
+
+@pytest.mark.long
+def test_a_node_that_dies_loses_nothing(cluster: Any, tmp_path: Path) -> None:
+    nodes, second = cluster
+    with engine("ray", nodes.address):
+        found: list[float] = []
+        for _, result in completed(partial(noted, str(tmp_path), 1.0), CASES):
+            found.append(result)
+            if len(found) == 4:
+                before = counted(tmp_path, "done")
+                nodes.remove_node(second, allow_graceful=False)
+    assert sorted(found) == [case / 3.0 for case in CASES]
+    starts = counted(tmp_path, "started")
+    assert all(starts[case] == 1 for case in before), "what was done ran again"
+    assert max(starts.values()) <= 2 and sum(starts.values()) <= len(CASES) + 2
+
+
+@pytest.mark.long
+def test_a_suite_has_the_same_rows_on_a_cluster(cluster: Any) -> None:
+    nodes, _ = cluster
+    alone = run(1, jobs=2)
+    with engine("ray", nodes.address):
+        assert run(1).rows == alone.rows
+
+
+def test_a_cluster_that_is_not_there_is_named() -> None:
+    with (
+        pytest.raises(ValueError, match=r"no Ray cluster at 127\.0\.0\.1:1"),
+        engine("ray", "127.0.0.1:1"),
+    ):
+        pass
