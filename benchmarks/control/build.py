@@ -108,7 +108,11 @@ class Checked:
         self.agent, self.shape = agent, (rows, width)
 
     def predict(
-        self, observation: Any, state: Any, episode_start: Any, deterministic: bool = True
+        self,
+        observation: Any,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = True,
     ) -> tuple[Any, Any]:
         """What the agent's returns."""
         found = self.agent.predict(observation, state, episode_start, deterministic=deterministic)

@@ -79,7 +79,7 @@ def test_of_a_slow_contestant_the_worse_half_stops_early(
 ) -> None:
     asked: list[int] = []
 
-    def fake(task: Contestant, found: dict[str, float], count: int) -> float:
+    def fake(task: Contestant, count: int, found: dict[str, float]) -> float:
         asked.append(count)
         return abs(math.log(found["grip"] / 0.5))
 
@@ -98,7 +98,7 @@ def test_of_a_slow_contestant_the_worse_half_stops_early(
 def test_a_stopped_search_goes_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     calls: list[float] = []
 
-    def fake(task: Contestant, found: dict[str, float], count: int) -> float:
+    def fake(task: Contestant, count: int, found: dict[str, float]) -> float:
         if len(calls) == 11:
             raise KeyboardInterrupt
         calls.append(found["gain"])

@@ -32,7 +32,6 @@ def test_the_environment_keeps_gymnasiums_contract(model: str) -> None:
 
 
 def test_an_outside_plant_is_drawn_without_tyre_forces() -> None:
-    pytest.importorskip("pygame")
     from sideslip.envs.rendering.scene import scene_of
 
     env = outside("drift", scenario=STEP | {"duration": 0.3}, render_mode="rgb_array")
