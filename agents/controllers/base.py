@@ -71,6 +71,11 @@ class Controller(ABC):
     vehicle: Vehicle
     """The car that the controller is designed for."""
 
+    def __repr__(self) -> str:
+        grip = "" if self.grip is None else f", grip {self.grip:g}"
+        reads = ", ".join(self.needs) or "nothing"
+        return f"<{type(self).__name__} for {self.vehicle.name}{grip}; reads {reads}>"
+
     @cached_property
     def _car(self) -> Car:
         return car_of(self.vehicle)

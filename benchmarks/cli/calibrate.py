@@ -41,7 +41,7 @@ def calibrate_command(
     for name in contest or []:
         check_choice("contest", name, known)
     asked = [known[name] for name in contest or known]
-    console, folder = Console(), Path(f".{path.name}.cases")
+    console, folder = Console(), Path(f".{path.name}.cases").absolute()
     command = shlex.join(["sideslip", *sys.argv[1:]])
     with engine(engine_name, address):
         made = calibrate(asked, folder, seeds, command, jobs, console)

@@ -60,7 +60,8 @@ def measure(
             Chunk(cell, tuple(mine[first : first + CHUNK]), keep=first == 0)
             for first in range(0, len(mine), CHUNK)
         ]
-    driven = run_cases(by or CachedDrive(keep), chunks, title, jobs, console)
+    cached = CachedDrive(keep and keep.absolute())  # a worker of a cluster runs elsewhere
+    driven = run_cases(by or cached, chunks, title, jobs, console)
     parts: dict[Cell, list[Driven]] = {}
     for chunk, each in zip(chunks, driven, strict=True):
         parts.setdefault(chunk.cell, []).append(each)

@@ -5,6 +5,7 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, get_origin
 
@@ -17,6 +18,7 @@ from .stats import Estimate
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
+    from pandas import DataFrame
 
 Made = TypeVar("Made", bound="DataclassInstance")
 VERDICTS = ("", "reproduced", "partly", "not reproduced", "report only")
@@ -72,6 +74,17 @@ class Table:
     note: str = ""
     keyed: bool = True
 
+    def to_pandas(self) -> "DataFrame":
+        """The texts as a pandas table (needs the extra `report`)."""
+        from pandas import DataFrame
+
+        return DataFrame(self.cells, columns=list(self.header))
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows."""
+        table = self.to_pandas().to_html(index=False, border=0)
+        return f"<b>{escape(self.title)}</b>{table}<p>{escape(self.note)}</p>"
+
 
 @dataclass(frozen=True)
 class ShareMap:
@@ -107,6 +120,19 @@ class Suite:
     files: list[tuple[str, str, str]] = field(default_factory=list)
     verdict: str = ""
     answers: list[tuple[str, Any, str]] = field(default_factory=list)
+
+    def to_pandas(self) -> "DataFrame":
+        """The rows as a pandas table (needs the extra `report`)."""
+        from pandas import DataFrame
+
+        return DataFrame([asdict(row) for row in self.rows])
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows: the verdict and the first table."""
+        lines = "".join(f"<p>{escape(line)}</p>" for line in self.verdict.splitlines())
+        return f"<h3>{escape(self.title)}</h3>{lines}" + "".join(
+            table._repr_html_() for table in self.tables[:1]
+        )
 
 
 def check_writable(*paths: Path | None) -> None:

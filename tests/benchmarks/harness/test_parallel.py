@@ -1,6 +1,8 @@
 """The same results on any engine; on a cluster a dead node's running cases run again, no others."""
 
 import os
+import subprocess
+import sys
 import time
 from collections import Counter
 from collections.abc import Iterator
@@ -74,6 +76,34 @@ def test_a_node_that_dies_loses_nothing(cluster: Any, tmp_path: Path) -> None:
     starts = counted(tmp_path, "started")
     assert all(starts[case] == 1 for case in before), "what was done ran again"
     assert max(starts.values()) <= 2 and sum(starts.values()) <= len(CASES) + 2
+
+
+DRIVER = """
+import sys
+from pathlib import Path
+from sideslip.benchmarks.control.cells import Cell
+from sideslip.benchmarks.control.contests import contests
+from sideslip.benchmarks.control.run import measure
+from sideslip.benchmarks.harness.engines import engine
+
+with engine("ray", sys.argv[1]):
+    cells = [Cell(contest, "", "none") for contest in contests()[:6]]
+    measure(cells, range(500), keep=Path(sys.argv[2]))
+"""
+
+
+@pytest.mark.long
+def test_a_driver_that_is_killed_goes_on(cluster: Any, tmp_path: Path) -> None:
+    nodes, _ = cluster
+    command = [sys.executable, "-c", DRIVER, nodes.address, str(tmp_path)]
+    with subprocess.Popen(command) as driver:
+        while len(done := list(tmp_path.glob("*.npz"))) < 3:
+            time.sleep(0.02)
+        driver.kill()
+    before = {path: path.stat().st_mtime_ns for path in done}
+    subprocess.run(command, check=True)
+    assert len(list(tmp_path.glob("*.npz"))) == 12
+    assert all(path.stat().st_mtime_ns == when for path, when in before.items())
 
 
 @pytest.mark.long
