@@ -17,10 +17,12 @@ from ..agents.learned.files import Policy, load_policy, save_policy
 from .control.cells import Cell
 from .control.contests import Contest
 from .control.episodes import Array, Chunk, Driven, drive
+from .control.scores import FLOOR
 from .control.seeds import salted_seeds
 from .control.tables import spec_of
 from .harness.results import Row, Suite, Table
-from .harness.stats import interval, won
+from .harness.stats import geometric_mean, interval, won
+from .harness.verdict import percent, verdict
 
 CLASSICAL, FILTER = "lqr", "exact-kf"
 
@@ -133,7 +135,20 @@ def suite_of(found: Enjoyed) -> Suite:
         (who,): each.series for who, each in found.driven.items() if each.series is not None
     }
     suite.explorers.append(over_time("The first seed, side by side", (), series, name))
+    suite.verdict = _verdict(found)
     return suite
+
+
+def _verdict(found: Enjoyed) -> str:
+    """What the policy costs over each of the others, and how often it fails."""
+    name, others = found.policy.name, [each for each in found.driven if each != found.policy.name]
+    fails = 100.0 * np.mean(found.driven[name]["failure"] != 0.0)
+    lines = []
+    for other in others:
+        logs = np.log((found.costs(name) + FLOOR) / (found.costs(other) + FLOOR))
+        lines.append(f"{name} costs {percent(geometric_mean(logs))} of {other}, seed by seed.")
+    limits = f"Not said: other cars, scenarios and seeds than these {len(found.seeds)}."
+    return verdict(*lines, f"It fails in {fails:.0f} % of the episodes. {limits}")
 
 
 def _table(found: Enjoyed) -> Table:

@@ -17,7 +17,7 @@ from .episodes import Array, Driven
 
 NOTHING = 0.05
 """A mean gap below which there is nothing to win."""
-_FLOOR, _CLIP = 0.001, 3.0
+FLOOR, _CLIP = 0.001, 3.0
 _FAILED = math.log(1.0 / 20.0)
 
 
@@ -30,7 +30,7 @@ def gains(nominal: Array, driven: Driven) -> Array:
     """(n,) r of the first n episodes; nominal: (n,) costs of the same seeds."""
     n = len(nominal)
     with np.errstate(invalid="ignore"):
-        r = np.log((nominal + _FLOOR) / (driven.costs[:n] + _FLOOR))
+        r = np.log((nominal + FLOOR) / (driven.costs[:n] + FLOOR))
     return np.where(survived(driven)[:n], np.clip(r, -_CLIP, _CLIP), _FAILED)
 
 

@@ -107,7 +107,7 @@ def test_a_state_that_is_known_exactly_stays_known() -> None:
         ("double-layer", {}, 1.0, ValueError, "double-layer: a smoother needs one layer"),
         ("single-rate-kf", {}, 1.0, ValueError, "samples used when they come"),
         ("multirate-kf", {"delay": "lag"}, 1.0, ValueError, "no states that lag"),
-        ("lob", {}, 1.0, TypeError, "no option 'gains'"),
+        ("lob", {}, 1.0, TypeError, "unknown option 'gains'"),
         ("exact-kf", {}, 0.0, ValueError, "lag is in s and positive, got 0.0"),
         ("exact-kf", {}, float("nan"), ValueError, "lag is in s and positive, got nan"),
         ("exact-kf", {}, 0.0105, ValueError, "the lag of 0.0105 s is no whole number of ticks"),

@@ -179,7 +179,7 @@ def test_snapshots_and_copies_continue_bit_for_bit() -> None:
         ({"speed": [1.0]}, ValueError, "speed: one or a list of 2, got 1"),
         ({"sensors": {"gps": GPS}, "slow": "camera"}, ValueError, "needs the slow sensor camera"),
         ({"sensors": [{"camera": CAMERA}, {"gps": GPS}]}, ValueError, "same states, row 0 .*row 1"),
-        ({"q": 1.0}, TypeError, "no option 'q'"),
+        ({"q": 1.0}, TypeError, "unknown option 'q'"),
     ],
 )
 def test_wrong_arguments(changes: Any, error: Any, message: Any) -> None:

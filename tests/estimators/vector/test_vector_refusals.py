@@ -76,7 +76,7 @@ def test_worker_processes_are_out_of_reach() -> None:
     [
         ({"estimator": "dakf"}, ValueError, "dakf needs the slow sensor gps; there is: camera"),
         ({"estimator": "bicycle-kf", "outputs": ["psi"]}, ValueError, "no state 'psi'"),
-        ({"estimator": "multirate-kf", "options": {"q": 1}}, TypeError, "no option 'q'"),
+        ({"estimator": "multirate-kf", "options": {"q": 1}}, TypeError, "unknown option 'q'"),
     ],
 )
 def test_wrong_arguments(options: Any, error: Any, message: Any) -> None:
