@@ -111,7 +111,8 @@ def test_a_suite_has_the_same_rows_on_a_cluster(cluster: Any) -> None:
     nodes, _ = cluster
     alone = run(1, jobs=2)
     with engine("ray", nodes.address):
-        assert run(1).rows == alone.rows
+        there = run(1)
+    assert list(map(repr, there.rows)) == list(map(repr, alone.rows))  # NaN is no NaN
 
 
 def test_a_cluster_that_is_not_there_is_named() -> None:
