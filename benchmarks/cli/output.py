@@ -152,7 +152,7 @@ _NARROW = 80  # columns
 
 
 def print_suite(console: Console, suite: Suite) -> None:
-    """The title, the verdict, the text, and each table with its note."""
+    """The title, the verdict, the text, and each table with its note, but for details."""
     if len(suite.title) + 4 <= console.width:
         console.rule(f"[bold]{escape(suite.title)}")
     else:  # a rule would cut it
@@ -161,10 +161,15 @@ def print_suite(console: Console, suite: Suite) -> None:
         console.print(f"[bold]{escape(suite.verdict)}[/]\n", highlight=False)
     console.print(f"{escape(suite.text)}\n", highlight=False)
     for table in suite.tables:
+        if table.detail:
+            continue
         for part in _parts(table, console.width):
             console.print(_rich(part, console.width))
         if table.note:
             console.print(f"[dim]{escape(table.note)}[/]\n", highlight=False)
+    if more := [table.title for table in suite.tables if table.detail]:
+        count = f"{len(more)} tables more are" if len(more) > 1 else "1 table more is"
+        console.print(f"{count} in the report (--html).\n", highlight=False)
 
 
 def _parts(table: Table, width: int) -> list[Table]:

@@ -223,7 +223,8 @@ def contest_table(title: str, found: Sequence[Standing], contests: Sequence[Cont
     for each in found:
         cells.append([each.label, *(_cell_text(each, contest) for contest in contests)])
     note = "Percent of nominal's cost, the paired geometric mean; in brackets failures in percent."
-    return Table(title, ("controller and estimator", *(c.name for c in contests)), cells, note)
+    header = ("controller and estimator", *(c.name for c in contests))
+    return Table(title, header, cells, note, detail=True)
 
 
 def _cell_text(standing: Standing, contest: Contest) -> str:
@@ -259,4 +260,4 @@ def motion_table(title: str, found: Sequence[Standing]) -> Table:
         "two decisions. saturated: of the decisions. The last column: a decision's time. What the "
         "tyres dissipate is not measured: no signal of the car has their forces."
     )
-    return Table(title, header, cells, note)
+    return Table(title, header, cells, note, detail=True)

@@ -66,6 +66,7 @@ class Table:
     """A table for the screen and the report: texts, a header, and what each column means.
 
     keyed: whether the first column names estimators or controllers, which have their colour.
+    detail: whether it stands in the report alone, too long for a screen.
     """
 
     title: str
@@ -73,6 +74,7 @@ class Table:
     cells: Sequence[Sequence[str]]
     note: str = ""
     keyed: bool = True
+    detail: bool = False
 
     def to_pandas(self) -> "DataFrame":
         """The texts as a pandas table (needs the extra `report`)."""

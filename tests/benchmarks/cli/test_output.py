@@ -41,6 +41,16 @@ def test_long_texts_wrap_and_are_no_part_of_their_own() -> None:
     assert written.getvalue().count("grows") == 9
 
 
+def test_details_are_in_the_report_alone() -> None:
+    suite = Suite("long", "Details", "")
+    suite.tables += [Table("Main", ("who", "cost"), [["a", "1"]])]
+    suite.tables += [Table("Contests", ("who", "cost"), [["b", "2"]], detail=True)]
+    written = io.StringIO()
+    print_suite(Console(file=written, width=80), suite)
+    assert "Main" in written.getvalue() and "Contests" not in written.getvalue()
+    assert "1 table more is in the report" in written.getvalue()
+
+
 LONG = "Fig. 9 (twin): multirate-residual-kf/constant-delay-kf"
 
 
