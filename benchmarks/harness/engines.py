@@ -18,6 +18,8 @@ Case = TypeVar("Case")
 Result = TypeVar("Result")
 
 PROCESSES, RAY = ENGINES = ("processes", "ray")
+RETRIES = 3
+"""Deaths of its worker or node that a case outlives on a cluster; a fourth may be its own doing."""
 _CLUSTER: ContextVar[Any] = ContextVar("cluster", default=None)
 
 
@@ -70,11 +72,11 @@ def completed(
     """(place, function(case)) of every case as it is done; arguments of `run_cases`."""
     ray = _CLUSTER.get()
     if ray is None:
-        jobs = max(min(jobs or cores(), len(cases)), 1)
-        pool = joblib.Parallel(n_jobs=jobs, return_as="generator")
+        # the number asked for is left alone: another one would end the processes of the last call
+        pool = joblib.Parallel(jobs or max(min(cores(), len(cases)), 1), return_as="generator")
         yield from enumerate(pool(joblib.delayed(function)(case) for case in cases))
         return
-    remote = ray.remote(num_cpus=1, max_retries=-1)(_call)  # a dead node's cases run again
+    remote = ray.remote(num_cpus=1, max_retries=RETRIES)(_call)  # a dead node's cases run again
     asked, waiting = ray.put(function), {}
     for place, case in enumerate(cases):
         waiting[remote.remote(asked, case)] = place

@@ -26,6 +26,7 @@ from ..control.cells import REFERENCE_FILTER, Cell
 from ..control.contests import Contest, candidates, contests
 from ..control.episodes import Chunk, Driven, drive
 from ..control.scores import gains
+from ..harness.engines import cores
 from ..harness.parallel import run_cases
 from ..harness.results import Suite, Table, write_text
 from .spaces import SLOW, Number, options_of, space
@@ -108,7 +109,7 @@ def objective(task: Contestant, count: int, found: dict[str, float]) -> float:
 
 
 def judge(
-    task: Contestant, jobs: int | None, batch: Sequence[dict[str, float]]
+    task: Contestant, jobs: int, batch: Sequence[dict[str, float]]
 ) -> list[tuple[float, int]]:
     """(objective, seeds driven) of each of a batch's trials.
 
@@ -148,7 +149,7 @@ def tune(
     study = open_study(task, storage, "tpe", seed)
     if not study.trials:
         study.enqueue_trial(task.start)
-    search_on(study, task, trials, partial(judge, task, jobs), len(task.seeds), console)
+    search_on(study, task, trials, partial(judge, task, jobs or cores()), len(task.seeds), console)
     return log_of(task, study.trials)
 
 

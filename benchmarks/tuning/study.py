@@ -17,6 +17,7 @@ import joblib
 from rich.console import Console
 
 from ..harness.drives import Drive
+from ..harness.engines import cores
 from ..harness.parallel import progress, run_cases
 from ..harness.stats import root_mean
 from .task import SAMPLERS, STORAGE, Task, squares
@@ -98,9 +99,10 @@ def search(
     with tempfile.TemporaryDirectory() as folder:
         path = str(Path(folder) / "drives")
         joblib.dump(list(drives), path)
+        many = min(jobs or cores(), BATCH)
 
         def judge(batch: Sequence[dict[str, float]]) -> list[tuple[float, int]]:
-            values = run_cases(functools.partial(score, path, task), batch, jobs=jobs)
+            values = run_cases(functools.partial(score, path, task), batch, jobs=many)
             return [(value, len(drives)) for value in values]
 
         search_on(study, task, trials, judge, len(drives), console)

@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 from sideslip.benchmarks.estimation import run
+from sideslip.benchmarks.harness import engines
 from sideslip.benchmarks.harness.engines import completed, engine
 from sideslip.benchmarks.harness.parallel import run_cases
 
@@ -76,6 +77,17 @@ def test_a_node_that_dies_loses_nothing(cluster: Any, tmp_path: Path) -> None:
     starts = counted(tmp_path, "started")
     assert all(starts[case] == 1 for case in before), "what was done ran again"
     assert max(starts.values()) <= 2 and sum(starts.values()) <= len(CASES) + 2
+
+
+@pytest.mark.long
+def test_a_case_that_ends_its_process_ends_the_work(
+    cluster: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from ray.exceptions import WorkerCrashedError
+
+    monkeypatch.setattr(engines, "RETRIES", 1)
+    with pytest.raises(WorkerCrashedError), engine("ray", cluster[0].address):
+        run_cases(os._exit, [1])
 
 
 DRIVER = """
