@@ -1,1 +1,1 @@
-"""Recorded drives: logs read from CSV and Parquet files into the record of a drive."""
+"""Recorded drives from files: tables into the record of a drive, receivers' NMEA into epochs."""

@@ -1,0 +1,225 @@
+"""NMEA 0183, what satellite receivers send: bytes as they come, decoded into epochs.
+
+    decoder = Decoder()
+    for chunk in open_source("serial:/dev/ttyUSB0:4800"):
+        for epoch in decoder.feed(chunk):
+            ...
+
+Degrees from north, knots and times of day live here and in `sentences` alone.
+"""
+
+import math
+from collections import Counter
+from dataclasses import dataclass, field
+from datetime import date
+from typing import Any, NamedTuple
+
+from ..sensors.gps import COURSE_SPEED
+from .sentences import DECODED, Sentence, read_sentence, signed
+
+LONGEST = 1024  # bytes of a sentence; the standard has 82, some vendors' are longer
+KNOT = 1852.0 / 3600.0  # m/s
+DAY = 86_400.0  # s
+_EPOCH = date(1970, 1, 1).toordinal()
+_NOT_MEASURED = (0, 6, 7)  # GGA's quality: no fix, dead reckoning, typed in
+
+
+class Epoch(NamedTuple):
+    """What a receiver measured at one time; NaN is unknown."""
+
+    t: float
+    """UTC in s since 1970, since the first epoch's midnight where no date was sent. Leap seconds
+    that were sent are counted: differences are elapsed time."""
+    latitude: float  # degrees north, NaN without a fix
+    longitude: float  # degrees east, NaN without a fix
+    course: float  # rad counter-clockwise from east, in [-pi, pi]
+    speed: float  # m/s
+    hdop: float
+    satellites: int  # used
+    in_view: int  # satellites, of the newest GSV of each system
+    quality: int  # of the course: 0 without a fix or below COURSE_SPEED, else 1
+    age: float  # s since the newest fix, by t: 0 with a fix, NaN before the first
+
+    @property
+    def fixed(self) -> bool:
+        """Whether there is a position."""
+        return math.isfinite(self.latitude)
+
+
+@dataclass
+class Counts:
+    """What came in, and what was wrong with it.
+
+    sentences: by type, with a right checksum; those outside `DECODED` were skipped. emptied: bad
+    fields, by type and name. garbage: bytes outside sentences, line ends apart.
+    """
+
+    received: int = 0
+    garbage: int = 0
+    sentences: Counter[str] = field(default_factory=Counter)
+    bad_checksum: int = 0
+    truncated: int = 0
+    overlong: int = 0
+    emptied: Counter[str] = field(default_factory=Counter)
+    epochs: int = 0
+    without_fix: int = 0
+    without_time: int = 0
+    backward: int = 0
+    repeated: int = 0
+
+    def rows(self) -> list[tuple[str, int]]:
+        """(what, how many), for a table."""
+        return [
+            ("bytes", self.received),
+            *((f"sentences {name}", n) for name, n in sorted(self.sentences.items())),
+            ("sentences with a bad checksum", self.bad_checksum),
+            ("sentences cut short", self.truncated),
+            ("sentences overlong", self.overlong),
+            ("sentences repeated in an epoch", self.repeated),
+            ("bytes outside sentences", self.garbage),
+            *((f"field {name} emptied", n) for name, n in sorted(self.emptied.items())),
+            ("epochs", self.epochs),
+            ("epochs without a fix", self.without_fix),
+            ("epochs without a time", self.without_time),
+            ("steps of time backward", self.backward),
+        ]
+
+
+class Decoder:
+    """Decodes a stream of bytes, cut anywhere, into epochs; never raises on what it is fed.
+
+    An epoch is handed out with the sentence that completes it: motion (RMC or VTG) and GGA, and GSA
+    where GGA has no HDOP; an incomplete one when the next begins. At most `LONGEST` bytes and one
+    epoch are held.
+    """
+
+    def __init__(self) -> None:
+        self.counts = Counts()
+        self._tail = b""  # a sentence that has not ended, from its "$"
+        self._parts: dict[str, dict[str, Any]] = {}  # of the epoch, by type
+        self._time: float | None = None  # of the epoch, s of the day
+        self._sent = False
+        self._date = (0, math.nan)  # the newest day known, and the time of that day
+        self._last, self._fix = math.nan, math.nan  # t of the newest epoch and the newest fix
+        self._in_leap, self._leaps = False, 0
+        self._view: dict[str, int] = {}  # satellites, by system
+
+    def feed(self, chunk: bytes) -> list[Epoch]:
+        """The epochs that these bytes complete."""
+        self.counts.received += len(chunk)
+        outside, *pieces = (self._tail + chunk).split(b"$")
+        self._tail = b""
+        self._skip(outside)
+        found: list[Epoch] = []
+        for i, piece in enumerate(pieces):
+            text = piece.replace(b"\r", b"\n").split(b"\n", 1)[0]
+            ended = len(text) < len(piece)
+            if len(text) > LONGEST:
+                self.counts.overlong += 1
+                self._skip(piece)
+            elif ended:
+                self._skip(piece[len(text) :])
+                found += self._sentence(text)
+            elif i < len(pieces) - 1:  # the next one begins in its line
+                self.counts.truncated += 1
+            else:
+                self._tail = b"$" + piece
+        return found
+
+    def finish(self) -> list[Epoch]:
+        """The last epoch, where the stream ended without completing it or its line."""
+        tail, self._tail = self._tail, b""
+        return (self._sentence(tail[1:]) if tail else []) + self._close()
+
+    def _skip(self, outside: bytes) -> None:
+        self.counts.garbage += len(outside) - sum(map(outside.count, (b"\r", b"\n")))
+
+    def _sentence(self, text: bytes) -> list[Epoch]:
+        try:
+            sentence = read_sentence(text)
+        except ValueError:
+            self.counts.truncated += 1
+            return []
+        if sentence is None:
+            self.counts.bad_checksum += 1
+            return []
+        self.counts.sentences[sentence.kind] += 1
+        self.counts.emptied.update(f"{sentence.kind} {name}" for name in sentence.bad)
+        return self._take(sentence)
+
+    def _take(self, sentence: Sentence) -> list[Epoch]:
+        """Add a sentence to its epoch; those without a time belong to the one at hand."""
+        _, kind, values, _ = sentence
+        if kind not in DECODED:
+            return []
+        if kind == "GSV":
+            self._view[sentence.talker] = values.get("numSV", 0)
+            return []
+        done: list[Epoch] = []
+        time = values.get("time")
+        if kind in ("RMC", "GGA"):
+            other = None not in (time, self._time) and time != self._time
+            if kind in self._parts and time is not None and time == self._time:
+                self.counts.repeated += 1
+                return []
+            if other or kind in self._parts:
+                done = self._close()
+        elif kind in self._parts and self._sent:
+            self._close()
+        self._parts[kind] = values
+        self._time = self._time if time is None else time
+        if time is not None and "date" in values:
+            self._date = values["date"].toordinal() - _EPOCH, time
+        has = self._parts
+        motion = "RMC" in has or "VTG" in has
+        if motion and "GGA" in has and ("HDOP" in has["GGA"] or "GSA" in has) and not self._sent:
+            done.append(self._epoch())
+        return done
+
+    def _close(self) -> list[Epoch]:
+        """End the epoch at hand: itself, if it was not handed out and is one."""
+        left = not self._sent and not self._parts.keys().isdisjoint(("RMC", "GGA"))
+        done = [self._epoch()] if left else []
+        self._parts, self._time, self._sent = {}, None, False
+        return done
+
+    def _epoch(self) -> Epoch:
+        self._sent = True
+        t = math.nan if self._time is None else self._since_1970(self._time)
+        rmc, gga, gsa, vtg = (self._parts.get(kind, {}) for kind in ("RMC", "GGA", "GSA", "VTG"))
+        both = vtg | rmc | gga
+        flags = [rmc["status"] == "A"] if "status" in rmc else []
+        flags += [gga["quality"] not in _NOT_MEASURED] if "quality" in gga else []
+        latitude, longitude = signed(both, "lat", "NS", "S"), signed(both, "lon", "EW", "W")
+        fixed = bool(flags) and all(flags) and math.isfinite(latitude + longitude)
+        knots = both.get("spd", both.get("sogn", both.get("sogk", math.nan) / 1.852))
+        speed = KNOT * knots if fixed else math.nan
+        north = both.get("cog", both.get("cogt", math.nan)) if fixed else math.nan
+        hdop = gga.get("HDOP", gsa.get("HDOP", 0.0))
+        self._fix = t if fixed else self._fix
+        self.counts.epochs += 1
+        self.counts.without_fix += not fixed
+        self.counts.without_time += math.isnan(t)
+        return Epoch(
+            t,
+            latitude if fixed else math.nan,
+            longitude if fixed else math.nan,
+            math.radians(math.remainder(90.0 - north, 360.0)),
+            speed,
+            hdop if hdop > 0.0 else math.nan,
+            gga.get("numSV", gsa.get("numSV", 0)),
+            sum(self._view.values()),
+            int(speed >= COURSE_SPEED and math.isfinite(north)),
+            t - self._fix,
+        )
+
+    def _since_1970(self, time: float) -> float:
+        day, at = self._date
+        day += (time < at - DAY / 2) - (time > at + DAY / 2)  # midnight, without a date
+        self._date = day, time
+        self._leaps += self._in_leap and time < DAY
+        self._in_leap = time >= DAY
+        t = day * DAY + time + self._leaps
+        self.counts.backward += t < self._last
+        self._last = t
+        return t

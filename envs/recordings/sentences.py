@@ -1,0 +1,114 @@
+"""NMEA 0183 sentences: bytes between "$" and the line's end, checked, and their fields as values.
+
+The forms of the fields and their conversion are pynmeagps's (needs the extra `wires`). Its parser
+of whole sentences is not used: it loses a sentence for one bad field ("0NaN" of a receiver in a
+tunnel), while here that field alone is left out.
+"""
+
+import math
+import re
+from collections.abc import Iterator
+from functools import cache
+from typing import Any, NamedTuple
+
+try:
+    from pynmeagps import NMEAMessage, calc_checksum, get_parts
+    from pynmeagps.exceptions import NMEAMessageError
+    from pynmeagps.nmeatypes_core import NMEA_TALKERS
+    from pynmeagps.nmeatypes_get import NMEA_PAYLOADS_GET
+except ModuleNotFoundError as error:
+    raise ModuleNotFoundError(
+        "decoding NMEA needs pynmeagps: pip install 'sideslip[wires]'", name=error.name
+    ) from None
+
+DECODED = ("RMC", "VTG", "GGA", "GSA", "GSV")
+VENDOR, OTHER = "of vendors", "other"
+_SKIPPED = ("GLL",)
+_RANGES = {
+    "lat": (0.0, 90.0), "lon": (0.0, 180.0), "cog": (0.0, 360.0), "cogt": (0.0, 360.0),
+    "spd": (0.0, 1e4), "sogn": (0.0, 1e4), "sogk": (0.0, 1e4), "HDOP": (0.0, 1e4),
+    "numSV": (0, 999), "quality": (0, 9),
+}  # fmt: skip
+_ANY = (-1e12, 1e12)
+_TIME = re.compile(r"(\d\d)(\d\d)(\d\d(?:\.\d*)?)", re.ASCII)
+
+
+class Sentence(NamedTuple):
+    """A sentence with a right checksum."""
+
+    talker: str
+    """The system: GP, GL, GN, ..."""
+    kind: str
+    """One of `DECODED`, GLL, `VENDOR` or `OTHER`."""
+    values: dict[str, Any]
+    """The fields that hold something, by pynmeagps's names; empty for a kind not in `DECODED`."""
+    bad: list[str]
+    """The names of the fields that hold no value of theirs."""
+
+
+def read_sentence(text: bytes) -> Sentence | None:
+    """The sentence; None for a wrong checksum. Raises ValueError for one without a checksum."""
+    try:
+        content, talker, kind, fields, checksum = get_parts(text)
+    except NMEAMessageError:
+        raise ValueError("the sentence is cut short or no text") from None
+    if calc_checksum(content) != checksum.strip().upper():
+        return None
+    if talker == "P" or kind not in (*DECODED, *_SKIPPED):
+        return Sentence("", VENDOR if talker == "P" else OTHER, {}, [])
+    talker = talker if talker in NMEA_TALKERS else ""
+    if kind in _SKIPPED:
+        return Sentence(talker, kind, {}, [])
+    if kind == "GSV":  # a number of the signal may follow the satellites
+        fields = fields[: 3 + (len(fields) - 3) // 4 * 4]
+    used = {"numSV": sum(map(bool, fields[2:14]))} if kind == "GSA" else {}
+    found = Sentence(talker, kind, used, [])
+    for (name, form), field in zip(_forms(kind), fields, strict=False):
+        if field:
+            value = _value(name, form, field)
+            if value is None:
+                found.bad.append(name)
+            else:
+                found.values[name] = value
+    return found
+
+
+def signed(values: dict[str, Any], name: str, side: str, negative: str) -> float:
+    """Degrees of "lat" or "lon" with the sign of their side; NaN where either is missing."""
+    if name not in values or side not in values:
+        return math.nan
+    return float(-values[name] if values[side] == negative else values[name])
+
+
+@cache
+def _forms(kind: str) -> tuple[tuple[str, str], ...]:
+    """(name, form) of each field of a kind, groups written out."""
+
+    def each(table: dict[str, Any]) -> Iterator[tuple[str, str]]:
+        for name, form in table.items():
+            if isinstance(form, tuple):  # (count or "None", fields): GSV has up to 4 satellites
+                yield from tuple(form[1].items()) * (form[0] if isinstance(form[0], int) else 4)
+            else:
+                yield name, form
+
+    return tuple(each(NMEA_PAYLOADS_GET[kind]))
+
+
+def _value(name: str, form: str, text: str) -> Any:
+    """A field's value; None where the text is none."""
+    try:
+        value = _seconds(text) if name == "time" else NMEAMessage.str2val(text, form)
+    except ValueError:
+        return None
+    low, high = _RANGES.get(name, _ANY)
+    bad = value == "" or (isinstance(value, int | float) and not low <= value <= high)
+    return None if bad else value
+
+
+def _seconds(text: str) -> float:
+    """s of the day of hhmmss.ss; 23:59:60 is a leap second, which pynmeagps refuses."""
+    match = _TIME.fullmatch(text)
+    hour, minute, second = map(float, match.groups()) if match else (24.0, 0.0, 0.0)
+    if not (hour < 24.0 and minute < 60.0 and second < 61.0):
+        raise ValueError(f"{text!r} is no time")
+    return 3600.0 * hour + 60.0 * minute + second

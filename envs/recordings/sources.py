@@ -1,0 +1,172 @@
+"""Where a receiver's bytes come from: a file, a serial port, a TCP peer."""
+
+import re
+import socket
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from ..arguments import brief
+
+if TYPE_CHECKING:
+    from .nmea import Counts, Epoch
+
+BAUD = 4800  # of NMEA 0183
+PAUSE = 0.5  # s without a byte after which b"" is handed out
+_MOST = 65_536  # bytes of a chunk, and those that show what a file holds
+_LINE = re.compile(rb"\$[A-Z]{3,6},[^$*\r\n]*\*[0-9A-Fa-f]{2}")
+
+
+class Line(NamedTuple):
+    """An open file, port or connection."""
+
+    read: Callable[[], bytes]
+    """Some bytes, b"" after `PAUSE` without any; raises EOFError at a file's end, OSError where the
+    line is lost."""
+    close: Callable[[], None]
+
+
+@dataclass
+class Source:
+    """The bytes of a receiver in chunks, b"" where none came for a while; ends with a file alone.
+
+    connect: opens the line. tries: how often a lost line is opened again before a byte comes, wait:
+    s before each. losses: how often it was lost.
+
+    Iterating raises OSError where the line cannot be opened at first, ConnectionError where it was
+    lost and does not come back; leaving the loop closes it.
+    """
+
+    name: str
+    connect: Callable[[], Line]
+    tries: int = 5
+    wait: float = 1.0
+    losses: int = 0
+
+    def __iter__(self) -> Iterator[bytes]:
+        line: Line | None = self.connect()
+        failures = 0
+        try:
+            while True:
+                chunk = b""
+                try:
+                    if line is None:
+                        time.sleep(self.wait)
+                        line = self.connect()
+                    chunk = line.read()
+                except EOFError:
+                    return
+                except OSError as error:
+                    if line is not None:
+                        self.losses += 1
+                        line.close()
+                        line = None
+                    failures += 1
+                    if failures > self.tries:
+                        raise ConnectionError(
+                            f"{self.name}: lost, and not back after {self.tries} tries: {error}"
+                        ) from None
+                failures = 0 if chunk else failures
+                yield chunk
+        finally:
+            if line is not None:
+                line.close()
+
+
+def open_source(text: str, tries: int = 5, wait: float = 1.0) -> Source:
+    """The source of a text: a file's path, serial:PORT[:BAUD] (extra `wires`) or tcp:HOST:PORT.
+
+    tries, wait: of `Source`. Nothing is opened before it is iterated. Raises ValueError for a text
+    of another form, FileNotFoundError, and ValueError for a folder.
+    """
+    kind, _, rest = text.partition(":")
+    head, _, number = rest.rpartition(":")
+    if kind == "serial" and rest:
+        port, baud = (head, int(number)) if head and number.isdecimal() else (rest, BAUD)
+        return Source(text, lambda: _serial(port, baud), tries, wait)
+    if kind == "tcp":
+        if not (head and number.isdecimal() and 0 < int(number) < 65_536):
+            raise ValueError(f"expected tcp:HOST:PORT, got {brief(text)}")
+        return Source(text, lambda: _tcp(head.strip("[]"), int(number)), tries, wait)
+    path = Path(text)
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: there is no such file")
+    if path.is_dir():
+        raise ValueError(f"{path}: expected a file, found a folder")
+    return Source(text, lambda: _file(path), tries=0)
+
+
+def is_nmea(path: str | Path) -> bool:
+    """Whether a file is called .nmea or a sentence stands near its beginning, valid or not."""
+    source = Path(path)
+    if source.suffix.lower() == ".nmea" or not source.is_file():
+        return source.suffix.lower() == ".nmea"
+    with source.open("rb") as stream:
+        return bool(_LINE.search(stream.read(_MOST)))
+
+
+def read_nmea(path: str | Path) -> tuple[list["Epoch"], "Counts"]:
+    """All epochs of a file, and what was found in it (needs the extra `wires`).
+
+    Raises FileNotFoundError, and ValueError, with the path, for a folder and a file that is empty,
+    has no valid sentence, or no epoch with a fix and a time.
+    """
+    from .nmea import Decoder
+
+    decoder, epochs = Decoder(), []
+    for chunk in open_source(str(Path(path).absolute())):
+        epochs += decoder.feed(chunk)
+    epochs += decoder.finish()
+    counts = decoder.counts
+    if not counts.received:
+        raise ValueError(f"{path}: the file is empty")
+    if not counts.sentences:
+        wrong = counts.bad_checksum, counts.truncated, counts.overlong
+        raise ValueError(
+            f"{path}: no valid NMEA sentence in {counts.received} bytes; {wrong[0]} with a bad "
+            f"checksum, {wrong[1]} cut short, {wrong[2]} overlong"
+        )
+    if not any(epoch.fixed and epoch.t == epoch.t for epoch in epochs):
+        raise ValueError(f"{path}: none of {len(epochs)} epochs has a fix and a time")
+    return epochs, counts
+
+
+def _file(path: Path) -> Line:
+    stream = path.open("rb", buffering=0)
+
+    def read() -> bytes:
+        chunk = stream.read(_MOST)
+        if not chunk:
+            raise EOFError
+        return chunk
+
+    return Line(read, stream.close)
+
+
+def _serial(port: str, baud: int) -> Line:
+    try:
+        import serial
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(
+            "a serial port needs pyserial: pip install 'sideslip[wires]'", name=error.name
+        ) from None
+    device = serial.Serial(port, baud, timeout=PAUSE)
+    return Line(lambda: bytes(device.read(min(device.in_waiting or 1, _MOST))), device.close)
+
+
+def _tcp(host: str, port: int) -> Line:
+    peer = socket.create_connection((host, port), timeout=5.0)
+    peer.settimeout(PAUSE)
+
+    def read() -> bytes:
+        try:
+            chunk = peer.recv(_MOST)
+        except TimeoutError:
+            return b""
+        if not chunk:
+            raise ConnectionError("the peer closed")
+        return chunk
+
+    return Line(read, peer.close)

@@ -1,0 +1,153 @@
+"""A file, a serial port and a TCP peer give the same bytes; what is lost ends clearly."""
+
+import os
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from sideslip.envs.recordings.nmea import Decoder, Epoch
+from sideslip.envs.recordings.sources import Source, is_nmea, open_source, read_nmea
+
+from .receiver import gga, rmc
+
+SECONDS = [f"1200{i:02d}" for i in range(20)]
+LOG = b"".join(rmc(time) + gga(time) for time in SECONDS)
+
+
+def collected(source: Source, count: int) -> list[Epoch]:
+    """The first so many epochs, however long they take."""
+    decoder, epochs = Decoder(), []
+    for chunk in source:
+        epochs += decoder.feed(chunk)
+        if len(epochs) >= count:
+            break
+    return epochs
+
+
+@contextmanager
+def peer(serve: Callable[[socket.socket], None], times: int) -> Iterator[str]:
+    """A TCP peer on loopback that serves so many connections and is then gone."""
+    server = socket.create_server(("127.0.0.1", 0))
+
+    def run() -> None:
+        for _ in range(times):
+            connection, _address = server.accept()
+            with connection:
+                serve(connection)
+        server.close()
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    yield f"tcp:127.0.0.1:{server.getsockname()[1]}"
+    thread.join(10.0)
+    server.close()
+
+
+def test_a_file_ends(tmp_path: Path) -> None:
+    path = tmp_path / "drive.nmea"
+    path.write_bytes(LOG)
+    assert b"".join(open_source(str(path))) == LOG
+    epochs, counts = read_nmea(path)
+    assert len(epochs) == counts.epochs == len(SECONDS)
+
+
+def test_a_serial_port_that_vanishes_ends_clearly() -> None:
+    ours, theirs = os.openpty()
+    name = os.ttyname(theirs)
+    source = open_source(f"serial:{name}:9600", tries=2, wait=0.01)
+    chunks = iter(source)
+    assert next(chunks) == b""  # open: what came before is flushed
+    os.write(ours, LOG[:1000])
+    got = b""
+    while len(got) < 1000:
+        got += next(chunks) or pytest.fail("bytes were lost")
+    assert got == LOG[:1000]
+    os.close(theirs)
+    os.close(ours)
+    with pytest.raises(ConnectionError, match=f"serial:{name}:9600: lost, and not back after 2"):
+        list(chunks)
+    assert source.losses >= 1
+
+
+def test_a_quiet_port_hands_out_nothing_again_and_again() -> None:
+    ours, theirs = os.openpty()
+    chunks = iter(open_source(f"serial:{os.ttyname(theirs)}"))
+    assert next(chunks) == b"" == next(chunks)
+    os.write(ours, b"$GP")
+    assert next(chunks)[:1] == b"$"
+    os.close(ours)
+    os.close(theirs)
+
+
+def test_a_peer_that_closes_is_called_again_and_nothing_whole_is_lost() -> None:
+    half = len(LOG) // 2  # amid a sentence
+    parts = iter([LOG[:half], LOG[half:]])
+    with peer(lambda connection: connection.sendall(next(parts)), 2) as text:
+        source = open_source(text, tries=2, wait=0.01)
+        epochs = collected(source, len(SECONDS))
+    assert len(epochs) == len(SECONDS) and source.losses == 1
+
+
+def test_a_peer_that_only_closes_is_given_up() -> None:
+    with peer(lambda connection: None, 4) as text:
+        source = open_source(text, tries=3, wait=0.01)
+        with pytest.raises(ConnectionError, match="not back after 3 tries"):
+            list(source)
+    assert 1 <= source.losses <= 4
+
+
+def test_garbage_of_a_peer_is_counted_and_what_follows_decoded() -> None:
+    garbage = os.urandom(1 << 20)
+    with peer(lambda connection: connection.sendall(garbage + b"\r\n" + LOG), 1) as text:
+        epochs = collected(open_source(text, wait=0.01), len(SECONDS))
+    assert [epoch.t % 60.0 for epoch in epochs[-20:]] == [float(i) for i in range(20)]
+
+
+def test_a_line_that_cannot_be_opened_is_an_error_at_once(tmp_path: Path) -> None:
+    with pytest.raises(OSError, match=r"/no/such/port"):
+        list(open_source("serial:/no/such/port"))
+    server = socket.create_server(("127.0.0.1", 0))
+    port = server.getsockname()[1]
+    server.close()
+    with pytest.raises(ConnectionRefusedError):
+        list(open_source(f"tcp:127.0.0.1:{port}"))
+    with pytest.raises(FileNotFoundError, match=r"gone\.nmea: there is no such file"):
+        open_source(str(tmp_path / "gone.nmea"))
+    with pytest.raises(ValueError, match="found a folder"):
+        open_source(str(tmp_path))
+
+
+@pytest.mark.parametrize("text", ["tcp:", "tcp:host", "tcp::80", "tcp:host:0", "tcp:host:65536"])
+def test_a_text_of_another_form_is_refused(text: str) -> None:
+    with pytest.raises(ValueError, match="expected tcp:HOST:PORT"):
+        open_source(text)
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (b"", "the file is empty"),
+        (bytes(range(256)) * 100, "no valid NMEA sentence in 25600 bytes"),
+        (rmc().replace(b"48", b"49") * 3, "3 with a bad checksum"),
+        (rmc(status="V") + gga(quality="0"), "none of 1 epochs has a fix"),
+    ],
+)
+def test_what_is_no_log_is_refused_by_name(tmp_path: Path, data: bytes, message: str) -> None:
+    path = tmp_path / "drive.nmea"
+    path.write_bytes(data)
+    with pytest.raises(ValueError, match=rf"drive\.nmea: .*{message}"):
+        read_nmea(path)
+
+
+def test_a_log_is_known_by_its_content(tmp_path: Path) -> None:
+    for name, data in (("a.txt", LOG), ("b.log", b"# title\n" + LOG), ("c.csv", LOG)):
+        (tmp_path / name).write_bytes(data)
+        assert is_nmea(tmp_path / name)
+    (tmp_path / "d.txt").write_bytes(b"time_s,price_$\n1,2\n")
+    assert not is_nmea(tmp_path / "d.txt")
+    assert not is_nmea(tmp_path / "gone.csv")
+    assert is_nmea(tmp_path / "gone.nmea")
