@@ -1,7 +1,9 @@
 """The ceiling: the best actions for a known car, road and every disturbance ahead.
 
-A plan is solved for the whole episode and scored by the cost of its actions in the real env, not by
-its own objective. On the nonlinear plant it is a local optimum, solved from several starts.
+Iterative LQR on the env itself: slopes of the plant's text along a run, a backward sweep within the
+limits, and runs of the env that try the new actions with the sweep's gains. What is found is a run
+and costs what the env says, cap and failures included; it is a local optimum, sought from several
+starts. The linear plant has one programme and one optimum (`qp.py`).
 """
 
 import time
@@ -14,45 +16,45 @@ import numpy as np
 import numpy.typing as npt
 
 from ...envs.engine.layout import P
-from ...envs.task.reference import reference
-from ...envs.vehicle.vehicle import GRAVITY
 from ..controllers.base import Controller
 from ..rollout import steps_of
-from .foresight import Forecast, Known, State, forecast_of, state_of
+from .foresight import Forecast, State, forecast_of, state_of
 from .qp import is_linear, solve_linear
-from .shooting import Solution, Trajectory, solve, tracking_gains
+from .slopes import INPUTS, Problem, Trajectory, limits_along, problem_of, slopes_along
+from .sweep import sweep
 
 Array = npt.NDArray[np.float64]
 Actions = npt.NDArray[np.float32]
 
-GRIPS = (3.0, 1.5, 1.0)  # times the true friction, on the way to a hard episode's plan
-REFINEMENTS = 3  # plans from the newest run, while they still gain
-GAIN = 1e-3  # of the cost, below which another refinement is not worth its seconds
-AGREEMENT = 5e-3  # between a solved plan's cost and objective: nothing is left to refine
+LENGTHS = (1.0, 0.4, 0.1)  # of a step, tried in turn
+DAMPING = 1e-2  # of the first sweep
+DAMPINGS = (1e-8, 1e4)  # the least, and the one at which no step is left to try
+FACTOR = 4.0  # between dampings
+MOST_SWEEPS = 60
+SLOW = (1e-3, 3)  # so little gained, relative, in so many steps in a row: settled
 
 
 @dataclass(frozen=True)
 class Plan:
     """Actions (K, width) for an episode, the best run that a start led to.
 
-    cost: of the run in the env. objective: the solver's, without the cap on the cost
-    rate. status: the solver's return text. seconds: of CPU time.
+    cost: of the run in the env. status: "settled", "stuck" (no step was cheaper), "stopped" (after
+    `MOST_SWEEPS` steps) or the quadratic programme's. seconds: of CPU time.
     """
 
     actions: Actions
     cost: float
-    objective: float
     status: str
     seconds: float
 
 
 @dataclass(frozen=True)
 class Run:
-    """The env's run of actions."""
+    """The env's run of actions; length: periods until it ended."""
 
     trajectory: Trajectory
     cost: float
-    failed: bool
+    length: int
 
 
 def drive(
@@ -62,7 +64,7 @@ def drive(
     env.reset(seed=seed)
     base: Any = env.unwrapped
     taken = np.array(actions, np.float32)
-    states, cost, failed = np.empty((len(actions) + 1, len(State._fields))), 0.0, False
+    states, cost, length = np.empty((len(actions) + 1, len(State._fields))), 0.0, 0
     states[0] = state_of(base.get_state()["state"])
     for k in range(len(taken)):
         if follow is not None:
@@ -72,10 +74,10 @@ def drive(
         _, reward, terminated, truncated, _ = env.step(taken[k])
         cost -= float(reward)
         states[k + 1 :] = state_of(base.get_state()["state"])
+        length = k + 1
         if terminated or truncated:
-            failed = terminated
             break
-    return Run(Trajectory(states, taken.astype(np.float64)), cost, failed)
+    return Run(Trajectory(states, taken.astype(np.float64)), cost, length)
 
 
 def replay(env: gym.Env[Any, Any], seed: int, actions: npt.ArrayLike) -> float:
@@ -91,76 +93,76 @@ def plan(env: gym.Env[Any, Any], seed: int, start: npt.ArrayLike | None = None) 
     began = time.process_time()
     env.reset(seed=seed)
     base: Any = env.unwrapped
-    linear = is_linear(base)
-    forecast = forecast_of(base, base.control_period if linear else 1)
+    forecast = forecast_of(base, base.control_period if is_linear(base) else 1)
     shape = (forecast.fixed.periods, forecast.fixed.width)
     actions = np.zeros(shape) if start is None else np.asarray(start, np.float64)
     if actions.shape != shape:
         raise ValueError(f"a plan of this episode has shape {shape}, got {actions.shape}")
-    if forecast.fixed.kind.follows and start is not None:
-        forecast = forecast_of(base, 1, actions)
-    if linear:
-        made, objective, status = solve_linear(forecast)
+    if is_linear(base):
+        made, _, status = solve_linear(forecast)
         best = drive(env, seed, made)
     else:
-        best, objective, status = _search(env, seed, forecast, actions, start is None)
+        best, status = _search(env, seed, forecast, actions)
     taken = best.trajectory.actions.astype(np.float32)
-    return Plan(taken, best.cost, objective, status, time.process_time() - began)
+    return Plan(taken, best.cost, status, time.process_time() - began)
 
 
 def _search(
-    env: gym.Env[Any, Any], seed: int, forecast: Forecast, actions: Array, free: bool
-) -> tuple[Run, float, str]:
-    """The best run of the plans from a start, with the objective and status of its plan.
-
-    free: whether the plan may start elsewhere where IPOPT does not finish from the actions' run.
-    """
-    found = solve(forecast, drive(env, seed, actions).trajectory)
-    if free and not found.solved:
-        found = _from_grip(forecast)
-    best, objective, status = _follow(env, seed, forecast, found), found.objective, found.status
-    if found.solved and abs(best.cost - objective) <= AGREEMENT * best.cost:
-        return best, objective, status
-    for _ in range(REFINEMENTS):
+    env: gym.Env[Any, Any], seed: int, forecast: Forecast, actions: Array
+) -> tuple[Run, str]:
+    """The best run that the steps from a start lead to, and how they ended."""
+    problem, best, damping, slow = problem_of(forecast.fixed), drive(env, seed, actions), DAMPING, 0
+    for sweeps in range(MOST_SWEEPS):
         if forecast.fixed.kind.follows:  # the driver answers to the newest run
             env.reset(seed=seed)
             forecast = forecast_of(env.unwrapped, 1, best.trajectory.actions)
-        before, found = best.cost, solve(forecast, best.trajectory)
-        run = _follow(env, seed, forecast, found)
-        if run.cost < best.cost:
-            best, objective, status = run, found.objective, found.status
-        if best.cost > before * (1.0 - GAIN):
-            break
-    return best, objective, status
+        before = best.cost
+        best, damping = _improve(env, seed, problem, forecast, best, damping)
+        if best.cost >= before:
+            return best, "settled" if sweeps else "stuck"
+        slow = slow + 1 if best.cost > before * (1.0 - SLOW[0]) else 0
+        if slow == SLOW[1]:
+            return best, "settled"
+    return best, "stopped"
 
 
-def _follow(env: gym.Env[Any, Any], seed: int, forecast: Forecast, found: Solution) -> Run:
-    """The better run of a solution: as it stands, or regulated along its course."""
-    plan = found.trajectory
-    gains = tracking_gains(forecast, plan)
-    runs = drive(env, seed, plan.actions), drive(env, seed, plan.actions, (plan.states, gains))
-    return min(runs, key=lambda run: run.cost)
+def _improve(
+    env: gym.Env[Any, Any],
+    seed: int,
+    problem: Problem,
+    forecast: Forecast,
+    run: Run,
+    damping: float,
+) -> tuple[Run, float]:
+    """(the first cheaper run, the damping for the next step); the run itself where none is."""
+    fixed, size = problem.fixed, len(problem.names)
+    at = _realised(problem, run.trajectory)
+    slopes = slopes_along(problem, forecast.known, at)
+    limits = limits_along(problem, forecast, at)
+    inputs = np.zeros((fixed.periods, INPUTS))
+    inputs[:, : fixed.width] = at.actions
+    d, G = np.empty_like(inputs), np.empty((*inputs.shape, size))
+    gains = np.zeros((fixed.periods, fixed.width, len(State._fields)))
+    while damping < DAMPINGS[1]:
+        sweep(slopes, limits, inputs, run.length, damping, d, G)
+        gains[:, :, problem.at] = -G[:, : fixed.width] / problem.scale
+        for length in LENGTHS:
+            wanted = at.actions + length * d[:, : fixed.width]
+            tried = drive(env, seed, wanted, (at.states, gains))
+            if tried.cost < run.cost:
+                factor = {LENGTHS[0]: 1.0 / FACTOR, LENGTHS[-1]: FACTOR}.get(length, 1.0)
+                return tried, max(damping * factor, DAMPINGS[0])
+        damping *= FACTOR
+    return run, damping
 
 
-def _from_grip(forecast: Forecast) -> Solution:
-    """A plan that starts on the reference with much friction and comes down to the true one."""
-    fixed, known = forecast.fixed, Known(*forecast.known)
-    v = np.full(len(known.command), forecast.start.v_x)
-    refs = [
-        reference(command, speed, fixed.target, fixed.kind.reference)
-        for command, speed in zip(known.command, v, strict=True)
-    ]
-    beta, gamma = np.array(refs).T
-    mu = 0.5 * (known.mu + known.mu_r)
-    share = np.minimum(1.0, 0.8 * mu * GRAVITY / np.maximum(v * np.abs(gamma), 1e-9))
-    states = np.tile(np.array(forecast.start), (len(v), 1))
-    states[:, State._fields.index("v_y")] = share * beta * v
-    states[:, State._fields.index("gamma")] = share * gamma
-    at = Trajectory(states, np.zeros((fixed.periods, fixed.width)))
-    for grip in GRIPS:
-        found = solve(forecast, at, grip)
-        at = found.trajectory
-    return found
+def _realised(problem: Problem, run: Trajectory) -> Trajectory:
+    """A run whose steering asks for no more than it got: the slopes know no limit of its rate."""
+    if run.actions.shape[1] < INPUTS:
+        return run
+    actions, column = run.actions.copy(), State._fields.index("slewing")
+    actions[:, 1] = run.states[1:, column] / problem.fixed.task.authority
+    return Trajectory(run.states, actions)
 
 
 @dataclass(frozen=True)
@@ -182,17 +184,18 @@ class Ceiling:
 def ceiling(
     env: gym.Env[Any, Any], seed: int, starts: Mapping[str, npt.ArrayLike] | None = None
 ) -> Ceiling:
-    """The best of the plans from zero and from other methods' runs, and of those runs themselves.
+    """The best of the plans from other methods' runs, and of those runs themselves.
 
-    starts: actions (K, width) by method. A method that no plan beats is the ceiling.
+    starts: actions (K, width) by method; without any the plan starts from zero. A method that no
+    plan beats is the ceiling.
     """
-    began = time.process_time()
-    first = plan(env, seed)
-    tried: dict[str, Actions] = {"none": np.zeros_like(first.actions)}
+    began, base = time.process_time(), env.unwrapped
+    env.reset(seed=seed)
+    shape = (_periods(base), *(base.action_space.shape or ()))
+    tried: dict[str, Actions] = {"none": np.zeros(shape, np.float32)}
     tried |= {name: np.asarray(actions, np.float32) for name, actions in (starts or {}).items()}
     costs = {name: replay(env, seed, actions) for name, actions in tried.items()}
-    plans = {"none": first}
-    plans |= {name: plan(env, seed, tried[name]) for name in starts or {}}
+    plans = {name: plan(env, seed, tried[name]) for name in starts or tried}
     for name, made in plans.items():
         tried[f"from {name}"], costs[f"from {name}"] = made.actions, made.cost
     winner = min(costs, key=lambda label: costs[label])
@@ -210,10 +213,14 @@ def actions_of(env: gym.Env[Any, Any], agent: Any, seed: int) -> Actions:
     """(K, width): the actions of an agent in an episode; zeros after a failure."""
     base: Any = env.unwrapped
     _, *steps = steps_of(env, agent, seed)
-    periods = -int(-base.get_state()["params"][P.task.duration] // base.control_period)
-    taken = np.zeros((periods, *base.action_space.shape), np.float32)
+    taken = np.zeros((_periods(base), *base.action_space.shape), np.float32)
     taken[: len(steps)] = [step.action for step in steps]
     return taken
+
+
+def _periods(base: Any) -> int:
+    """Control periods of the episode that was last reset."""
+    return -int(-base.get_state()["params"][P.task.duration] // base.control_period)
 
 
 class Replay(Controller):

@@ -49,15 +49,19 @@ def carried(fixed: Fixed) -> tuple[str, ...]:
     return tuple(name for name in State._fields if name in needed)
 
 
-def node_cost(fixed: Fixed, x: State, known: Known) -> Any:
-    """Cost of the motion at a step's start, without the cap, for the seconds it stands for."""
+def node_errors(fixed: Fixed, x: State, known: Known) -> tuple[Any, Any]:
+    """(e_beta, e_gamma) of the motion at a step's start."""
     kind = fixed.kind
     beta = _slip(x.v_x, x.v_y, kind.small_angle)
     beta_ref, gamma_ref = known.beta_ref, known.gamma_ref
     if kind.reference != LAGGED:
         beta_ref, gamma_ref = _reference(known.command, x.v_x, fixed.target, kind.reference)
-    e_beta, e_gamma = beta - beta_ref, x.gamma - gamma_ref
-    return known.weight * _uncapped(e_beta, e_gamma, 0.0, 0.0, kind.reference)
+    return beta - beta_ref, x.gamma - gamma_ref
+
+
+def node_cost(fixed: Fixed, errors: tuple[Any, Any], known: Known) -> Any:
+    """Cost of the errors at a step's start, without the cap, for the seconds it stands for."""
+    return known.weight * _uncapped(*errors, 0.0, 0.0, fixed.kind.reference)
 
 
 def advance(fixed: Fixed, x: State, action: Any, known: Known) -> Step:

@@ -15,7 +15,7 @@ import osqp
 from scipy import sparse
 
 from .foresight import Fixed, Forecast, Known, State
-from .plant import advance, carried, node_cost, scales
+from .plant import advance, carried, node_cost, node_errors, scales
 
 Array = npt.NDArray[np.float64]
 
@@ -80,14 +80,15 @@ def _expansion(fixed: Fixed, v_x: float) -> tuple[Any, Any]:
     for j in range(fixed.steps):
         here = Known(*ca.vertsplit(known[:, j]))
         step = advance(fixed, x, ca.vertsplit(w[size:]), here)
-        cost += node_cost(fixed, x, here) + step.effort
+        cost += node_cost(fixed, node_errors(fixed, x, here), here) + step.effort
         x = rest._replace(**{name: getattr(step.state, name) for name in names})
     after = ca.vertcat(*(getattr(x, name) for name in names)) / scale
     H, g = ca.hessian(cost, w)
     zero = ca.DM.zeros(w.shape)
     slope = ca.jacobian(after, w)
     inside = ca.Function("inside", [w, known], [after, slope, cost, g, H])
-    last = node_cost(fixed, first, Known(*ca.vertsplit(known[:, 0])))
+    here = Known(*ca.vertsplit(known[:, 0]))
+    last = node_cost(fixed, node_errors(fixed, first, here), here)
     H, g = ca.hessian(last, w)
     end = ca.Function("end", [w, known], [last, g, H])
 

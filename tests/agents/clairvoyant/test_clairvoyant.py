@@ -1,6 +1,5 @@
 """The clairvoyant knows the plant exactly, and no other run of an episode is better."""
 
-import dataclasses
 from typing import Any
 
 import gymnasium
@@ -18,7 +17,6 @@ ca = pytest.importorskip("casadi")
 pytest.importorskip("osqp")
 from sideslip.agents import make_agent  # noqa: E402
 from sideslip.agents.clairvoyant import plan as clairvoyant  # noqa: E402
-from sideslip.agents.clairvoyant import shooting as clairvoyant_nonlinear  # noqa: E402
 from sideslip.agents.clairvoyant.foresight import Known, State, forecast_of  # noqa: E402
 from sideslip.agents.clairvoyant.plan import Replay, actions_of, ceiling, drive, plan, replay  # noqa: E402
 from sideslip.agents.clairvoyant.plant import advance  # noqa: E402
@@ -153,19 +151,19 @@ def test_no_run_is_better(scenario: str) -> None:
 
 
 @pytest.mark.long
-def test_a_sliding_car_is_kept_on_its_plan() -> None:
-    """Where the plan alone would be lost, the regulated run costs what the plan expects."""
+def test_a_car_that_is_lost_is_saved() -> None:
+    """The uncontrolled car leaves the lane; the plan that starts from that run does not."""
     env = make("lane-change", 6.0)
+    none = np.zeros((600, 1))
+    lost = drive(env, 2, none)
     found = plan(env, 2)
-    none = replay(env, 2, np.zeros_like(found.actions))
-    assert found.cost < 0.3 * none
+    assert found.cost < 0.3 * lost.cost
     assert found.cost == replay(env, 2, found.actions)
-    assert found.cost < 1.05 * found.objective  # which knows no cap
 
 
 @pytest.mark.long
 def test_steering_too() -> None:
-    """Two actions do better than one, and what is planned keeps the rate limit."""
+    """Two actions do better than one, and the steering that is found was within its rate."""
     alone = plan(make("lane-change"), 0)
     env = gymnasium.make(
         "sideslip/AfsYawFusion-v0", scenario={"base": "lane-change", "duration": 2.0}
@@ -173,11 +171,11 @@ def test_steering_too() -> None:
     both = plan(env, 0)
     assert both.actions.shape == (200, 2)
     assert both.cost < 0.5 * alone.cost
-    start = drive(env, 0, np.zeros((200, 2))).trajectory
-    env.reset(seed=0)
-    planned = clairvoyant_nonlinear.solve(forecast_of(env.unwrapped), start).trajectory
-    moved = np.diff(planned.states[:, State._fields.index("slewing")])
-    assert np.abs(moved).max() < 0.8 * 0.01 * (1.0 + 1e-3)  # rad/s times the period
+    run = drive(env, 0, both.actions.astype(np.float64)).trajectory
+    stands = run.states[:, State._fields.index("slewing")] / 0.1  # rad of full scale
+    assert np.abs(np.diff(stands)).max() == pytest.approx(0.08)  # 0.8 rad/s, 10 ms: it binds
+    beyond = np.abs(both.actions[:, 1] - stands[1:]) > 1e-6
+    assert beyond.mean() < 0.1  # hardly any action asks for more than the rate gives
 
 
 def test_a_plan_is_an_agent() -> None:
@@ -195,26 +193,14 @@ def test_a_plan_is_an_agent() -> None:
 def test_an_unfinished_plan_has_its_status_and_the_better_run_stands(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setitem(clairvoyant_nonlinear._OPTIONS, "ipopt.max_iter", 1)
-    monkeypatch.setattr(clairvoyant, "REFINEMENTS", 0)
-    clairvoyant_nonlinear.problem_of.cache_clear()
+    monkeypatch.setattr(clairvoyant, "MOST_SWEEPS", 1)
     env = make("sine", 1.0)
-    good = np.zeros((100, 1))
-    found = ceiling(env, 0, {"other": good})
-    clairvoyant_nonlinear.problem_of.cache_clear()
-    assert set(found.statuses.values()) == {"Maximum_Iterations_Exceeded"}
+    found = ceiling(env, 0, {"other": np.full((100, 1), 0.1)})
+    assert found.statuses == {"other": "stopped"}
     assert found.cost == min(found.costs.values()) == found.costs[found.winner]
-
-
-def test_a_failed_solve_gives_back_its_start() -> None:
-    env = make("sine", 0.2)
-    env.reset(seed=0)
-    forecast = forecast_of(env.unwrapped)
-    start = drive(env, 0, np.full((20, 1), 0.25)).trajectory
-    lost = dataclasses.replace(forecast, known=np.full_like(forecast.known, np.nan))
-    found = clairvoyant_nonlinear.solve(lost, start)
-    assert not found.solved and found.status == "Invalid_Number_Detected"
-    np.testing.assert_array_equal(found.trajectory.actions, start.actions)
+    monkeypatch.setattr(clairvoyant, "LENGTHS", (0.0,))  # steps that go nowhere
+    stuck = plan(env, 0)
+    assert stuck.status == "stuck" and stuck.cost == replay(env, 0, np.zeros((100, 1)))
 
 
 def test_bad_input() -> None:
