@@ -2,12 +2,12 @@
 
 from typing import Any, NamedTuple
 
-from ..backend.decorators import jit
-from ..backend.elementary import PI, wrap
-from ..backend.primitives import absolute, select
-from ..backend.random import CHANNELS
-from ..vehicle.dynamics import curvature_at
-from .kind import Blocks, SlowKind, Value
+from ...backend.decorators import jit
+from ...backend.elementary import PI, wrap
+from ...backend.primitives import absolute, select
+from ...backend.random import CHANNELS
+from ...vehicle.dynamics import curvature_at
+from ..kind import Blocks, SlowKind, Value
 
 CAMERA_KIND = SlowKind(
     "camera",

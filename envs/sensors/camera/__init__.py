@@ -1,0 +1,11 @@
+"""The camera: what it measures as numbers, and a lane finder on pictures in its place.
+
+`analytic` is the compiled sample of the engine. `pinhole` is the camera's geometry, `road_image`
+renders the road, `finder` and `consensus` find the lane in a picture, `mounting` finds tilt and
+height, `chessboard` the intrinsics, `films` reads files. Only `analytic` is loaded with the
+package; what works on pictures needs the extra of OpenCV.
+"""
+
+from .analytic import CAMERA_KIND, View, camera_sample, lane_in_view, lane_offset
+
+__all__ = ["CAMERA_KIND", "View", "camera_sample", "lane_in_view", "lane_offset"]

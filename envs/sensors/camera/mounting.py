@@ -1,0 +1,97 @@
+"""How a camera is mounted, from one picture of a lane: tilt and height.
+
+Straight markings meet in the vanishing point, whose row is the horizon's; how far they spread below
+it is the camera's height over a lane of known width. Needs the extra `vision`.
+"""
+
+import dataclasses
+from math import atan, cos
+
+import cv2
+import numpy as np
+
+from .consensus import Array
+from .pinhole import Pinhole
+from .road_image import Image
+
+TRIED, LEAST = 1500, 20  # pairs of points, and points
+_TOP, _BOTTOM = 0.55, 0.92  # of the picture's height: the road, without the bonnet
+_NEAR = 0.004  # of the focal length, from a line
+_SLOPES = 0.35, 4.0  # across over down, of a lane's own markings
+_TILTS, _HEIGHTS = (-0.25, 0.45), (0.4, 4.0)  # rad, m
+
+
+def default_camera(size: tuple[int, int]) -> Pinhole:
+    """A camera of which nothing is known: 58 degrees wide, without distortion, level."""
+    width, height = size
+    K = ((0.9 * width, 0.0, width / 2), (0.0, 0.9 * width, height / 2), (0.0, 0.0, 1.0))
+    return Pinhole(K=K, dist=(0.0,) * 5, size=size, tilt=0.0, ahead=0.0)
+
+
+def mounted(camera: Pinhole, picture: Image, lane_width: float) -> Pinhole:
+    """The camera with the tilt and the height that a picture of a straight lane shows.
+
+    Raises ValueError where two markings are not found in it.
+    """
+    points, weight = _ridges(camera, picture)
+    pair = _pair(points, weight)
+    if pair is None:
+        raise ValueError("no pair of markings was found: pass the camera's tilt and height")
+    (a, b), (c, d) = pair  # across = a + b down, left and right
+    down = (a - c) / (d - b)
+    tilt = atan(-down)
+    height = lane_width * cos(tilt) / (d - b)
+    if not (_TILTS[0] < tilt < _TILTS[1] and _HEIGHTS[0] < height < _HEIGHTS[1]):
+        raise ValueError(
+            f"the markings found would have the camera {height:.2f} m high and tilted by "
+            f"{tilt:.3f} rad: pass its tilt and height"
+        )
+    return dataclasses.replace(camera, tilt=tilt, height=height)
+
+
+def _ridges(camera: Pinhole, picture: Image) -> tuple[Array, Array]:
+    """(points (n, 2) on the plane one unit ahead, weight): bright ridges across the rows."""
+    grey = picture if picture.ndim == 2 else picture.max(2)
+    rows = slice(int(_TOP * len(grey)), int(_BOTTOM * len(grey)))
+    scale = camera.size[0] / 1280.0
+    smooth = cv2.GaussianBlur(grey[rows].astype(np.float32), (0, 0), 4.0 * scale)
+    light = -16.0 * scale**2 * cv2.Laplacian(smooth, cv2.CV_32F)
+    middle = light[:, 1:-1]
+    level = max(8.0, 4.0 * 1.4826 * float(np.median(np.abs(middle))))
+    top = (middle > level) & (middle >= light[:, :-2]) & (middle > light[:, 2:])
+    row, column = np.nonzero(top[::2])
+    pixels = np.stack([column + 1.0, 2.0 * row + rows.start], 1)
+    return camera.undistorted(pixels) if len(pixels) else pixels, np.minimum(
+        middle[::2][row, column], 40.0
+    ).astype(float)
+
+
+def _pair(points: Array, weight: Array) -> tuple[Array, Array] | None:
+    """(left, right): each (2,), a and b of across = a + b down, by random consensus."""
+    if len(points) < LEAST:
+        return None
+    across, down = points.T
+    rng = np.random.Generator(np.random.SFC64(len(points)))
+    sums = np.cumsum(weight)
+    i, j = np.searchsorted(sums, rng.random((2, TRIED)) * sums[-1]).clip(max=len(points) - 1)
+    with np.errstate(all="ignore"):
+        b = (across[j] - across[i]) / (down[j] - down[i])
+    keep = (np.abs(down[j] - down[i]) > 0.05) & (np.abs(b) > _SLOPES[0]) & (np.abs(b) < _SLOPES[1])
+    b = b[keep, None]
+    a = across[i[keep], None] - b * down[i[keep], None]
+    held = (np.abs(across - a - b * down) < _NEAR * (1.0 + np.abs(b))) @ weight
+    a, b = a[:, 0], b[:, 0]
+    left, right = np.flatnonzero(b < 0.0), np.flatnonzero(b > 0.0)
+    if not (len(left) and len(right)):
+        return None
+    spread = b[right] - b[left, None]  # a lane's: a wider pair holds another lane too
+    score = np.minimum(held[left, None], held[right]) + 0.25 * (held[left, None] + held[right])
+    tilted = np.arctan((a[right] - a[left, None]) / spread)
+    score *= ((tilted > _TILTS[0]) & (tilted < _TILTS[1])) / (1.0 + 0.1 * spread)
+    best_left, best_right = np.unravel_index(np.argmax(score), score.shape)
+    lines = []
+    for k in (left[best_left], right[best_right]):
+        near = np.abs(across - a[k] - b[k] * down) < _NEAR * (1.0 + abs(b[k]))
+        slope, start = np.polyfit(down[near], across[near], 1, w=weight[near])
+        lines.append(np.array([start, slope]))
+    return lines[0], lines[1]

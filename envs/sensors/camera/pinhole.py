@@ -1,0 +1,129 @@
+"""A pinhole camera on a car: from pixels to the road's plane and back.
+
+Car axes: X forward, Y left, Z up, from the road below the centre of gravity. Needs `vision`.
+"""
+
+import dataclasses
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from math import cos, radians, sin
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from ...arguments import brief, is_finite, unknown_names
+from ...documents import read_document, write_document
+
+Array = npt.NDArray[np.float64]
+_MATRIX = ((640.0, 0.0, 639.5), (0.0, 640.0, 359.5), (0.0, 0.0, 1.0))
+_MEASURED = ("rms_px", "boards")  # a calibration file may hold them
+
+
+@dataclass(frozen=True)
+class Pinhole:
+    """A camera's intrinsics and where it sits; the defaults are the papers' tilt and preview, and
+    a lens wide enough to see both markings throughout the analytic camera's field of view.
+
+    Raises ValueError for a value out of place.
+    """
+
+    K: tuple[tuple[float, ...], ...] = _MATRIX  # px, the camera matrix
+    dist: tuple[float, ...] = (-0.1, 0.01, 0.0, 0.0, 0.0)  # k1, k2, p1, p2, k3
+    size: tuple[int, int] = (1280, 720)  # px, width and height
+    height: float = 1.3  # m, above the road
+    tilt: float = radians(8.0)  # rad, downwards
+    ahead: float = 0.2  # m, of the centre of gravity
+    preview: float = 5.135  # m, ahead of the centre of gravity, at which y_l is measured
+    rate: float = 30.0  # frames a second
+
+    def __post_init__(self) -> None:
+        K, dist = np.array(self.K, float), np.array(self.dist, float).ravel()
+        if K.shape != (3, 3) or not (np.isfinite(K).all() and K[0, 0] > 0.0 and K[1, 1] > 0.0):
+            raise ValueError(f"K is a 3 x 3 camera matrix in pixels, got {brief(self.K)}")
+        if len(dist) not in (4, 5) or not np.isfinite(dist).all():
+            raise ValueError(f"dist is k1, k2, p1, p2 and perhaps k3, got {brief(self.dist)}")
+        size = tuple(self.size)
+        if len(size) != 2 or not all(isinstance(n, int) and 16 <= n <= 1 << 14 for n in size):
+            raise ValueError(f"size is (width, height) in pixels, got {brief(self.size)}")
+        for name in ("height", "tilt", "ahead", "preview", "rate"):
+            if not is_finite(getattr(self, name)):
+                raise ValueError(f"{name} is a number, got {brief(getattr(self, name))}")
+        if not (self.height > 0.0 and self.rate > 0.0 and abs(self.tilt) < 1.0):
+            raise ValueError(
+                "height and rate are positive and the tilt is within 1 rad, got "
+                f"{self.height} m, {self.rate} 1/s, {self.tilt} rad"
+            )
+        object.__setattr__(self, "K", tuple(map(tuple, K.tolist())))
+        object.__setattr__(self, "dist", tuple(dist.tolist()))
+        object.__setattr__(self, "size", size)
+
+    @classmethod
+    def from_mapping(cls, values: Mapping[str, Any]) -> "Pinhole":
+        """A camera from names and values; ValueError for an unknown name and for none of K."""
+        known = [field.name for field in dataclasses.fields(cls)]
+        if unknown := [name for name in values if name not in (*known, *_MEASURED)]:
+            raise ValueError(unknown_names("camera field", unknown, known))
+        try:
+            return cls(**{name: values[name] for name in values if name in known})
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"a camera's fields: {error}") from None
+
+    @classmethod
+    def read(cls, path: "str | os.PathLike[str]") -> "Pinhole":
+        """A camera from a TOML or JSON file with at least K, dist and size."""
+        values = read_document(path, "camera")
+        if missing := {"K", "dist", "size"} - values.keys():
+            raise ValueError(f"{path}: a camera needs {', '.join(sorted(missing))}")
+        try:
+            return cls.from_mapping(values)
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from None
+
+    def write(self, path: "str | os.PathLike[str]", **measured: float) -> None:
+        """Write a file that `read` reads back; measured: what else a calibration found."""
+        write_document(path, dataclasses.asdict(self) | measured)
+
+    def scaled(self, size: tuple[int, int]) -> "Pinhole":
+        """The same camera with pictures of another size."""
+        across, down = size[0] / self.size[0], size[1] / self.size[1]
+        K = np.diag([across, down, 1.0]) @ np.array(self.K)
+        return dataclasses.replace(self, K=tuple(map(tuple, K.tolist())), size=size)
+
+    def undistorted(self, pixels: Array) -> Array:
+        """Points on the plane one unit ahead of the lens, (..., 2), of pixels (..., 2)."""
+        points = np.ascontiguousarray(pixels, float).reshape(-1, 1, 2)
+        criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 40, 1e-9)
+        found = cv2.undistortPoints(
+            points, np.array(self.K), np.array(self.dist), criteria=criteria
+        )
+        return np.asarray(found, float).reshape(np.shape(pixels))
+
+    def pixels_of(self, x: Array, y: Array) -> Array:
+        """The pixels (..., 2) of points of the road, in m ahead and to the left of the car; NaN
+        where they lie outside the picture."""
+        x, y = np.broadcast_arrays(np.asarray(x, float) - self.ahead, np.asarray(y, float))
+        depth = x * cos(self.tilt) + self.height * sin(self.tilt)
+        down = self.height * cos(self.tilt) - x * sin(self.tilt)
+        seen = depth > 0.1
+        points = np.stack([-y, down, np.where(seen, depth, 1.0)], -1).reshape(-1, 1, 3)
+        pixels, _ = cv2.projectPoints(
+            points, np.zeros(3), np.zeros(3), np.array(self.K), np.array(self.dist)
+        )
+        pixels = np.asarray(pixels, float).reshape(*x.shape, 2)
+        width, height = self.size
+        corners = np.array([[0.0, 0.0], [width, 0.0], [0.0, height], [width, height]])
+        edge = np.linalg.norm(self.undistorted(corners), axis=1).max()  # the polynomial's folds
+        inside = np.hypot(y, down) <= 1.02 * edge * depth
+        inside &= (pixels >= 0.0).all(-1) & (pixels <= np.array([width, height]) - 1.0).all(-1)
+        return np.where((seen & inside)[..., None], pixels, np.nan)
+
+    def rays(self) -> Array:
+        """Directions (height, width, 3) of all pixels in car axes, of unit depth."""
+        width, height = self.size
+        grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1).astype(float)
+        across, down = np.moveaxis(self.undistorted(grid), -1, 0)
+        s, c = sin(self.tilt), cos(self.tilt)
+        return np.stack([c - s * down, -across, -s - c * down], -1)

@@ -1,0 +1,169 @@
+"""The road as a camera sees it: markings, bends, roll and pitch, shadow, wear, blur and noise.
+
+Every pixel is followed to the road's plane, whose brightness there is averaged over the pixel's
+footprint. Needs the extra `vision`.
+"""
+
+from dataclasses import dataclass, fields
+from math import cos, sin
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from ...arguments import brief, is_finite
+from ...vehicle.dynamics import Road
+from .pinhole import Pinhole
+
+Image = npt.NDArray[np.uint8]
+Flat = npt.NDArray[np.float32]
+
+ASPHALT, PAINT, GRASS, SKY = 85.0, 215.0, 60.0, 200.0  # grey levels
+VERGE = 1.6  # m, from a marking's middle to the grass
+_FAR = 80.0  # m, of the road that is drawn
+_PATCH, _FLAKE = 0.25, 0.03  # m, along and across, of paint that wears off together
+
+
+@dataclass(frozen=True)
+class Appearance:
+    """What the road and the picture look like. Raises ValueError for a value out of place."""
+
+    noise: float = 2.0  # grey levels, standard deviation of a pixel
+    blur: float = 0.5  # px, standard deviation of the lens
+    shadow: float = 0.0  # share of the light that bands of shadow across the road take
+    wear: float = 0.0  # share of the paint that has gone
+    lane_width: float = 3.5  # m, from marking to marking
+    marking_width: float = 0.12  # m
+    dash: float = 4.0  # m, length of the left marking's dashes; the right one is solid
+    gap: float = 5.0  # m
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if not (is_finite(value) and value >= 0.0):
+                raise ValueError(f"{field.name} is zero or more, got {brief(value)}")
+        if max(self.shadow, self.wear) > 1.0:
+            raise ValueError(f"shadow and wear are shares, got {self.shadow} and {self.wear}")
+        if not min(self.lane_width, self.marking_width, self.dash) > 0.0:
+            raise ValueError("lane_width, marking_width and dash are positive")
+
+
+class Scene(NamedTuple):
+    """Where the car is against the road, and the road's bend."""
+
+    psi: float = 0.0  # rad, heading against the road, to the left positive
+    y: float = 0.0  # m, left of the lane's middle
+    s: float = 0.0  # m, along the road
+    roll: float = 0.0  # rad, left side up positive, about the road below the car
+    pitch: float = 0.0  # rad, nose down positive
+    road: Road = Road(0.0, 0.0, 1.0)
+
+    @classmethod
+    def bend(cls, curvature: float, **places: float) -> "Scene":
+        """On a road of constant curvature in 1/m."""
+        return cls(road=Road(curvature, -1e6, 1.0), **places)
+
+
+class Painter:
+    """Renders a camera's pictures; rows: the first and the last row that is painted, the rest stays
+    black (default: all)."""
+
+    def __init__(
+        self,
+        camera: Pinhole,
+        appearance: Appearance | None = None,
+        rows: tuple[int, int] | None = None,
+    ) -> None:
+        self.camera, self.appearance = camera, appearance or Appearance()
+        self.rows = slice(*(rows or (0, camera.size[1])))
+        self._rays = np.moveaxis(camera.rays()[self.rows], -1, 0).astype(np.float32).copy()
+
+    def picture(self, scene: Scene, seed: Any = 0) -> Image:
+        """The picture (height, width) in grey levels; seed: of `np.random.Philox`, a number or a
+        pair (key, tick), for the noise."""
+        camera, look = self.camera, self.appearance
+        light = self._road(scene)
+        if look.blur > 0.0:
+            light = np.asarray(cv2.GaussianBlur(light, (0, 0), look.blur), np.float32)
+        if look.noise > 0.0:
+            key, tick = seed if isinstance(seed, tuple) else (int(seed), 0)
+            numbers = np.random.Generator(np.random.Philox(key=key, counter=[0, 0, 0, tick]))
+            light += look.noise * numbers.standard_normal(light.shape, np.float32)
+        whole = np.zeros(camera.size[::-1], np.uint8)
+        whole[self.rows] = np.clip(light + 0.5, 0.0, 255.0)
+        return whole
+
+    def _road(self, scene: Scene) -> Flat:
+        """Brightness of the painted rows without blur and noise."""
+        camera, look = self.camera, self.appearance
+        turn = _attitude(scene.roll, scene.pitch)
+        eye = turn @ [camera.ahead, 0.0, camera.height]
+        ahead, left, up = np.tensordot(turn.astype(np.float32), self._rays, 1)
+        reach = np.float32(eye[2]) / np.maximum(-up, 1e-4)
+        X, Y = np.float32(eye[0]) + reach * ahead, np.float32(eye[1]) + reach * left
+        seen = (up < -1e-3) & (X < _FAR)
+        d, s = _lane_coordinates(X, Y, scene)
+        wide = reach / np.float32(camera.K[0][0])  # m of a pixel, across and along the view
+        long = wide * np.maximum(X, 1.0) / np.float32(eye[2])
+        across = np.hypot(wide, long * np.float32(sin(scene.psi)))
+        paint = _stripe(d + 0.5 * look.lane_width, look.marking_width, across)  # right, solid
+        dashes = _stripe(d - 0.5 * look.lane_width, look.marking_width, across)
+        period = look.dash + look.gap
+        place = np.mod(s + np.float32(scene.s % period) + 0.5 * look.gap, period)
+        paint += dashes * _stripe(place - 0.5 * period, look.dash, long)
+        if look.wear > 0.0:
+            first = int(np.floor(scene.s / _PATCH))
+            patches = np.floor((s + np.float32(scene.s - first * _PATCH)) / _PATCH)
+            paint *= _hash(patches.astype(np.int64) + first, d / _FLAKE) >= look.wear
+        light = ASPHALT + (PAINT - ASPHALT) * paint
+        if look.shadow > 0.0:
+            bands = np.mod(s + np.float32(scene.s % 11.0) + 0.7 * d, 11.0) < 4.5
+            light *= 1.0 - np.float32(look.shadow) * bands
+        verge = np.abs(d) > 0.5 * look.lane_width + VERGE
+        light = np.where(seen, np.where(verge, np.float32(GRASS), light), np.float32(SKY))
+        return np.asarray(light, np.float32)
+
+
+def _attitude(roll: float, pitch: float) -> Any:
+    """From body axes to those of the road."""
+    over = np.array([[1, 0, 0], [0, cos(roll), -sin(roll)], [0, sin(roll), cos(roll)]])
+    nod = np.array([[cos(pitch), 0, sin(pitch)], [0, 1, 0], [-sin(pitch), 0, cos(pitch)]])
+    return nod @ over
+
+
+def _lane_coordinates(X: Flat, Y: Flat, scene: Scene) -> tuple[Flat, Flat]:
+    """(d, s): m left of the lane's middle and along it from the car, of points in car axes.
+
+    Exact on the osculating circle; where the curvature changes ahead, to first order about it.
+    """
+    sine, cosine = np.float32(sin(scene.psi)), np.float32(cos(scene.psi))
+    u, v = X * cosine - Y * sine, np.float32(scene.y) + X * sine + Y * cosine
+    road = scene.road
+    from_ramp, slope = scene.s - road.start, road.curvature / road.ramp
+    kappa = slope * min(max(from_ramp, 0.0), road.ramp)
+    w = 2.0 * v - kappa * (u * u + v * v)
+    d = w / (1.0 + np.sqrt(np.maximum(1.0 - kappa * w, 0.0)))
+    s = u if abs(kappa) < 1e-9 else np.arctan2(kappa * u, 1.0 - kappa * v) / kappa
+    if slope and from_ramp < road.ramp:  # the curvature's double integral beyond the circle's
+        x, a, b = np.maximum(s, 0.0), from_ramp, from_ramp - road.ramp
+        cubes = np.maximum(x + a, 0.0) ** 3 - np.maximum(x + b, 0.0) ** 3
+        start, rise = max(a, 0.0), 0.5 * max(a, 0.0) ** 2
+        d = d - (slope * (cubes - start**3) / 6.0 - slope * rise * x - 0.5 * kappa * x * x)
+    return d.astype(np.float32), np.asarray(s, np.float32)
+
+
+def _stripe(offset: Flat, width: float, footprint: Flat) -> Flat:
+    """The share of a footprint that a stripe covers."""
+    share = np.clip((0.5 * width - np.abs(offset)) / footprint + 0.5, 0.0, 1.0)
+    return np.asarray(np.minimum(share, width / footprint), np.float32)
+
+
+def _hash(along: npt.NDArray[np.int64], across: Flat) -> Flat:
+    """A number in [0, 1) for each cell of the road."""
+    word = along.astype(np.uint32) * np.uint32(0x9E3779B1)
+    word ^= np.floor(across).astype(np.int64).astype(np.uint32) * np.uint32(0x85EBCA77)
+    word ^= word >> np.uint32(15)
+    word *= np.uint32(0x2C1B3C6D)
+    word ^= word >> np.uint32(13)
+    return np.asarray((word >> np.uint32(8)) / float(1 << 24), np.float32)

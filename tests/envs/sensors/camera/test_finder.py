@@ -1,0 +1,130 @@
+"""The lane finder on rendered pictures whose truth is known."""
+
+from collections.abc import Iterable
+from itertools import product
+from math import radians
+
+import numpy as np
+import pytest
+
+pytest.importorskip("cv2")
+from sideslip.envs.backend.rebuild import plain
+from sideslip.envs.sensors.camera import View, lane_offset
+from sideslip.envs.sensors.camera.finder import Lane, LaneFinder
+from sideslip.envs.sensors.camera.pinhole import Pinhole
+from sideslip.envs.sensors.camera.road_image import Appearance, Painter, Scene
+from sideslip.envs.vehicle.dynamics import Motion
+
+VIEW = View(0.35, 4.0)  # of the scored scenarios
+CAMERA = Pinhole()
+FINDER = LaneFinder(CAMERA)
+CLEAR = Painter(CAMERA, Appearance(), FINDER.rows)
+
+
+def truth(scene: Scene) -> tuple[float, float]:
+    """(psi, y_l) as the analytic camera has them, without noise."""
+    still = (0.0,) * 3
+    motion = Motion(*still, scene.psi, 0.0, 0.0, scene.s, scene.y, 0.0)
+    return scene.psi, plain(lane_offset)(motion, scene.road, CAMERA.preview)
+
+
+def errors(scenes: Iterable[Scene], painter: Painter = CLEAR) -> tuple[float, float, list[Lane]]:
+    """(rms of psi in degrees, rms of y_l in cm, the lanes); what is lost counts for nothing."""
+    lanes, rest = [], []
+    for seed, scene in enumerate(scenes):
+        lanes.append(FINDER.find(painter.picture(scene, seed)))
+        if lanes[-1].quality > 0.0:
+            rest.append(np.subtract(lanes[-1][:2], truth(scene)))
+    psi, y_l = np.sqrt(np.mean(np.square(rest), axis=0))
+    return np.degrees(psi), 100.0 * y_l, lanes
+
+
+def draws(count: int, bend: float = 0.0, view: View = VIEW) -> list[Scene]:
+    rng = np.random.default_rng(5)
+    low = np.array([-view.heading, -view.offset, 0.0, -bend])
+    return [
+        Scene.bend(kappa, psi=psi, y=y, s=s)
+        for psi, y, s, kappa in rng.uniform(
+            low, [view.heading, view.offset, 500.0, bend], (count, 4)
+        )
+    ]
+
+
+def test_over_the_field_of_view_within_a_fifth_of_a_degree_and_two_centimetres() -> None:
+    headings, offsets = np.linspace(-1.0, 1.0, 7), np.linspace(-1.0, 1.0, 7)
+    grid = [
+        Scene(psi=VIEW.heading * a, y=VIEW.offset * b, s=3.0 * k)
+        for k, (a, b) in enumerate(product(headings, offsets))
+    ]
+    for scenes in (grid, draws(60)):
+        psi, y_l, lanes = errors(scenes)
+        assert psi < 0.2 and y_l < 2.0
+        assert min(lane.quality for lane in lanes) > 0.5
+
+
+def test_bends_are_found_with_their_curvature() -> None:
+    scenes = draws(60, 0.02, View(0.15, 1.2))
+    psi, y_l, lanes = errors(scenes)
+    assert psi < 0.2 and y_l < 2.0 and all(lane.quality > 0.5 for lane in lanes)
+    kappa = [scene.road.curvature for scene in scenes]
+    assert np.std(np.subtract([lane.curvature for lane in lanes], kappa)) < 5e-4
+
+
+@pytest.mark.parametrize(
+    ("look", "psi", "y_l"),
+    [
+        (Appearance(noise=12.0), 0.3, 3.0),
+        (Appearance(shadow=0.6), 0.3, 2.0),
+        (Appearance(wear=0.5), 0.5, 4.0),
+    ],
+)
+def test_it_degrades_gently(look: Appearance, psi: float, y_l: float) -> None:
+    found = errors(draws(40), Painter(CAMERA, look, FINDER.rows))
+    assert found[0] < psi and found[1] < y_l
+    assert np.mean([lane.quality > 0.0 for lane in found[2]]) > 0.9
+
+
+def test_pitch_and_roll_are_told_from_the_lane() -> None:
+    for scene in draws(10, view=View(0.1, 1.0)):
+        assert FINDER.find(CLEAR.picture(scene)).quality > 0.0 and FINDER.fit is not None
+        assert abs(FINDER.fit.pitch) < radians(0.1)  # a tilt that is wrong would be seen here
+    for pitch in (-0.015, 0.015):
+        lane = FINDER.find(CLEAR.picture(Scene(psi=0.05, y=0.3, pitch=pitch)))
+        assert FINDER.fit is not None and FINDER.fit.pitch == pytest.approx(pitch, abs=2e-3)
+        assert lane.y_l == pytest.approx(0.3 + 5.135 * 0.05, abs=0.02)
+    lane = FINDER.find(CLEAR.picture(Scene(y=1.5, roll=0.02)))  # in its middle nothing shows it
+    assert FINDER.fit is not None and FINDER.fit.roll == pytest.approx(0.02, abs=4e-3)
+    assert lane.y_l == pytest.approx(1.5, abs=0.04)
+
+
+@pytest.mark.parametrize("noise", [0.0, 2.0, 30.0])
+def test_without_markings_the_lane_is_lost_and_no_number_is_wild(noise: float) -> None:
+    bare = Painter(CAMERA, Appearance(wear=1.0, noise=noise, shadow=0.5), FINDER.rows)
+    for seed in range(5):
+        assert FINDER.find(bare.picture(Scene(psi=0.1), seed)) == Lane() == (0.0,) * 5
+    assert FINDER.find(np.zeros((720, 1280), np.uint8)).quality == 0.0
+    chance = np.random.default_rng(1).integers(0, 256, (720, 1280), np.uint8)
+    assert FINDER.find(chance).quality == 0.0
+
+
+def test_beyond_the_field_of_view_it_is_lost() -> None:
+    narrow = LaneFinder(CAMERA, view=View(0.1, 1.0))
+    for scene, seen in ((Scene(psi=0.08), 1), (Scene(psi=0.12), 0), (Scene(y=-1.1), 0)):
+        assert (narrow.find(CLEAR.picture(scene)).quality > 0.0) == seen
+
+
+def test_one_picture_one_answer_in_grey_and_in_colour() -> None:
+    picture = CLEAR.picture(Scene(psi=0.05, y=0.2), 1)
+    first = FINDER.find(picture)
+    FINDER.find(CLEAR.picture(Scene(psi=-0.3, y=2.0), 2))
+    assert FINDER.find(picture) == first
+    assert FINDER.find(np.repeat(picture[..., None], 3, 2)) == first
+
+
+def test_a_picture_of_another_size_and_a_blind_camera_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"expected a picture of \(1280, 720\)"):
+        FINDER.find(np.zeros((480, 640), np.uint8))
+    with pytest.raises(ValueError, match="does not see the road"):
+        LaneFinder(Pinhole(tilt=-0.9))
+    with pytest.raises(ValueError, match="0 < near < far"):
+        LaneFinder(CAMERA, near=9.0, far=5.0)

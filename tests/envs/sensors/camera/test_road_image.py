@@ -1,0 +1,86 @@
+"""Rendered pictures: paint lies where a walk along the road puts it, and the seed is all chance."""
+
+from dataclasses import replace
+from math import cos, sin
+
+import numpy as np
+import pytest
+
+pytest.importorskip("cv2")
+from sideslip.envs.sensors.camera.pinhole import Pinhole
+from sideslip.envs.sensors.camera.road_image import Appearance, Painter, Scene
+from sideslip.envs.vehicle.dynamics import Road
+
+CAMERA = Pinhole()
+CLEAR = Appearance(noise=0.0, blur=0.0)
+PAINTER = Painter(CAMERA, CLEAR)
+
+
+def walked(scene: Scene, ahead: float, aside: float) -> tuple[float, float]:
+    """A point of the road in car axes, by small steps along its middle from beside the car."""
+    x, y, theta, step = 0.0, -scene.y, 0.0, 1e-3
+    road = scene.road
+    for k in range(round(ahead / step)):
+        share = (scene.s + (k + 0.5) * step - road.start) / road.ramp
+        theta += road.curvature * min(max(share, 0.0), 1.0) * step
+        x, y = x + step * cos(theta), y + step * sin(theta)
+    x, y = x - aside * sin(theta), y + aside * cos(theta)
+    c, s = cos(scene.psi), sin(scene.psi)
+    return c * x + s * y, c * y - s * x
+
+
+@pytest.mark.parametrize(
+    "scene",
+    [
+        Scene(psi=0.1, y=0.5),
+        Scene(psi=-0.2, y=-1.0, s=7.3),
+        Scene.bend(0.02, psi=0.05, y=-0.4),
+        Scene(s=12.0, road=Road(-0.03, 20.0, 20.0)),  # the ramp begins 8 m ahead
+        Scene(s=27.0, psi=-0.1, road=Road(0.02, 20.0, 20.0)),  # the car is on it
+    ],
+)
+def test_the_solid_marking_lies_where_a_walk_along_the_road_ends(scene: Scene) -> None:
+    picture = PAINTER.picture(scene)
+    for ahead in (5.0, 8.0, 12.0, 15.0):
+        for aside, bright in ((-1.75, True), (-1.55, False), (-1.95, False), (0.0, False)):
+            x, y = walked(scene, ahead, aside)
+            column, row = np.round(CAMERA.pixels_of(np.array(x), np.array(y))).astype(int)
+            assert (picture[row, column] > 150) == bright, (ahead, aside)
+
+
+def test_dashes_move_with_the_car() -> None:
+    def bright(s: float) -> list[bool]:
+        pixels = CAMERA.pixels_of(np.arange(5.0, 15.0, 0.5), np.array(1.75))
+        columns, rows = np.round(pixels).astype(int).T
+        return [bool(light > 150) for light in PAINTER.picture(Scene(s=s))[rows, columns]]
+
+    assert bright(2.0)[:-4] == bright(0.0)[4:] and bright(9.0) == bright(0.0)
+    assert 0.3 < np.mean([bright(s) for s in range(9)]) < 0.6
+
+
+def test_one_seed_one_picture() -> None:
+    noisy = Painter(CAMERA, Appearance(noise=5.0), rows=(300, 500))
+    first = noisy.picture(Scene(), (7, 33))
+    np.testing.assert_array_equal(first, noisy.picture(Scene(), (7, 33)))
+    for other in ((7, 34), (8, 33)):
+        assert (first != noisy.picture(Scene(), other)).mean() > 0.2
+    assert not first[:300].any() and not first[500:].any()
+    clear = Painter(CAMERA, CLEAR, rows=(300, 500)).picture(Scene())
+    np.testing.assert_array_equal(clear[300:500], PAINTER.picture(Scene())[300:500])
+    spread = (first.astype(float) - clear)[320:480][(clear == 85)[320:480]].std()
+    assert spread == pytest.approx(5.0, rel=0.05)
+
+
+def test_wear_takes_paint_and_shadow_light() -> None:
+    whole = PAINTER.picture(Scene())[320:]
+    for wear in (0.3, 1.0):
+        worn = Painter(CAMERA, replace(CLEAR, wear=wear)).picture(Scene())[320:]
+        assert (worn > 150).sum() / (whole > 150).sum() == pytest.approx(1.0 - wear, abs=0.1)
+    dark = Painter(CAMERA, replace(CLEAR, shadow=0.5)).picture(Scene())[320:]
+    assert 0.1 < (dark < whole).mean() < 0.7 and dark[dark < whole].max() <= 108
+
+
+def test_an_appearance_out_of_place_is_named() -> None:
+    for fields, said in (({"noise": -1.0}, "noise is zero"), ({"wear": 1.2}, "shares")):
+        with pytest.raises(ValueError, match=said):
+            Appearance(**fields)
