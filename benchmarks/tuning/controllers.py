@@ -35,7 +35,7 @@ from .task import STORAGE
 TRIALS = 60
 LOGS = Path(__file__).with_name("logs")
 """The studies whose options the package ships."""
-STAGES = (4, 8)
+STAGES = (2, 4, 8)
 """Seeds after which the better half of a slow contestant's trials goes on."""
 _UNTUNED: Options = {"filter": {}, "controller": {}}
 
@@ -96,9 +96,9 @@ def _nominal(contest: Contest, seeds: tuple[int, ...]) -> Array:
     return driven(contest, NOMINAL, _UNTUNED, seeds).costs
 
 
-def objective(task: Contestant, count: int, found: dict[str, float]) -> float:
-    """The mean over contests and the first seeds, infinite where nothing can be designed."""
-    options, seeds, logs = task.options(found), task.seeds[:count], []
+def objective(task: Contestant, seeds: tuple[int, ...], found: dict[str, float]) -> float:
+    """The mean over contests and some seeds, infinite where nothing can be designed."""
+    options, logs = task.options(found), []
     for contest in task.contests:
         mine = driven(contest, task.name, options, seeds)
         if mine.error:
@@ -113,14 +113,17 @@ def judge(
 ) -> list[tuple[float, int]]:
     """(objective, seeds driven) of each of a batch's trials.
 
-    Of a slow contestant's the worse half is left after each of `STAGES` (successive halving).
+    Of a slow contestant's the worse half is left after each of `STAGES` (successive halving); the
+    others go on with the seeds that they have not driven.
     """
     stages = [each for each in STAGES if task.name in SLOW and each < len(task.seeds)]
-    judged, going = [(math.inf, 0)] * len(batch), list(range(len(batch)))
+    judged, going, done = [(0.0, 0)] * len(batch), list(range(len(batch))), 0
     for count in (*stages, len(task.seeds)):
-        values = run_cases(partial(objective, task, count), [batch[i] for i in going], jobs=jobs)
+        new = task.seeds[done:count]
+        values = run_cases(partial(objective, task, new), [batch[i] for i in going], jobs=jobs)
         for i, value in zip(going, values, strict=True):
-            judged[i] = value, count
+            judged[i] = (judged[i][0] * done + value * len(new)) / count, count
+        done = count
         going = sorted(going, key=lambda i: judged[i])[: (len(going) + 1) // 2]
     return judged
 
