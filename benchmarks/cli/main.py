@@ -242,7 +242,7 @@ def bench(
 
 @app.command()
 def replay(
-    log: Annotated[Path, typer.Argument(help="A recorded drive, CSV or Parquet.")],
+    log: Annotated[Path, typer.Argument(help="A recorded drive: CSV, Parquet, or NMEA.")],
     vehicle: Vehicle = None,
     mapping: Mapping = None,
     course_rate: Annotated[float, typer.Option(help="Hz of the emulated course.")] = 10.0,
@@ -253,11 +253,29 @@ def replay(
     html: Html = None,
     json: Json = None,
     parquet: Parquet = None,
+    plot: Annotated[
+        Path | None, typer.Option(help="Draw a receiver's track: PNG, PDF, SVG.")
+    ] = None,
+    kml: Annotated[Path | None, typer.Option(help="Write a receiver's track for a map.")] = None,
 ) -> None:
-    """Run the estimators over a recorded drive and score them."""
+    """Run the estimators over a recorded drive and score them; over a receiver's log (NMEA), which
+    has no gyro, filter the fixes with noise that follows HDOP or does not."""
+    from ...envs.recordings.sources import is_nmea
     from ..recorded.suite import replay_file
 
-    check_files(html=html, json=json, parquet=parquet)
+    check_files(html=html, json=json, parquet=parquet, plot=plot, kml=kml)
+    if is_nmea(log):
+        from ..recorded.receiver_suite import draw, receiver_suite, replay_nmea, write_kml
+
+        received = replay_nmea(log, vehicle, mapping)
+        write_output(console, [receiver_suite(received)], html, json, parquet)
+        for path, write in ((plot, draw), (kml, write_kml)):
+            if path is not None:
+                write(path, received)
+                wrote(console, path)
+        return
+    if plot or kml:
+        raise ValueError(f"{log}: --plot and --kml are for a receiver's log (NMEA)")
     suite = replay_file(
         log,
         vehicle,

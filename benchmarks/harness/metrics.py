@@ -141,8 +141,8 @@ that ask for all of an input. failure: a code of `FAILURES`.
 """
 
 _OTHERS = {
-    "rad": "rmse static_slip drift",
-    "m": "offset",
+    "rad": "rmse static_slip drift course_prediction_error",
+    "m": "offset prediction_error",
     "m/s": "speed",
     "s": "cpu_seconds response_time",
     "us": "us_per_tick us_per_step us_per_decision",
@@ -151,7 +151,7 @@ _OTHERS = {
     "rad s2/m": "understeer_gradient",
     "-": "rmse_over_bound score cost_vs_nominal share_won worst_cost failure_rate spin_rate "
     "departure_rate saved_rate not_finite_rate bad_action_rate gap ratio difference residual rank "
-    "share spectral_radius count amplitude overshoot",
+    "share spectral_radius count amplitude overshoot log_likelihood nis",
 }
 METRICS = {metric.name: metric.unit for metric in EPISODE} | {
     name: unit for unit, names in _OTHERS.items() for name in names.split()

@@ -12,6 +12,7 @@ from ... import __version__
 from ...envs.record import Log
 from ...envs.recordings.columns import parse_mapping
 from ...envs.recordings.log_file import read_log
+from ...envs.recordings.sources import is_nmea
 from ...envs.vehicle.vehicle import Vehicle
 from ...envs.vehicle.vehicles import VehicleSource, vehicle_from
 from ..harness.drives import SETTLED
@@ -116,13 +117,18 @@ def replay_file(
     mapping: Sequence[str] | None = None,
     **settings: Any,
 ) -> Suite:
-    """Read a drive and its vehicle, replay it, and where it has truth the vehicle's corners too.
+    """Read a drive and its vehicle, replay it, and where it has truth the vehicle's corners too; a
+    receiver's log (NMEA) is replayed as `replay_nmea` does.
 
     vehicle: of `vehicle_from`: a name or a TOML or JSON file. None: the Ferrari
     250 LM of the Stanford log, with the fitted tyres x 0.7, and the corners of the nominal one.
     mapping: texts such as "steer_rad=Delta". settings: of `replay`. Raises what `read_log`,
     `vehicle_from` and `replay` do.
     """
+    if is_nmea(log):
+        from .receiver_suite import receiver_suite, replay_nmea
+
+        return receiver_suite(replay_nmea(log, vehicle, mapping))
     drive = read_log(log, parse_mapping(mapping or ()))
     if vehicle is None:
         fitted, nominal = vehicle_from(FITTED), vehicle_from(NOMINAL)

@@ -1,15 +1,12 @@
 """A drive's track for map programs: KML, its metres laid on the earth around an origin."""
 
-import math
 from xml.sax.saxutils import escape
 
 import numpy as np
-import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
+from ...envs.record import Array
+from ...envs.recordings.geodesy import degrees
 
-EARTH = 6_378_137.0  # m, equatorial radius of WGS 84
-ECCENTRICITY_SQUARED = 6.694379990e-3  # of WGS 84
 ORIGIN = (35.9015, 139.9378)  # deg north and east: a campus of the papers' authors, our choice
 _MOST = 2000  # points
 
@@ -30,18 +27,6 @@ _PLACE = """\
 {points}
 </coordinates></LineString>
 </Placemark>"""
-
-
-def degrees(X: Array, Y: Array, origin: tuple[float, float] = ORIGIN) -> tuple[Array, Array]:
-    """(latitude, longitude) in degrees of metres east and north of an origin.
-
-    On the tangent plane of the WGS 84 ellipsoid; within a kilometre the error is below 0.2 m.
-    """
-    phi = math.radians(origin[0])
-    w = 1.0 - ECCENTRICITY_SQUARED * math.sin(phi) ** 2
-    north = EARTH * (1.0 - ECCENTRICITY_SQUARED) / w**1.5  # radius of the meridian
-    east = EARTH / math.sqrt(w) * math.cos(phi)  # of the parallel
-    return origin[0] + np.degrees(Y / north), origin[1] + np.degrees(X / east)
 
 
 def track_kml(

@@ -114,6 +114,8 @@ def test_run_films_a_drive_with_another_beside(run: Run, tmp_path: Path) -> None
         (("list", "scenario"), "unknown kind of name 'scenario'; did you mean 'scenarios'"),
         (("bench", "weather"), "unknown suite 'weather'; known: estimation"),
         (("replay", "nowhere.csv"), "nowhere.csv"),
+        (("replay", "nowhere.nmea"), "nowhere.nmea: there is no such file"),
+        (("replay", "nowhere.csv", "--kml", "a.kml"), "--kml are for a receiver's log"),
         (("bench", "--log", "nowhere.csv"), "nowhere.csv"),
     ],
 )

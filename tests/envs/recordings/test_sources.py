@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from sideslip.envs.recordings.nmea import Decoder, Epoch
-from sideslip.envs.recordings.sources import Source, is_nmea, open_source, read_nmea
+from sideslip.envs.recordings.sources import Line, Source, is_nmea, open_source, read_nmea
 
 from .receiver import gga, rmc
 
@@ -98,6 +98,21 @@ def test_a_peer_that_only_closes_is_given_up() -> None:
         with pytest.raises(ConnectionError, match="not back after 3 tries"):
             list(source)
     assert 1 <= source.losses <= 4
+
+
+def test_a_line_is_opened_again_so_many_times_and_no_more() -> None:
+    opened = []
+
+    def lost() -> bytes:
+        raise ConnectionResetError("reset")
+
+    def connect() -> Line:
+        opened.append(1)
+        return Line(lost, lambda: None)
+
+    with pytest.raises(ConnectionError, match="quiet: lost, and not back after 3 tries: reset"):
+        list(Source("quiet", connect, tries=3, wait=0.0))
+    assert len(opened) == 1 + 3
 
 
 def test_garbage_of_a_peer_is_counted_and_what_follows_decoded() -> None:

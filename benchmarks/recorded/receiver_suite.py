@@ -1,0 +1,198 @@
+"""Question: do a receiver's fixes filter better with noise that follows HDOP? (NMEA logs)"""
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.stats import spearmanr
+
+from ... import __version__
+from ...envs.backend.files import whole
+from ...envs.record import Array
+from ...envs.recordings.nmea import Counts
+from ...envs.recordings.sources import read_nmea
+from ..harness.results import Row, Suite, Table, write_text
+from ..harness.stats import Estimate
+from ..harness.verdict import verdict
+from ..report.kml import track_kml
+from .receiver import LEAST_NOISE, SAME, Result, Signal, Track, compare, gain, signals, track_of
+
+DEGREES = 180.0 / math.pi
+TUNED, FIXED = "table", "constant"
+CLASSES = {"HDOP below 2": (0.0, 2.0), "2 to 5": (2.0, 5.0), "5 and more": (5.0, math.inf)}
+_NO_SAY = 0.01  # of log-likelihood a fix: nobody would notice
+_LOOSE = 0.3  # a rank correlation that explains little
+_ROWS = {"position": "prediction_error", "course": "course_prediction_error"}
+_ALL = {"likelihood": "log_likelihood", "square": "nis"}
+
+
+class Replay(NamedTuple):
+    """A receiver's log: its fixes, and each signal with the results of the laws."""
+
+    name: str
+    track: Track
+    found: list[tuple[Signal, dict[str, Result]]]
+    counts: Counts
+
+
+def replay_nmea(log: str | Path, *no_drive: object) -> Replay:
+    """Read a receiver's log and compare the laws of its noise on it (needs the extra `wires`).
+
+    no_drive: what only a drive with a gyro has, a vehicle and a mapping: None or empty. Raises what
+    `read_nmea` does, and ValueError, with the path, for a log too short to compare.
+    """
+    path = Path(log)
+    if any(no_drive):
+        raise ValueError(f"{path}: a receiver's log takes no vehicle and no mapping")
+    epochs, counts = read_nmea(path)
+    track = track_of(epochs)
+    try:
+        found = [(signal, compare(signal)) for signal in signals(track)]
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+    return Replay(f"{path.resolve().parent.name}/{path.stem}", track, found, counts)
+
+
+def receiver_suite(replay: Replay) -> Suite:
+    """The answer, the counts, the numbers of each law, the track."""
+    track = replay.track
+    low, middle, high = np.percentile(track.hdop, (5, 50, 95))
+    text = (
+        f"{track.t[-1] - track.t[0]:.0f} s with {len(track.t)} fixes; HDOP {middle:.1f}, from "
+        f"{low:.1f} to {high:.1f} in 90 % of them; {np.median(track.satellites):.0f} satellites. "
+        "A filter with a constant rate, disturbed by white noise, predicts each fix from those "
+        "before, where the car moves. Its two noises are those of maximum likelihood on the first "
+        "half of the log; all numbers are of the second."
+    )
+    suite = Suite("replay", f"A receiver's log: {replay.name}", text)
+    suite.verdict = answer(replay)
+    suite.rows = [row for signal, found in replay.found for row in _rows(replay, signal, found)]
+    suite.tables = [_table(signal, found) for signal, found in replay.found]
+    counts = [[what, str(n)] for what, n in replay.counts.rows()]
+    suite.tables.append(
+        Table("What came from the receiver", ("what", "count"), counts, keyed=False)
+    )
+    suite.figures = _figures(replay)
+    return suite
+
+
+def answer(replay: Replay) -> str:
+    """The verdict."""
+    tuned, fixed = (replay.found[0][1][law] for law in (TUNED, FIXED))
+    rank = float(spearmanr(fixed.hdop, fixed.error).statistic)
+    errors = [
+        f"{np.median(each.error):.2f} m ({np.percentile(each.error, 95):.1f} m)"
+        for each in (tuned, fixed)
+    ]
+    why = "." if abs(rank) > _LOOSE else ", as of a receiver that smooths its fixes."
+    return verdict(
+        *(_pays(signal.name, found) for signal, found in replay.found),
+        f"Error of the next fix, median (95 %): {errors[0]} tuned by HDOP, {errors[1]} constant.",
+        f"Why: the rank correlation of that error with HDOP is {rank:.2f}{why}",
+        "Not covered: how far fixes are from the truth; other receivers. Likelihood: nats a fix.",
+    )
+
+
+def _pays(name: str, found: Mapping[str, Result]) -> str:
+    value, low, high = gain(found[TUNED], found[FIXED])
+    what = f"Tuning the noise of {name} by HDOP"
+    if max(abs(low), abs(high)) < _NO_SAY:
+        return f"{what} changes nothing: log-likelihood {value:+.3f}."
+    how = "pays" if low > 0.0 else "costs" if high < 0.0 else "is not seen to pay"
+    return f"{what} {how}: log-likelihood {value:+.2f} [{low:.2f}, {high:.2f}]."
+
+
+def _rows(replay: Replay, signal: Signal, found: Mapping[str, Result]) -> list[Row]:
+    rows = []
+    for law, result in found.items():
+        where = {
+            "suite": "replay", "scenario": f"{replay.name}: {signal.name}", "estimator": law,
+            "n": len(result.error), "env_version": f"replay {__version__}",
+        }  # fmt: skip
+        rms = Estimate(float(np.sqrt(np.mean(result.error**2))))
+        rows.append(Row.of(_ROWS[signal.name], rms, **where))
+        for column, metric in _ALL.items():
+            rows.append(Row.of(metric, Estimate(float(getattr(result, column).mean())), **where))
+        if law != FIXED:
+            rows.append(Row.of("difference", gain(result, found[FIXED]), **where))
+    return rows
+
+
+def _table(signal: Signal, found: Mapping[str, Result]) -> Table:
+    scale, unit = (DEGREES, "deg") if signal.axes == 1 else (1.0, signal.unit)
+    cells = []
+    for law, result in found.items():
+        error = scale * result.error
+        more = "-"
+        if law != FIXED:
+            value, low, high = gain(result, found[FIXED])
+            more = f"{value:+.3f} [{low:.3f}, {high:.3f}]"
+        numbers = [np.median(error), np.sqrt(np.mean(error**2)), np.percentile(error, 95)]
+        numbers += [result.likelihood.mean(), result.square.mean()]
+        noise = f"{scale * result.r:.3g}" if result.r > 1.5 * LEAST_NOISE else "none seen"
+        cells.append([law, noise, *(f"{each:.2f}" for each in numbers), more])
+    header = ("noise", f"at HDOP 1 / {unit}", "median", "rms", "95 %", "log-likelihood", "NIS",
+              "against constant")  # fmt: skip
+    note = (
+        f"Errors in {unit} of {len(result.error)} fixes. constant, half, table: how the noise "
+        f"follows HDOP; {SAME}: what `table` has on average, while `constant` "
+        "has its own. NIS is 1 for a filter that knows its errors; intervals by blocks of fixes."
+    )
+    if signal.axes == 1:
+        note += " The noise of course is that at 1 m/s, it falls with speed."
+    return Table(f"The next {signal.name}, predicted", header, cells, note, keyed=False)
+
+
+def write_kml(path: Path, replay: Replay) -> None:
+    """The fixes as a track for a map."""
+    track = replay.track
+    fixes = {"fixes": (track.east, track.north)}
+    write_text(path, track_kml(replay.name, fixes, origin=track.origin))
+
+
+def _figures(replay: Replay) -> list[tuple[str, Any, str]]:
+    """The track by classes of HDOP, and HDOP over time; nothing without plotly."""
+    try:
+        from ..report.figures import time_series, track
+    except ModuleNotFoundError:
+        return []
+    now = replay.track
+    shown = {name: (_within(now, ends, now.east), now.north) for name, ends in CLASSES.items()}
+    time = now.t - now.t[0]
+    return [
+        (f"{replay.name}: the track", track(shown), "East and north of the first fix, by HDOP."),
+        (f"{replay.name}: HDOP", time_series(time, {"HDOP": now.hdop}, "HDOP"), ""),
+    ]
+
+
+def _within(track: Track, ends: tuple[float, float], values: Array) -> Array:
+    """The values where HDOP lies within the ends, else NaN."""
+    return np.where((track.hdop >= ends[0]) & (track.hdop < ends[1]), values, np.nan)
+
+
+def draw(path: Path, replay: Replay) -> None:
+    """The track and the errors of the next fix by HDOP, as a picture; needs the extra `report`."""
+    try:
+        from matplotlib.colors import LogNorm
+        from matplotlib.figure import Figure
+    except ModuleNotFoundError:
+        raise ModuleNotFoundError(
+            "pictures need matplotlib: pip install 'sideslip[report]'"
+        ) from None
+    track, result = replay.track, replay.found[0][1][FIXED]
+    figure = Figure(figsize=(10, 4.6), layout="constrained")
+    left, right = figure.subplots(1, 2, width_ratios=(4, 3))
+    look = {"c": track.hdop, "norm": LogNorm(1.0, 20.0), "cmap": "cividis_r", "s": 5}
+    dots = left.scatter(track.east, track.north, **look)
+    figure.colorbar(dots, ax=left, label="HDOP", ticks=[1, 2, 5, 10, 20], format="%g")
+    left.set(aspect="equal", adjustable="datalim", xlabel="east / m", ylabel="north / m")
+    left.set_title(replay.name, fontsize=10)
+    right.scatter(result.hdop, np.maximum(result.error, 0.01), s=6, color="#0072B2", alpha=0.5)
+    line = np.array([1.0, 20.0])
+    right.plot(line, line * np.median(result.error / result.hdop), color="#D55E00")
+    right.set(xscale="log", yscale="log", xlabel="HDOP", ylabel="error of the next fix / m")
+    right.set_title("line: errors that follow HDOP", fontsize=10)
+    with whole(path) as file:
+        figure.savefig(file, format=path.suffix[1:] or "png", dpi=100)

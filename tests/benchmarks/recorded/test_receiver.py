@@ -1,0 +1,167 @@
+"""Noise that follows HDOP is found to pay where it does, and to cost where it does not."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sideslip.benchmarks.harness.verdict import LETTERS, LINES
+from sideslip.benchmarks.recorded.receiver import (
+    SAME,
+    compare,
+    gain,
+    law_size,
+    predictions,
+    signals,
+    track_of,
+)
+from sideslip.benchmarks.recorded.receiver_suite import (
+    answer,
+    draw,
+    receiver_suite,
+    replay_nmea,
+    write_kml,
+)
+from sideslip.benchmarks.recorded.suite import replay_file
+from sideslip.envs.recordings.geodesy import degrees
+from sideslip.envs.recordings.nmea import Epoch
+from tests.envs.recordings.receiver import ABSENT, REASON, RECORDINGS, sentence
+
+ORIGIN = (48.0, 11.0)
+Q, NOISE = 2.0, 1.5
+
+
+def drive(weight: float, count: int = 700, seed: int = 0) -> list[Epoch]:
+    """Fixes of a car with white acceleration; the noise follows HDOP by so much."""
+    rng = np.random.default_rng(seed)
+    hdop = np.round(np.exp(rng.normal(0.9, 0.7, count)).clip(0.8, 15.0), 1)
+    force = np.array([[1 / 3, 1 / 2], [1 / 2, 1.0]]) * Q
+    x = np.array([[0.0, 0.0], [8.0, 8.0]])
+    epochs = []
+    for k in range(count):
+        x = np.array([[1.0, 1.0], [0.0, 1.0]]) @ x + np.linalg.cholesky(force) @ rng.normal(
+            size=(2, 2)
+        )
+        size = NOISE * law_size(hdop[k : k + 1], weight)[0]
+        place = x[0] + size * rng.normal(size=2)
+        speed = math.hypot(*x[1])
+        course = math.atan2(x[1, 1], x[1, 0]) + 0.05 * size / speed * rng.normal()
+        (north,), (east,) = degrees(place[:1], place[1:], ORIGIN)
+        epochs.append(Epoch(1e9 + k, north, east, course, speed, hdop[k], 8, 10, 1, 0.0))
+    return epochs
+
+
+def log_of(epochs: list[Epoch], path: Path) -> Path:
+    """The same drive as a receiver would write it."""
+    lines = b""
+    for e in epochs:
+        clock = math.floor(e.t) % 86400
+        time = f"{clock // 3600:02d}{clock // 60 % 60:02d}{clock % 60:02d}"
+        north, east = (
+            f"{math.floor(x):0{n}d}{x % 1 * 60:09.6f}"
+            for x, n in ((e.latitude, 2), (e.longitude, 3))
+        )
+        course, knots = (90.0 - math.degrees(e.course)) % 360.0, e.speed * 3600.0 / 1852.0
+        place = f"{north},N,{east},E"
+        lines += sentence(f"GPRMC,{time},A,{place},{knots:.3f},{course:.2f},090901,,,A")
+        lines += sentence(f"GPGGA,{time},{place},1,08,{e.hdop:.1f},500.0,M,46.0,M,,")
+    path.write_bytes(lines)
+    return path
+
+
+def test_predictions_are_gaussian_conditioning() -> None:
+    """On all fixes between the first, where the filter starts, and the one that is predicted."""
+    n, track = 12, track_of(drive(1.0, 12))
+    R = (NOISE * track.hdop) ** 2
+    signal = signals(track)[0]
+    where = signal.z
+    error, variance = predictions(signal, R, Q)
+    assert np.isnan(error[:4]).all() and np.isfinite(error[4:]).all()
+    step = np.array([[1.0, 1.0], [0.0, 1.0]])
+    state, full = np.diag([R[0], 400.0]), np.zeros((2 * n, 2 * n))
+    full[:2, :2] = state
+    for k in range(2, 2 * n, 2):
+        full[k : k + 2, :k] = step @ full[k - 2 : k, :k]
+        full[:k, k : k + 2] = full[k : k + 2, :k].T
+        state = step @ state @ step.T + Q * np.array([[1 / 3, 1 / 2], [1 / 2, 1.0]])
+        full[k : k + 2, k : k + 2] = state
+    z = (full[::2, ::2] + np.diag(R))[1:, 1:]
+    values = where[1:] - where[0]
+    for k in range(4, n):
+        weight = np.linalg.solve(z[: k - 1, : k - 1], z[: k - 1, k - 1])
+        assert variance[k] == pytest.approx(z[k - 1, k - 1] - weight @ z[: k - 1, k - 1], rel=1e-9)
+        assert error[k] == pytest.approx(abs(values[k - 1] - weight @ values[: k - 1]), rel=1e-6)
+
+
+def test_likelihood_finds_the_noise_and_who_follows_hdop_rightly_wins() -> None:
+    (position, _) = signals(track_of(drive(1.0)))
+    found = compare(position)
+    table = found["table"]
+    assert table.r == pytest.approx(NOISE, rel=0.15)
+    assert table.q == pytest.approx(Q, rel=0.35)
+    assert table.square.mean() == pytest.approx(1.0, abs=0.15)
+    assert gain(table, found[SAME]).low > 0.0 and gain(table, found["constant"]).low > 0.0
+    assert np.median(table.error) < np.median(found["constant"].error)
+
+
+def test_where_the_noise_is_constant_tuning_by_hdop_costs() -> None:
+    (position, _) = signals(track_of(drive(0.0)))
+    found = compare(position)
+    assert found["constant"].r == pytest.approx(NOISE, rel=0.15)
+    assert gain(found["table"], found["constant"]).high < 0.0
+
+
+def test_the_same_information_is_the_mean_of_the_inverse_variances() -> None:
+    (position, _) = signals(track_of(drive(1.0, 300)))
+    found = compare(position)
+    sizes = law_size(position.track.hdop, 1.0)[:150]
+    variances = (found["table"].r * sizes) ** 2
+    assert found[SAME].r ** -2 == pytest.approx(np.mean(1.0 / variances), rel=1e-9)
+
+
+def test_a_track_leaves_out_what_steps_back_and_starts_anew_where_the_clock_is_set() -> None:
+    epochs = drive(0.0, 40)
+    blind = epochs[5]._replace(hdop=math.nan)
+    lost = epochs[6]._replace(latitude=math.nan)
+    set_back = [each._replace(t=each.t - 500.0) for each in epochs[20:]]
+    track = track_of(
+        [*epochs[:5], blind, lost, *epochs[7:10], epochs[9], *epochs[10:20], *set_back]
+    )
+    assert len(track.t) == 38 and track.t[18] < track.t[17] - 400.0
+    assert track.east[0] == track.north[0] == 0.0
+    scored = np.isfinite(predictions(signals(track)[0], np.ones(38), Q)[0])
+    assert not scored[[0, 1, 2, 3, 18, 19, 20, 21]].any() and scored[22:].all()
+
+
+def test_a_log_is_answered_drawn_and_laid_on_the_map(tmp_path: Path) -> None:
+    path = log_of(drive(1.0, 400), tmp_path / "drive.txt")
+    replay = replay_nmea(path)
+    suite = receiver_suite(replay)
+    lines = suite.verdict.splitlines()
+    assert len(lines) <= LINES and max(map(len, lines)) <= LETTERS
+    assert lines[0].startswith("Tuning the noise of position by HDOP pays: log-likelihood +")
+    assert ["epochs", "400"] in [list(row) for row in suite.tables[-1].cells]
+    assert {row.metric for row in suite.rows} >= {"prediction_error", "log_likelihood", "nis"}
+    assert suite.figures
+    write_kml(tmp_path / "drive.kml", replay)
+    assert "11.0" in (tmp_path / "drive.kml").read_text()
+    draw(tmp_path / "drive.png", replay)
+    assert (tmp_path / "drive.png").read_bytes().startswith(b"\x89PNG")
+    assert replay_file(path).verdict == suite.verdict  # by its content, whatever its name
+    with pytest.raises(ValueError, match=r"drive\.txt: a receiver's log takes no vehicle"):
+        replay_file(path, "coms")
+
+
+def test_a_log_too_short_to_compare_is_refused_by_name(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"short\.nmea: \d+ fixes to score"):
+        replay_nmea(log_of(drive(1.0, 50), tmp_path / "short.nmea"))
+
+
+@pytest.mark.skipif(ABSENT, reason=REASON)
+@pytest.mark.parametrize("name", RECORDINGS)
+def test_the_recordings_are_answered(name: str) -> None:
+    replay = replay_nmea(RECORDINGS[name])
+    lines = answer(replay).splitlines()
+    assert len(lines) <= LINES and max(map(len, lines)) <= LETTERS
+    assert " costs: " in lines[0] if "munich" in name else " changes nothing: " in lines[0]
