@@ -95,7 +95,7 @@ def test_of_a_slow_contestant_the_worse_half_stops_early(
     best = log["best"]
     assert best["seeds"] == 16
     wanted = abs(math.log(best["numbers"]["grip"] / 0.5)) + 2 / 16
-    assert best["objective"] == pytest.approx(wanted, abs=1e-4)
+    assert best["objective"] == pytest.approx(wanted, abs=2e-3)  # numbers have three digits
     nearest = min(log["trials"], key=lambda row: abs(math.log(row["numbers"]["grip"] / 0.5)))
     assert best["numbers"] == nearest["numbers"]  # the best trial is never stopped
 
