@@ -14,6 +14,7 @@ from ...envs.task.failures import FAILURES
 from ...envs.ticks import TICK
 from ...envs.vehicle.dynamics import Motion
 from ...estimators.user_files import reason_of
+from ..harness.dissipation import dissipated
 from ..harness.metrics import EPISODE, FOLDS, Moment
 from .build import make_cars
 from .cells import Cell
@@ -84,8 +85,10 @@ class _Tally:
         self.aside += speed * (self.turned + info["beta"] - info["beta_ref"]) * self.dt
         torques = self.base.rows[:, -1, [FAST.torque_left, FAST.torque_right]]
         power = np.abs(torques).sum(axis=1) * speed / self.radius
+        heat = dissipated(self.base.params, self.base.states, self.base.switches)
         moment = Moment(
-            asked, self.before, step.reward, info, self.last, self.full, self.dt, self.aside, power
+            *(asked, self.before, step.reward, info, self.last, self.full, self.dt, self.aside),
+            *(power, heat),
         )
         for metric, total in zip(EPISODE, self.totals, strict=True):
             added = FOLDS[metric.fold].add(total, metric.of(moment))

@@ -111,7 +111,14 @@ class CachedDrive:
 def sources() -> str:
     """A hash of all files that an episode's numbers depend on."""
     digest = hashlib.sha256(source_stamp("agents").encode())
-    for name in ("build.py", "cells.py", "contests.py", "episodes.py", "../harness/metrics.py"):
+    for name in (
+        "build.py",
+        "cells.py",
+        "contests.py",
+        "episodes.py",
+        "../harness/metrics.py",
+        "../harness/dissipation.py",
+    ):
         digest.update((Path(__file__).parent / name).read_bytes())
     return digest.hexdigest()
 

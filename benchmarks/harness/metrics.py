@@ -20,7 +20,7 @@ class Moment(NamedTuple):
     asked: (N, 2) shares of the yaw moment and of the added steering. before: those of the last
     step. reward: (N,). info, last: the env's infos after and before the step. full: (2,) N m and
     rad at a share of 1. dt: s. aside: (N,) m that the car is beside the path of its reference.
-    power: (N,) W of the motors.
+    power: (N,) W of the motors. heat: (N,) W dissipated by the tyres.
     """
 
     asked: Array
@@ -32,6 +32,7 @@ class Moment(NamedTuple):
     dt: float
     aside: Array
     power: Array
+    heat: Array
 
 
 class Fold(NamedTuple):
@@ -106,6 +107,7 @@ EPISODE = (
         turning=True,
     ),
     Metric("motor_energy", "J", lambda m: m.power * m.dt, "sum", "motors / kJ", 1e-3),
+    Metric("tyre_dissipation", "J", lambda m: m.heat * m.dt, "sum", "tyres / kJ", 1e-3, 2),
     Metric(
         "effort", "-", lambda m: (m.info["yaw_moment"] / m.full[0]) ** 2, "mean", "effort", 1, 3
     ),
@@ -134,6 +136,7 @@ EPISODE = (
 
 path_error: the largest distance from the path that the reference's yaw rate and slip would drive
 from the same start. motor_energy: mechanical, both motors' work without regard to its sign.
+tyre_dissipation: by sliding sideways, both axles.
 effort: mean square share of the yaw moment that was delivered. moment_rate: how fast the delivered
 yaw moment changes, on average. steer_effort: mean square share of the added steering that was asked
 for. largest_step, largest_steer_step: between two decisions. saturation: share of the decisions

@@ -1,0 +1,42 @@
+"""The power that tyres dissipate by sliding sideways."""
+
+from typing import Any
+
+import numpy as np
+
+from ...envs.backend.arrays import read
+from ...envs.backend.decorators import jit
+from ...envs.backend.elementary import sincos
+from ...envs.engine.layout import P, Z
+from ...envs.engine.step import kind_of
+from ...envs.engine.tick import changed, standing_load
+from ...envs.record import Array
+from ...envs.vehicle.dynamics import gravity_at
+from ...envs.vehicle.tyres import tyre_forces
+
+
+def dissipated(params: Array, states: Array, switches: Any) -> Array:
+    """(N,) W: lateral force times the speed across the wheel, both axles, of N cars now.
+
+    params, states, switches: the engine's packed numbers, a row a car. Drive slip is not modelled.
+    """
+    out = np.empty(len(params))
+    _write(params, states, switches, out)
+    return out
+
+
+@jit
+def _write(params: Any, states: Any, switches: Any, out: Any) -> None:
+    for i in range(len(params)):
+        p, z = params[i], states[i]
+        motion, drive, change = read(z, Z.motion), read(z, Z.drive), read(p, P.change)
+        kind = kind_of(p, switches[i])
+        car = changed(read(p, P.car), change, z[Z.clock.tick] >= change.tick)
+        _, g_y = gravity_at(motion, read(p, P.road), kind.small_angle)
+        load = standing_load(drive, car, kind)
+        F_yf, F_yr, _, _ = tyre_forces(
+            motion, load, car, g_y, kind.small_angle, kind.law, kind.roll
+        )
+        sin_d, cos_d = sincos(drive.delta_f)
+        front = (motion.v_y + car.l_f * motion.gamma) * cos_d - motion.v_x * sin_d
+        out[i] = -F_yf * front - F_yr * (motion.v_y - car.l_r * motion.gamma)
