@@ -7,6 +7,7 @@ Importing this package registers its Gymnasium environments and loads nothing el
 >>> for name in sorted(name for name in gym.registry if name.startswith("sideslip/")):
 ...     print(name)
 sideslip/AfsYawFusion-v0
+sideslip/Highway-v0
 sideslip/Outside-v0
 sideslip/YawFusion-v0
 sideslip/YawGps-v0
@@ -65,8 +66,12 @@ for _id, _kwargs in _ENVIRONMENTS.items():
             vector_entry_point="sideslip.envs.vector:StabilityVectorEnv",
             kwargs=_kwargs,
         )
-if "sideslip/Outside-v0" not in registry:
-    register("sideslip/Outside-v0", entry_point="sideslip.envs.outside.env:OutsideEnv")
+for _id, _entry in {
+    "sideslip/Highway-v0": "sideslip.envs.highway.env:HighwayEnv",
+    "sideslip/Outside-v0": "sideslip.envs.outside.env:OutsideEnv",
+}.items():
+    if _id not in registry:
+        register(_id, entry_point=_entry)
 
 
 def __getattr__(name: str) -> Any:

@@ -122,7 +122,6 @@ class StabilityEnv(DrawnOne, gym.Env[npt.NDArray[np.float32], npt.NDArray[np.flo
         self.control_period, self.reference = int(control_period), reference
         self._now = self.config.base
         self._draw_in(render_mode)
-
         self.layout: tuple[Entry, ...] = self.config.layout
         self._bounds = self.config.bounds
         low, high = self._bounds.astype(np.float32)
@@ -139,8 +138,7 @@ class StabilityEnv(DrawnOne, gym.Env[npt.NDArray[np.float32], npt.NDArray[np.flo
         self.ticks_done = self.delivered = 0  # rows and packets of the newest record
         # the record as it stood before the newest reset: a vector env resets within a step
         self.final_rows, self.final_packets = self.rows.copy(), self.packets.copy()
-        self.final_ticks_done, self.final_delivered = 0, 0
-        self._over = True
+        self.final_ticks_done, self.final_delivered, self._over = 0, 0, True
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -157,10 +155,14 @@ class StabilityEnv(DrawnOne, gym.Env[npt.NDArray[np.float32], npt.NDArray[np.flo
         self._params = np.zeros(len(config.start.params))  # behind which a trace may be
         reset_vehicle(config.start, key & 0xFFFFFFFF, key >> 32, self._bounds, self._row(obs))
         self._over = False
+        self._begin()
         self.annotations, info = {}, self._info(1)
         if self._traces:
             self._seen()
         return obs, info
+
+    def _begin(self) -> None:
+        """What else begins with an episode whose tick 0 is packed."""
 
     def step(
         self, action: npt.ArrayLike
@@ -239,8 +241,7 @@ class StabilityEnv(DrawnOne, gym.Env[npt.NDArray[np.float32], npt.NDArray[np.flo
     def true_state(self) -> Array:
         """The `TrueState` now, (len(TrueState),); no sensor tells these."""
         rows = self._params[None], self._state[None], self._switches[None]
-        state: Array = true_states_in(*rows)[0]
-        return state
+        return np.asarray(true_states_in(*rows)[0])
 
     @property
     def nominal(self) -> Vehicle:

@@ -23,7 +23,7 @@ QUIET = "SIDESLIP_QUIET"
 
 _PACKAGE = Path(__file__).resolve().parents[2]
 LAYERS = ("envs", "estimators", "agents", "benchmarks")  # each calls only those before it
-_NOT_COMPILED = "rendering"
+_NOT_COMPILED = ("rendering", "highway")
 _VERSIONS = 12  # of the sources whose kernels stay on disk
 
 _logger = logging.getLogger("sideslip.compiler")
@@ -54,12 +54,12 @@ def source_stamp(layer: str = LAYERS[-1]) -> str:
 
     numba watches only the file of the function itself: an edit in a callee's module would
     otherwise silently give the numbers of the old text. Calls point one way, so an edit in
-    `benchmarks` leaves the kernels of `envs` alone. Pictures are not compiled and left out.
+    `benchmarks` leaves the kernels of `envs` alone. What compiles nothing is left out.
     """
     digest = hashlib.sha256()
     for folder in LAYERS[: LAYERS.index(layer) + 1]:
         for path in sorted((_PACKAGE / folder).rglob("*.py")):
-            if path.parent.name != _NOT_COMPILED:
+            if path.parent.name not in _NOT_COMPILED:
                 digest.update(str(path.relative_to(_PACKAGE)).encode())
                 digest.update(path.read_bytes())
     return digest.hexdigest()[:16]

@@ -27,7 +27,7 @@ _ROAD, _CLOSEUP, _STRIPS = (
 
 def draw(shot: Shot, name: str = "true", ghosts: Sequence[tuple[str, Shot]] = ()) -> pygame.Surface:
     """The picture of a car, under the name of its driver; ghosts drive beside it, with theirs."""
-    p, _, switches, _, config, trace, _ = shot
+    p, _, switches, _, config, trace, _, world = shot
     now = trace.now
     span = min(max(float(p[P.task.duration]) * TICK, 2.0), SPAN)
     first = max(now[MOMENT.t] - span, 0.0)
@@ -37,7 +37,8 @@ def draw(shot: Shot, name: str = "true", ghosts: Sequence[tuple[str, Shot]] = ()
     beside = [Driven(scene_of(each), each.trace.since(first)[0], GREY, who) for who, each in ghosts]
     canvas = Canvas(SIZE)
     canvas.area((0.0, 0.0, *SIZE), PAPER)
-    draw_road(canvas, _ROAD, [*beside, Driven(scene, truth, BLUE)])
+    if world is None:
+        draw_road(canvas, _ROAD, [*beside, Driven(scene, truth, BLUE)])
     newest = {label: (float(each[-1, 0]), shades[label]) for label, each in estimates.items()}
     known = {label: each for label, each in newest.items() if math.isfinite(each[0])}
     draw_closeup(canvas, _CLOSEUP, scene, now[MOMENT.beta], now[MOMENT.beta_ref], known)
@@ -49,7 +50,10 @@ def draw(shot: Shot, name: str = "true", ghosts: Sequence[tuple[str, Shot]] = ()
     _legend(canvas, name, [each for each, _ in ghosts], shades)
     failures = [("", scene.failure), *((each.name, each.scene.failure) for each in beside)]
     _heading(canvas, scene, config.scenario.name, now[MOMENT.t], failures)
-    return canvas.finished()
+    picture = canvas.finished()
+    if world is not None:
+        picture.blit(world((int(_ROAD[2]), int(_ROAD[3]))), _ROAD[:2])
+    return picture
 
 
 def _shades(labels: Iterable[str]) -> dict[str, str]:

@@ -73,7 +73,7 @@ class Scene(NamedTuple):
 
 def scene_of(shot: Shot) -> Scene:
     """The Scene of a Shot."""
-    p, z, switches, _, config, _, ours = shot
+    p, z, switches, _, config, _, ours, _ = shot
     fixed, kind = _fixed_of(p), _kind_of(p, switches)
     motion, drive, tick = read(z, Z.motion), read(z, Z.drive), float(z[Z.clock.tick])
     car = _changed(fixed.car, fixed.change, tick >= fixed.change.tick)

@@ -1,5 +1,6 @@
 """What an episode's pictures remember: the truth and the estimates of the steps so far."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -86,6 +87,7 @@ class Shot(NamedTuple):
     config: EpisodeConfig
     trace: Trace
     ours: bool = True  # its tyres are those of our plant
+    world: Callable[[tuple[int, int]], Any] | None = None  # draws the road instead, a surface
 
 
 def _grown(rows: Array) -> Array:

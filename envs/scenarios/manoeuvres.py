@@ -18,6 +18,7 @@ from .tiers import (
     SLALOM,
     STEP,
     TIERS,
+    WET_EVASION,
     random_of,
 )
 from .traces import TABLES, trace_from
@@ -122,6 +123,7 @@ _ROADS = (
         name="curved-road", half_width=1.75, **_BEND, **_HARSH
     ),
     Scenario(name="curved-road-driver", **_LANE, **_BEND, **_HARSH),
+    WET_EVASION,
 )
 
 SCENARIOS: dict[str, Scenario] = {

@@ -164,4 +164,19 @@ _RECOVERY = Scenario(
     **_COMS,
 )
 
+# Not scored either: what is drawn where a driver swerves around others, on `sideslip/Highway-v0`.
+WET_EVASION = Scenario(
+    name="wet-evasion",
+    duration=6.0,
+    steering="driver",
+    **_CAR
+    | {
+        "speed": (75.0 * KMH, 100.0 * KMH),
+        "driver_gain": 2.0,  # startled
+        "friction": (0.4, 0.7),
+        "nominal": _CAR_PLANT | {"friction": 0.55},
+        "camera_offset": 6.0,
+    },
+)
+
 TIERS: tuple[Scenario, ...] = (*_ONE, *_TWO_A, *_TWO_B, *_TWO_C, _RECOVERY)

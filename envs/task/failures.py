@@ -5,8 +5,8 @@ from typing import Any
 from ..backend.decorators import jit
 from ..backend.primitives import select
 
-RUNNING, SPIN, OFF_ROAD, NOT_FINITE, BAD_ACTION = range(5)
-FAILURES = ("none", "spin", "off-road", "not-finite", "bad-action")
+RUNNING, SPIN, OFF_ROAD, NOT_FINITE, BAD_ACTION, COLLISION, DEPARTURE = range(7)
+FAILURES = ("none", "spin", "off-road", "not-finite", "bad-action", "collision", "departure")
 REFUSED = -1
 
 

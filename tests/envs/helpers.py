@@ -15,7 +15,8 @@ IDS = tuple(
     sorted(
         name
         for name in gymnasium.registry
-        if name.startswith("sideslip/") and name != "sideslip/Outside-v0"  # needs an extra
+        if name.startswith("sideslip/")
+        and name not in ("sideslip/Highway-v0", "sideslip/Outside-v0")  # which need extras
     )
 )
 

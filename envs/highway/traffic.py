@@ -1,0 +1,227 @@
+"""The vehicles on a road: highway-env's own, one of which brakes, and our car among them."""
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..arguments import is_finite, mapping_of, unknown_names
+from ..rendering.road import body
+from ..scenarios.draws import Range, range_of
+from ..scenarios.tracks import Path
+from ..vehicle.dynamics import Motion
+from ..vehicle.vehicle import GRAVITY, Vehicle
+from .roads import ROADS, WIDTH, Course, Place, place_on
+
+from highway_env.road.road import Road  # isort: skip  # after `roads`, which names the extra
+from highway_env.vehicle.behavior import IDMVehicle  # isort: skip
+from highway_env.vehicle.kinematics import Vehicle as HighwayVehicle  # isort: skip
+from highway_env.vehicle.objects import Obstacle  # isort: skip
+
+PERIOD = 50  # ticks between two steps of the road
+_STEP = 1e-3 * PERIOD
+_SHORTEST = 0.8  # s, in which no driver changes lanes faster
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Hazard:
+    """The vehicle ahead that brakes, and the driver who swerves around it late.
+
+    Each is a range that the seed draws from. headway: s between the bumpers, both cars being as
+    fast. onset: s at which it brakes. braking: share of the road's grip that it brakes with.
+    reaction: s after which our driver swerves. haste: time of the lane change over the time that is
+    left until the cars would meet. stay: s in the free lane, behind the standing vehicle, before
+    the driver comes back.
+
+    Raises ValueError for what is no range of positive numbers.
+    """
+
+    headway: Range = (0.5, 0.8)
+    onset: Range = (0.3, 0.8)
+    braking: Range = (0.8, 1.0)
+    reaction: Range = (0.7, 1.0)
+    haste: Range = (1.0, 1.9)
+    stay: Range = (0.0, 0.5)
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            ends = list(value) if isinstance(value, list | tuple) else [value, value]
+            if len(ends) != 2 or not all(map(is_finite, ends)) or not 0.0 <= ends[0] <= ends[1]:
+                raise ValueError(
+                    f"hazard: {name} is a number or (low, high) from 0 on, got {value}"
+                )
+            object.__setattr__(self, name, tuple(map(float, ends)))
+
+
+def hazard_from(source: Mapping[str, Any] | None) -> Hazard | None:
+    """A hazard of a mapping of its fields, {} for the usual one; None for none.
+
+    Raises TypeError for an unknown field, ValueError for a value out of place.
+    """
+    if source is None:
+        return None
+    known = [entry.name for entry in dataclasses.fields(Hazard)]
+    values = dict(mapping_of("hazard", source))
+    if unknown := [name for name in values if name not in known]:
+        raise TypeError(unknown_names("field of hazard", unknown, known))
+    return Hazard(**values)
+
+
+class Start(NamedTuple):
+    """What the engine drew for an episode."""
+
+    vehicle: Vehicle
+    motion: Motion
+    speed: float  # m/s, that our driver holds
+    friction: float
+
+
+class OurCar(HighwayVehicle):  # type: ignore[misc]
+    """Our car as the others see it: it is where it was put, and a vehicle like any other."""
+
+    def __init__(self, road: Any, start: Start) -> None:
+        front, rear, half = body(start.vehicle)
+        self.LENGTH, self.WIDTH, self._centre = front - rear, 2.0 * half, 0.5 * (front + rear)
+        self.target_speed = start.speed  # which those who would merge ahead of it ask for
+        super().__init__(road, [0.0, 0.0])
+        self.put(start.motion)
+        self.on_state_update()
+
+    def put(self, motion: Motion) -> None:
+        """Move to a Motion of ours; the body's centre is not the centre of gravity."""
+        ahead = np.array([math.cos(motion.psi), -math.sin(motion.psi)])
+        self.position = np.array([motion.X, -motion.Y]) + self._centre * ahead
+        self.heading: float = -motion.psi
+        self.speed: float = motion.v_x
+        self._velocity = motion.v_x * ahead + motion.v_y * np.array([ahead[1], -ahead[0]])
+
+    @property
+    def velocity(self) -> Any:
+        """With the sideslip that other vehicles have none of."""
+        return self._velocity
+
+    def act(self, action: Any = None) -> None:
+        """Nothing: its driver is ours."""
+
+    def step(self, dt: float) -> None:
+        """Take part in a step of the road; an impact foreseen in the last one is a crash, as it is
+        to highway-env's own vehicles."""
+        self.crashed |= self.impact is not None
+        self.on_state_update()
+
+
+class BrakingVehicle(IDMVehicle):  # type: ignore[misc]
+    """An IDM vehicle in its lane that from a time on brakes until it stands."""
+
+    def __init__(self, road: Any, position: Any, speed: float, onset: float, rate: float) -> None:
+        super().__init__(road, position, speed=speed, target_speed=speed, enable_lane_change=False)
+        self.left, self.rate = onset, rate
+        self.speed: float = speed
+
+    def act(self, action: Any = None) -> None:
+        """Follow the road; brake when it is time."""
+        super().act(action)
+        if self.left <= 0.0 and not self.crashed:
+            self.action["acceleration"] = -self.rate
+
+    def step(self, dt: float) -> None:
+        """A step, of which none goes backwards."""
+        self.left -= dt
+        super().step(dt)
+        self.speed = max(self.speed, 0.0)
+
+
+class Traffic:
+    """A road with its vehicles in an episode, and our car's place on its lanes.
+
+    All that is random is drawn from `key`. others: how many vehicles beside the braking one.
+    """
+
+    def __init__(
+        self, road: str, start: Start, hazard: Hazard | None, others: int, key: int
+    ) -> None:
+        random = np.random.Generator(np.random.Philox(key=[key, 0]))
+        self.course: Course = ROADS[road](1 if random.random() < 0.5 else -1)
+        self.road = Road(
+            self.course.network, np_random=random, neighbour_vehicles_connected_lanes=True
+        )
+        self.ours = OurCar(self.road, start)
+        self.road.vehicles.append(self.ours)
+        self._lane = 0
+        self.path: Path | None = None
+        if hazard is not None:
+            self.path = self._endanger(hazard, start)
+        self._populate(others, start)
+
+    def _endanger(self, hazard: Hazard, start: Start) -> Path:
+        """Put the vehicle that brakes ahead of us; the path of the driver who swerves around it."""
+        random = self.road.np_random
+        draw = {name: random.uniform(*range_of(ends)) for name, ends in vars(hazard).items()}
+        v, rate = start.speed, max(draw["braking"] * start.friction * GRAVITY, 0.1)
+        gap = draw["headway"] * v
+        ahead = 0.5 * (self.ours.LENGTH + BrakingVehicle.LENGTH) + gap
+        place = np.array([self.ours.position[0] + ahead, 0.0])
+        self.road.vehicles.append(BrakingVehicle(self.road, place, v, draw["onset"], rate))
+        meeting = math.sqrt(2.0 * gap / rate)  # s after the onset, while it still moves
+        if meeting > v / rate:
+            meeting = gap / v + 0.5 * v / rate
+        begin = v * (draw["onset"] + draw["reaction"])
+        length = v * max(draw["haste"] * (meeting - draw["reaction"]), _SHORTEST)
+        stands = place[0] + v * draw["onset"] + 0.5 * v * v / rate + BrakingVehicle.LENGTH
+        back = max(begin + length, stands) + v * draw["stay"]
+        shift = WIDTH if self.course.free < self.course.own else -WIDTH
+        return Path(shift, begin, length, -shift, back, length)
+
+    def _populate(self, others: int, start: Start) -> None:
+        """IDM vehicles ahead and behind in both lanes, and on the ramp if there is one."""
+        random, course = self.road.np_random, self.course
+        slots = [
+            (course.free, 80.0),
+            (course.own, -35.0),
+            (course.own, 120.0),
+            (course.free, -45.0),
+        ]
+        for i in range(others):
+            speed = start.speed * random.uniform(0.95, 1.05)
+            if course.ramp is not None and i == 0:
+                lane = course.network.get_lane(course.ramp)
+                position = lane.position(110.0 - lane.start[0] - 60.0 * random.random(), 0.0)
+            else:
+                index, ahead = slots[i % len(slots)]
+                far = ahead + math.copysign(45.0 * (i // len(slots)), ahead)
+                lateral = 0.0 if index == course.own else WIDTH * (index - course.own)
+                position = np.array([far + random.uniform(-8.0, 8.0), lateral])
+            self.road.vehicles.append(
+                IDMVehicle(self.road, position, speed=speed, target_speed=speed)
+            )
+        if course.ramp is not None:
+            end = course.network.graph["b"]["c"][-1]
+            self.road.objects.append(Obstacle(self.road, end.position(end.length, 0.0)))
+
+    def follow(self, motion: Motion) -> None:
+        """A step of the road, at whose end our car is at a Motion."""
+        self.ours.put(motion)
+        self.road.act()
+        self.road.step(_STEP)
+
+    @property
+    def crashed(self) -> bool:
+        """Whether our car hit another."""
+        return bool(self.ours.crashed)
+
+    @property
+    def departed(self) -> bool:
+        """Whether the whole of our car's width is beyond the road's edge line."""
+        ours = self.ours
+        return not bool(ours.lane.on_lane(ours.position, margin=0.5 * ours.WIDTH))
+
+    def place(self, motion: Motion) -> Place:
+        """Our car's place on the lanes that it follows."""
+        route = self.course.route
+        here = place_on(route[self._lane], motion.X, motion.Y, motion.psi)
+        while here.along > route[self._lane].length and self._lane + 1 < len(route):
+            self._lane += 1
+            here = place_on(route[self._lane], motion.X, motion.Y, motion.psi)
+        return here
