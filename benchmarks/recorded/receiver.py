@@ -25,7 +25,7 @@ from ..harness.stats import Estimate, interval
 SAME = "constant, same information"
 GAP = 10.0  # s without a fix, or back, after which the filter starts anew
 SETTLED = 3  # fixes after a start that are not scored
-LEAST = 60  # scored fixes of a half
+LEAST = 120  # scored fixes
 BLOCK = 30  # fixes of a bootstrap's block
 LEAST_NOISE = 1e-3  # in m or rad: r of a log that shows none
 _LIMITS = math.log(LEAST_NOISE), math.log(1e4)  # of q and r
@@ -70,7 +70,8 @@ def track_of(epochs: Sequence[Epoch]) -> Track:
 
 class Signal(NamedTuple):
     """What is filtered: name, unit, axes (two: real and imaginary part), values (n,), the noise's
-    own size (n,), the standard deviation of a rate at the start, and which fixes are scored."""
+    own size (n,), the standard deviation of a rate at the start, which fixes are scored, and the
+    row at which half of these lie behind."""
 
     name: str
     unit: str
@@ -80,6 +81,7 @@ class Signal(NamedTuple):
     spread: float
     track: Track
     scored: Mask
+    half: int = 0
 
 
 class Result(NamedTuple):
@@ -95,27 +97,35 @@ class Result(NamedTuple):
 
 
 def signals(track: Track) -> list[Signal]:
-    """Position, scored where the car moves, and course, which has a meaning there alone."""
+    """Position, scored where the car moves, and course, which has a meaning there alone; those
+    with `LEAST` fixes to score.
+
+    Raises ValueError where position has fewer.
+    """
     moving: Mask = ~(track.speed < COURSE_SPEED)  # an unknown speed may be one
     where = np.asarray(track.east + 1j * track.north, np.complex128)
-    found = [Signal("position", "m", 2, where, np.ones(len(where)), 20.0, track, moving)]
+    position = Signal("position", "m", 2, where, np.ones(len(where)), 20.0, track, moving)
     part = track.of((track.speed >= COURSE_SPEED) & np.isfinite(track.course))
-    if len(part.t) > 2 * LEAST:
-        whole: Mask = np.ones(len(part.t), bool)
-        course = np.asarray(part.course, np.complex128)
-        found.append(Signal("course", "rad", 1, course, 1.0 / part.speed, 0.5, part, whole))
+    whole: Mask = np.ones(len(part.t), bool)
+    angle = np.asarray(part.course, np.complex128)
+    course = Signal("course", "rad", 1, angle, 1.0 / part.speed, 0.5, part, whole)
+    found = []
+    for signal in (position, course):
+        known = signal.scored & np.isfinite(predictions(signal, signal.own**2, 1.0)[0])
+        rows = np.flatnonzero(known)
+        if len(rows) >= LEAST:
+            found.append(signal._replace(scored=known, half=int(rows[len(rows) // 2])))
+        elif signal is position:
+            raise ValueError(f"{len(rows)} fixes to score, where the car moves; {LEAST} are needed")
     return found
 
 
 def compare(signal: Signal) -> dict[str, Result]:
     """Each law of the noise, q and r at their maximum likelihood on the first half; and one noise
-    for all with the average information of the law `table`.
-
-    Raises ValueError for too few fixes.
-    """
+    for all with the average information of the law `table`."""
+    half = signal.half
     sizes = {name: law_size(signal.track.hdop, weight) for name, weight in HDOP_LAWS.items()}
     found = {name: _best(signal, size) for name, size in sizes.items()}
-    half = len(signal.z) // 2
     table = (sizes["table"] * signal.own)[:half]
     own = signal.own[:half]
     r = found["table"].r * math.sqrt(np.mean(own**-2.0) / np.mean(table**-2.0))
@@ -129,17 +139,16 @@ def law_size(hdop: Array, weight: float) -> Array:
     return np.asarray(1.0 + weight * (np.interp(hdop, knots, factors) - 1.0))
 
 
-def gain(result: Result, other: Result, column: str = "likelihood") -> Estimate:
-    """The mean of a column less that of another law on the same fixes, by blocks of fixes."""
-    difference = getattr(result, column) - getattr(other, column)
+def gain(result: Result, other: Result) -> Estimate:
+    """The mean log-likelihood less that of another law on the same fixes, by blocks of fixes."""
+    difference = result.likelihood - other.likelihood
     blocks = np.array_split(difference, max(len(difference) // BLOCK, 1))
     return interval(np.array([block.mean() for block in blocks]))
 
 
 def _best(signal: Signal, size: Array, r: float | None = None) -> Result:
     """The filter at its maximum likelihood on the first half: the best of a grid, then refined."""
-    half = len(signal.z) // 2
-    early = np.arange(len(signal.z)) < half
+    half = signal.half
 
     def scores(p: Array, count: int) -> tuple[Array, Array, Array]:
         q, noise = np.exp(p)
@@ -149,7 +158,7 @@ def _best(signal: Signal, size: Array, r: float | None = None) -> Result:
 
     def cost(p: Array) -> float:
         p = np.clip(p, *_LIMITS) if r is None else np.array([*p[:1], math.log(r)])
-        return -float(np.nanmean(scores(p, half)[1][signal.scored[:half]]))
+        return -float(np.mean(scores(p, half)[1][signal.scored[:half]]))
 
     axes = [_GRID] * (2 if r is None else 1)
     first = min(itertools.product(*axes), key=lambda p: cost(np.array(p)))
@@ -157,9 +166,7 @@ def _best(signal: Signal, size: Array, r: float | None = None) -> Result:
     p = minimize(cost, first, method="Nelder-Mead", options={"initial_simplex": simplex}).x
     p = np.clip(p, *_LIMITS) if r is None else np.array([p[0], math.log(r)])
     error, likelihood, square = scores(p, len(signal.z))
-    late = signal.scored & ~early & np.isfinite(error)
-    if late.sum() < LEAST:
-        raise ValueError(f"{late.sum()} fixes to score; the comparison needs {LEAST} in each half")
+    late = signal.scored & (np.arange(len(signal.z)) >= half)
     q, noise = np.exp(p)
     hdop = signal.track.hdop
     return Result(noise, q, error[late], likelihood[late], square[late], hdop[late])

@@ -9,6 +9,8 @@ import pytest
 from sideslip.benchmarks.harness.verdict import LETTERS, LINES
 from sideslip.benchmarks.recorded.receiver import (
     SAME,
+    Signal,
+    Track,
     compare,
     gain,
     law_size,
@@ -70,11 +72,17 @@ def log_of(epochs: list[Epoch], path: Path) -> Path:
     return path
 
 
+def position_of(track: Track) -> Signal:
+    n = len(track.t)
+    where = np.asarray(track.east + 1j * track.north, np.complex128)
+    return Signal("position", "m", 2, where, np.ones(n), 20.0, track, np.ones(n, bool))
+
+
 def test_predictions_are_gaussian_conditioning() -> None:
     """On all fixes between the first, where the filter starts, and the one that is predicted."""
     n, track = 12, track_of(drive(1.0, 12))
     R = (NOISE * track.hdop) ** 2
-    signal = signals(track)[0]
+    signal = position_of(track)
     where = signal.z
     error, variance = predictions(signal, R, Q)
     assert np.isnan(error[:4]).all() and np.isfinite(error[4:]).all()
@@ -115,7 +123,7 @@ def test_where_the_noise_is_constant_tuning_by_hdop_costs() -> None:
 def test_the_same_information_is_the_mean_of_the_inverse_variances() -> None:
     (position, _) = signals(track_of(drive(1.0, 300)))
     found = compare(position)
-    sizes = law_size(position.track.hdop, 1.0)[:150]
+    sizes = law_size(position.track.hdop, 1.0)[: position.half]
     variances = (found["table"].r * sizes) ** 2
     assert found[SAME].r ** -2 == pytest.approx(np.mean(1.0 / variances), rel=1e-9)
 
@@ -130,7 +138,7 @@ def test_a_track_leaves_out_what_steps_back_and_starts_anew_where_the_clock_is_s
     )
     assert len(track.t) == 38 and track.t[18] < track.t[17] - 400.0
     assert track.east[0] == track.north[0] == 0.0
-    scored = np.isfinite(predictions(signals(track)[0], np.ones(38), Q)[0])
+    scored = np.isfinite(predictions(position_of(track), np.ones(38), Q)[0])
     assert not scored[[0, 1, 2, 3, 18, 19, 20, 21]].any() and scored[22:].all()
 
 
@@ -153,9 +161,18 @@ def test_a_log_is_answered_drawn_and_laid_on_the_map(tmp_path: Path) -> None:
         replay_file(path, "coms")
 
 
-def test_a_log_too_short_to_compare_is_refused_by_name(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"short\.nmea: \d+ fixes to score"):
-        replay_nmea(log_of(drive(1.0, 50), tmp_path / "short.nmea"))
+@pytest.mark.parametrize("sparse", [False, True], ids=["few", "too far apart"])
+def test_a_log_too_short_to_compare_is_refused_by_name(tmp_path: Path, sparse: bool) -> None:
+    epochs = drive(1.0, 400 if sparse else 50)
+    far = [each._replace(t=each.t + 20.0 * k * sparse) for k, each in enumerate(epochs)]
+    with pytest.raises(ValueError, match=r"short\.nmea: \d+ fixes to score, where the car moves"):
+        replay_nmea(log_of(far, tmp_path / "short.nmea"))
+
+
+def test_a_log_without_hdop_is_refused(tmp_path: Path) -> None:
+    path = log_of([each._replace(hdop=math.nan) for each in drive(0.0, 200)], tmp_path / "a.nmea")
+    with pytest.raises(ValueError, match=r"a\.nmea: 0 fixes to score"):
+        replay_nmea(path)
 
 
 @pytest.mark.skipif(ABSENT, reason=REASON)
