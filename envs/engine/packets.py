@@ -48,6 +48,19 @@ def _capture(z: Any, sensor: int, link: Any, tick: Any, key: Any, v: Any, q: Any
 
 
 @jit
+def note(z: Any, packet: Any, tick: Any) -> None:
+    """A packet (PACKET_WIDTH,) that is here becomes its sensor's newest sample, if it is newer."""
+    sensor = int(packet[PACKET.sensor])
+    newest = Z.slow[sensor]
+    nothing = SEES[sensor] and packet[PACKET.quality] <= 0.0
+    if not nothing and packet[PACKET.captured] > z[newest.captured]:
+        z[newest.captured] = packet[PACKET.captured]
+        for i in range(VALUES):
+            z[newest.values[0] + i] = packet[PACKET.value + i]
+        z[newest.arrived] = tick
+
+
+@jit
 def _deliver(z: Any, tick: Any, packets: Any, count: int) -> int:
     """Move the packets that arrive at this tick into `packets`; returns the new count."""
     while True:
@@ -67,14 +80,7 @@ def _deliver(z: Any, tick: Any, packets: Any, count: int) -> int:
             return count
         for i in range(PACKET_WIDTH):
             packets[count, i] = z[best + i]
-        sensor = int(z[best + PACKET.sensor])
-        newest = Z.slow[sensor]
-        nothing = SEES[sensor] and z[best + PACKET.quality] <= 0.0
-        if not nothing and z[best + PACKET.captured] > z[newest.captured]:
-            z[newest.captured] = z[best + PACKET.captured]
-            for i in range(VALUES):
-                z[newest.values[0] + i] = z[best + PACKET.value + i]
-            z[newest.arrived] = tick
+        note(z, packets[count], tick)
         last = Z.queue + (under_way - 1) * PACKET_WIDTH  # it takes the free place
         for i in range(PACKET_WIDTH):
             z[best + i] = z[last + i]

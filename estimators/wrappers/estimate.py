@@ -14,7 +14,7 @@ from ...envs.vehicle.vehicles import VehicleSource
 from ..estimator import Estimator
 from .arguments import AnyEstimator, Arguments, Setup, Source, setup_of
 from .kernel import observe_entry
-from .outputs import BETA, STD, outputs_of, titled, write
+from .outputs import BETA, STD, Outputs, outputs_of, titled, write
 from .truth import as_built, set_stiffness
 
 _MAY_STAND_BETWEEN = (PassiveEnvChecker, OrderEnforcing, TimeLimit)
@@ -44,9 +44,9 @@ class EstimateObservation(
     `info` gains `beta_hat` and `beta_std` where the estimator has beta and, if beta or gamma is
     among the outputs, `nees`: their normalised estimation error squared, divided by their number.
     An estimate that is not finite is passed on, so that controllers and the env see the failure.
-    `layout` describes the whole observation; `estimator` is the estimator at work, around a user's
-    own as a `ForeignEstimator`. In `spec` a factory that can be imported stands as its entry point;
-    `spec.to_json()` refuses others and objects with TypeError.
+    `layout` describes the whole observation, `outputs` what is appended; `estimator` is the
+    estimator at work, around a user's own as a `ForeignEstimator`. In `spec` a factory that can be
+    imported stands as its entry point; `spec.to_json()` refuses others and objects with TypeError.
 
     Raises TypeError if it is not the innermost wrapper, the env has no record or the estimator is
     none; ValueError for an unknown output, where names would stand twice, or for an object with a
@@ -83,9 +83,9 @@ class EstimateObservation(
         self.estimator: AnyEstimator = self._configured()
         inner: tuple[Entry, ...] = () if replace else env.get_wrapper_attr("layout")
         states, label = self.estimator.names, self._arguments.label
-        self._outputs = outputs_of(label, states, outputs, std, name, inner)
-        self.layout: tuple[Entry, ...] = self._outputs.layout
-        low, high = self._outputs.bounds
+        self.outputs: Outputs = outputs_of(label, states, outputs, std, name, inner)
+        self.layout: tuple[Entry, ...] = self.outputs.layout
+        low, high = self.outputs.bounds
         self.observation_space = gym.spaces.Box(low, high, dtype=np.float32)
         self._width, self._title = len(self.layout), titled(label, name)
         self._summary = np.zeros(3)
@@ -134,7 +134,7 @@ class EstimateObservation(
         self, obs: npt.NDArray[np.float32], info: dict[str, Any]
     ) -> npt.NDArray[np.float32]:
         """The estimator takes the newest step; the observation with its outputs, (width,)."""
-        base, outputs, summary = self._base, self._outputs, self._summary
+        base, outputs, summary = self._base, self.outputs, self._summary
         estimator: Any = self.estimator
         out, rows, done = np.empty(self._width, np.float32), base.ticks_done, 0
         last = outputs.inner, outputs.plan, outputs.limits, info["beta"], info["gamma"]

@@ -1,0 +1,156 @@
+"""From datagrams to ticks: fast rows and packets as estimators take them, whatever came.
+
+Time is that of the inertial stamps, so that two clocks may drift apart. A fast row ends its tick;
+packets of slow sensors go with the next row. What is lost or late is counted and bridged by the
+last row, held. The same batches give the same ticks, which is how a session is replayed.
+"""
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from ...envs.record import FAST_WIDTH, PACKET, PACKET_WIDTH
+from ...envs.ticks import TICK
+from .datagrams import SENSORS, STAMP, Bad, Kind, Message, decode
+
+Array = npt.NDArray[np.float64]
+
+PATIENCE = 10  # ticks of silence, from which on the last row is held
+MOST_HELD = 1000  # ticks that are bridged; a longer gap begins anew
+MOST_BEHIND = 100  # rows from the past in succession: then the sender's clock was set back
+WINDOW = 1024  # sequence numbers; an older one is of a sender that began anew
+MOST_WAITING = 64  # packets of slow sensors before a fast row
+_INPUTS = (Kind.INERTIAL, Kind.END, *SENSORS)
+NO_PACKETS = np.zeros((0, PACKET_WIDTH))
+BRIDGED = ("lost", "restarted", "held", "late", "begun anew", "dropped")
+"""What is counted beside `Bad`: sequence numbers that never came, senders that began anew, ticks
+without a row, rows behind their tick, gaps too long to be bridged, packets without a row."""
+
+
+class Arrival(NamedTuple):
+    """A datagram, when it came in ns of the monotonic clock, and from where."""
+
+    at: int
+    data: bytes
+    sender: Any = None
+
+
+class Tick(NamedTuple):
+    """What the wires carried at a tick."""
+
+    number: int
+    row: Array  # (FAST_WIDTH,)
+    steer_next: float  # rad, the driver's command from now on
+    packets: Array  # (count, PACKET_WIDTH)
+    begins: bool  # forget everything before
+
+
+class Assembler:
+    """Makes ticks of datagrams.
+
+    patience: calls of `take` without a fast row, from which on the last one is held; None: for
+    ever. `counts`: of what was ignored, by `Bad` and `BRIDGED`. `sender`: of the newest row.
+    `accepted`: datagrams of the newest batch. `over`: whether the drive's end came. `silent`: calls
+    since the last fast row.
+    """
+
+    def __init__(self, patience: int | None = PATIENCE) -> None:
+        self.patience = patience
+        self.counts: Counter[str] = Counter({name: 0 for name in (*Bad, *BRIDGED)})
+        self.sender: Any = None
+        self.accepted: list[bytes] = []
+        self.over, self.silent = False, 0
+        self._newest: dict[int, int] = {}  # sequence numbers by kind
+        self._waiting: list[tuple[int, Message]] = []
+        self._last: Tick | None = None
+        self._behind = 0
+
+    def take(self, batch: Sequence[Arrival]) -> Iterator[Tick]:
+        """The ticks that a batch of datagrams completes; to be called once a period."""
+        before, self.silent = self.silent, self.silent + 1
+        self.accepted.clear()
+        for arrival in batch:
+            message = decode(arrival.data)
+            if isinstance(message, Bad) or message.kind not in _INPUTS:
+                self.counts[message if isinstance(message, Bad) else Bad.KIND] += 1
+            elif self._in_order(message):
+                self.accepted.append(arrival.data)
+                if message.kind == Kind.INERTIAL:
+                    self.sender, self.silent = arrival.sender, 0
+                    yield from self._row(message)
+                elif message.kind in SENSORS:
+                    self._waiting.append((SENSORS[Kind(message.kind)], message))
+                    self._drop(MOST_WAITING)
+                elif message.kind == Kind.END:
+                    self.over = True
+        last, patience = self._last, self.patience
+        if last is not None and self.silent and patience is not None and self.silent > patience:
+            missed = patience + 1 if before == patience else 1
+            for _ in range(missed):
+                self.counts["held"] += 1
+                last = last._replace(number=last.number + 1, begins=False)
+                yield self._ended(last)
+
+    def _in_order(self, message: Message) -> bool:
+        """Whether this is the newest of its kind; else it is counted."""
+        before = self._newest.get(message.kind)
+        if before is not None:
+            ahead = (message.sequence - before) & 0xFFFFFFFF
+            behind = 2**32 - ahead
+            if ahead == 0 or behind < WINDOW:
+                self.counts[Bad.REORDERED if ahead else Bad.DUPLICATE] += 1
+                return False
+            if ahead < 2**31:
+                self.counts["lost"] += ahead - 1
+            else:
+                self.counts["restarted"] += 1
+                self._last = None if message.kind == Kind.INERTIAL else self._last
+        self._newest[message.kind] = message.sequence
+        return True
+
+    def _row(self, message: Message) -> Iterator[Tick]:
+        """The tick of a fast row, after those that are missing before it."""
+        row, number, last = message.values, round(message.stamp / STAMP), self._last
+        begins = last is None
+        if last is not None:
+            missing = number - last.number - 1
+            if missing < 0:
+                self._behind += 1
+                if self._behind <= MOST_BEHIND:
+                    self.counts["late"] += 1
+                    return
+            begins = not 0 <= missing <= MOST_HELD
+            self.counts["begun anew"] += begins
+            for skipped in range(0 if begins else missing):
+                self.counts["held"] += 1
+                yield last._replace(
+                    number=last.number + 1 + skipped, packets=NO_PACKETS, begins=False
+                )
+        self._behind = 0
+        fast = np.array(row[:FAST_WIDTH])
+        yield self._ended(Tick(number, fast, row[-1], NO_PACKETS, begins))
+
+    def _ended(self, tick: Tick) -> Tick:
+        """The tick with the packets that wait for one."""
+        packets = NO_PACKETS
+        if self._waiting:
+            packets = np.zeros((len(self._waiting), PACKET_WIDTH))
+            for packet, (sensor, message) in zip(packets, self._waiting, strict=True):
+                *values, age, quality = message.values
+                captured = tick.number - round(age / TICK)
+                head = sensor, captured, tick.number, quality, message.sequence
+                packet[: PACKET.value + len(values)] = *head, *values
+            order = np.lexsort((packets[:, PACKET.sensor], packets[:, PACKET.captured]))
+            packets = packets[order]
+            self._waiting.clear()
+        self._last = tick._replace(packets=packets)
+        return self._last
+
+    def _drop(self, most: int) -> None:
+        """The oldest packets go where no row takes them."""
+        while len(self._waiting) > most:
+            self.counts["dropped"] += 1
+            del self._waiting[0]

@@ -1,0 +1,145 @@
+"""The car's computer: estimates at every tick, an observation and an action a control period."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import numpy.typing as npt
+
+from ...envs.backend.arrays import read
+from ...envs.backend.rebuild import plain
+from ...envs.engine.arrays import Row
+from ...envs.engine.layout import FLAGS, STATE_WIDTH, P, Z
+from ...envs.engine.observe import observe
+from ...envs.engine.packets import note
+from ...envs.record import FAST, FAST_WIDTH
+from ...envs.task.info import REPORT
+from ...envs.task.reference import followed, reference
+from ...envs.ticks import NEVER
+from ...estimators.estimator import Estimator
+from ...estimators.protocol import deviations
+from ...estimators.wrappers.estimate import EstimateObservation
+from ...estimators.wrappers.kernel import observe_entry
+from ...estimators.wrappers.outputs import write
+from ..env_facts import facts_of
+from .assemble import NO_PACKETS, Tick
+
+_reference, _followed = plain(reference), plain(followed)
+Array = npt.NDArray[np.float64]
+
+
+class Onboard:
+    """An estimator and an agent on what the wires carry.
+
+    env: an `EstimateObservation`, which has the sensors' clocks, the nominal car, the references
+    and the control period; nothing is driven in it. agent: of `make_agent` for it, None: without
+    control. seed: of the env, whose reset draws the sensors' phases. What it makes of the same
+    ticks is the same, bit for bit, as in the env. `x`, `std` (n,): the estimate now; `names`.
+    `action` (width,): the newest, None before the first; `fresh`: whether it is of this tick.
+    Raises TypeError for another env.
+    """
+
+    def __init__(self, env: gym.Env[Any, Any], agent: Any = None, seed: int | None = 0) -> None:
+        if not isinstance(env, EstimateObservation):
+            raise TypeError(f"an Onboard reads an EstimateObservation, got {type(env).__name__}")
+        base: Any = env.unwrapped
+        env.reset(seed=seed)
+        self.base = base
+        self.facts, self.agent, self.outputs = facts_of(env), agent, env.outputs
+        self.estimator: Any = env.estimator
+        self.sensors, self.names = self.base.slow_sensors, env.estimator.names
+        self._ours = isinstance(self.estimator, Estimator)
+        snapshot = self.base.get_state()
+        self._p, self._switches = snapshot["params"], snapshot["switches"]
+        self._kind, self._target = int(self._switches[FLAGS.reference]), read(self._p, P.target)
+        self._bounds = self.base.config.bounds
+        self._rows = np.zeros((self.facts.control_period, FAST_WIDTH))
+        self._X: Array = np.zeros((1, len(self.names)))
+        self._S = np.zeros_like(self._X)
+        self.begin(0)
+        self._warm_up()
+
+    @property
+    def x(self) -> Array:
+        """The estimate now, (n,)."""
+        now: Array = self._X[0]
+        return now
+
+    @property
+    def std(self) -> Array:
+        """Its standard deviations, (n,)."""
+        now: Array = self._S[0]
+        return now
+
+    def begin(self, first: int) -> None:
+        """Forget everything; the next tick is `first`."""
+        self.estimator.reset(self.sensors, first)
+        self._z, self._refs = np.zeros(STATE_WIDTH), None
+        for at in Z.slow:
+            self._z[at.captured] = NEVER
+        self._count, self._packets = 0, [NO_PACKETS]
+        self._memory, self._start = None, np.ones(1, np.bool_)
+        self.action: npt.NDArray[np.float32] | None = None
+        self.fresh = False
+
+    def take(self, tick: Tick) -> None:
+        """A tick: the estimate and, at the end of a control period, the agent's action."""
+        if tick.begins:
+            self.begin(tick.number)
+        n, row = self.facts.control_period, tick.row
+        if self._ours:
+            one, packets = row.reshape(1, -1), tick.packets
+            self.estimator.take(one, 1, packets, len(packets), self._X, self._S)
+        else:
+            self.estimator.step(row.reshape(1, -1), tick.packets)
+            self._X[0], self._S[0] = self.estimator.x, deviations(self.estimator.P)
+        self._rows[self._count] = row
+        self._count += 1
+        if len(tick.packets):
+            self._packets.append(tick.packets)
+            for packet in tick.packets:
+                note(self._z, packet, float(tick.number))
+        v = 0.5 * float(row[FAST.wheel_left] + row[FAST.wheel_right])
+        steady = _reference(tick.steer_next, v, self._target, self._kind)
+        before, target, kind = self._refs, self._target, self._kind
+        self._refs = steady if before is None else _followed(before, steady, target, kind)
+        self.fresh = tick.number % n == 0
+        if self.fresh:
+            self._act(tick.number)
+        elif self._count == n:  # begun within a period
+            self._count = 0
+
+    def _act(self, number: int) -> None:
+        obs, start = self.observation(number), self._start
+        self._count, self._packets, self._start = 0, [NO_PACKETS], np.zeros(1, np.bool_)
+        if self.agent is None:
+            self.action = np.zeros(self.facts.width, np.float32)
+            return
+        found = self.agent.predict(obs, self._memory, start, deterministic=True)
+        self.action, self._memory = found
+
+    def observation(self, number: int) -> npt.NDArray[np.float32]:
+        """What the env's agents would see now, at the tick `number`."""
+        done, outputs = self._count, self.outputs
+        packets = np.concatenate(self._packets)
+        self._rows[done:] = self._rows[done - 1]
+        shown = len(self._rows) if self._switches[FLAGS.all_samples] else done
+        obs = np.empty(self._bounds.shape[1], np.float32)
+        self._z[Z.clock.tick] = number
+        row = Row(self._p, self._z, self._switches, obs, self._rows, packets, np.zeros(len(REPORT)))
+        observe(row, shown, len(packets), self._refs, self._bounds)
+        out, estimator = np.empty(len(outputs.layout), np.float32), self.estimator
+        last = outputs.inner, outputs.plan, outputs.limits, 0.0, 0.0, out, np.zeros(3)
+        if self._ours:  # which takes no further row here
+            record = self._rows, 0, NO_PACKETS, 0, 0
+            observe_entry()(estimator.filters, estimator.gains, *record, obs, *last)
+        else:
+            write(estimator, obs, *last)
+        return out
+
+    def _warm_up(self) -> None:
+        """Compile what the first ticks need."""
+        row, packet = self.base.record.fast[0], np.zeros((1, NO_PACKETS.shape[1]))
+        for number in range(self.facts.control_period + 1):
+            self.take(Tick(number, row, 0.0, packet, number == 0))
+        self.begin(0)

@@ -1,0 +1,107 @@
+"""UDP ports, and waiting for a point in time with what arrives meanwhile."""
+
+import errno
+import select
+import socket
+import time
+from collections.abc import Sequence
+from typing import Any
+
+from .assemble import Arrival
+from .datagrams import MOST, Kind, encode
+
+LOOPBACK, PORT = "127.0.0.1", 47001
+BUFFER = 1 << 22  # bytes of the kernel's, as far as it grants them
+MOST_AT_ONCE = 512  # datagrams of a batch: whoever floods the port does not stop the loop
+SPIN = 150_000  # ns before a point in time, which sleeping alone would miss
+
+clock = time.monotonic_ns
+"""ns of the clock that nobody sets."""
+
+
+def address_of(text: str, host: str = LOOPBACK) -> tuple[str, int]:
+    """HOST:PORT or PORT; ValueError for another text."""
+    before, _, number = text.rpartition(":")
+    if not (number.isascii() and number.isdigit() and 0 <= int(number) < 65536):
+        raise ValueError(f"an address is HOST:PORT or PORT, got {text!r}")
+    return before.strip("[]") or host, int(number)
+
+
+def spin_until(when: int) -> None:
+    """Return at a point in time of `clock`."""
+    if (left := when - clock() - SPIN) > 0:
+        time.sleep(left * 1e-9)
+    while clock() < when:
+        pass
+
+
+class Port:
+    """A UDP port that listens on one of this machine's addresses, and numbers what it sends.
+
+    host, port: where it is bound, port 0 for any. `address` (host, port). `unsent`: datagrams
+    that the network did not take. Raises OSError for a port that is in use or a host that is none.
+    """
+
+    def __init__(self, host: str = LOOPBACK, port: int = 0) -> None:
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER)
+        self._socket.setblocking(False)
+        try:
+            self._socket.bind((host, port))
+        except OSError as error:
+            self._socket.close()
+            why = "is in use" if error.errno == errno.EADDRINUSE else f"is none: {error.strerror}"
+            raise OSError(f"UDP port {port} of {host} {why}") from None
+        self.address: tuple[str, int] = self._socket.getsockname()
+        self.unsent = 0
+        self._sent: dict[int, int] = {}
+
+    def send(
+        self, to: Any, kind: Kind, stamp: int, values: Sequence[float] = (), names: Any = ()
+    ) -> None:
+        """Send a message; stamp: us."""
+        number = self._sent[kind] = self._sent.get(kind, -1) + 1
+        try:
+            self._socket.sendto(encode(kind, number, stamp, values, names), to)
+        except OSError:
+            self.unsent += 1
+
+    def drain(self, batch: list[Arrival]) -> list[Arrival]:
+        """The batch with what has arrived, up to MOST_AT_ONCE."""
+        while len(batch) < MOST_AT_ONCE:
+            try:
+                data, sender = self._socket.recvfrom(MOST + 1)
+            except BlockingIOError:
+                break
+            except OSError:  # a message of the network about an earlier datagram
+                continue
+            batch.append(Arrival(clock(), data, sender))
+        return batch
+
+    def wait(self, seconds: float) -> list[Arrival]:
+        """What arrives first, or nothing after so long."""
+        select.select([self._socket], [], [], max(seconds, 0.0))
+        return self.drain([])
+
+    def until(self, when: int) -> list[Arrival]:
+        """What arrives until a point in time of `clock`, each with the time it came."""
+        batch: list[Arrival] = []
+        while (left := when - clock() - SPIN) > 0:
+            if len(batch) >= MOST_AT_ONCE:
+                time.sleep(left * 1e-9)
+                break
+            if select.select([self._socket], [], [], left * 1e-9)[0]:
+                self.drain(batch)
+        while clock() < when:
+            self.drain(batch)
+        return self.drain(batch)
+
+    def close(self) -> None:
+        """Free the port."""
+        self._socket.close()
+
+    def __enter__(self) -> "Port":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

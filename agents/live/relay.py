@@ -1,0 +1,86 @@
+"""The relay: a receiver's NMEA, decoded, as datagrams of course, speed, HDOP and satellites."""
+
+import math
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+from .datagrams import LONGEST_AGE, Kind
+from .port import Port, clock
+
+EARTH = 6_371_000.0  # m
+WORST_HDOP = 99.0  # of a receiver without a fix
+LONGEST_PAUSE = 10.0  # s between two epochs of a file
+
+
+@dataclass
+class Relay:
+    """Sends the epochs of a source, as `envs.recordings.sources.open_source` takes it.
+
+    port: from which it sends, to the address `to`. latency: s from an epoch to its sentences, which
+    the receiver adds. speed: of a file, which is played in the time of its epochs. A lost line is
+    opened again; `error` has why the relay ended, "" at a file's end. `sent`: datagrams. `counts`:
+    of the decoder.
+    """
+
+    source: str
+    port: Port
+    to: Any
+    latency: float = 0.0
+    speed: float = 1.0
+    sent: int = 0
+    error: str = ""
+    counts: Any = None
+    _origin: tuple[float, float] | None = field(default=None)
+
+    def run(self, stop: Callable[[], bool] = lambda: False) -> None:
+        """Relay until the source ends, is lost for good, or `stop`."""
+        plays = not self.source.startswith(("serial:", "tcp:"))
+        begun, before, due = clock(), math.nan, time.monotonic()
+        try:
+            for epoch in self._epochs():
+                if epoch is not None and plays and epoch.t > before:
+                    due += min(epoch.t - before, LONGEST_PAUSE) / self.speed
+                while not stop() and plays and (left := due - time.monotonic()) > 0.0:
+                    time.sleep(min(left, 0.1))
+                if stop():
+                    return
+                if epoch is not None:
+                    before = epoch.t
+                    stamp = (clock() - begun) // 1000
+                    self.port.send(self.to, Kind.GPS, stamp, self._values(epoch))
+                    self.sent += 1
+        except OSError as error:
+            self.error = str(error)
+
+    def _epochs(self) -> Iterator[Any]:
+        """The epochs, and None after each chunk of bytes."""
+        from ...envs.recordings.nmea import Decoder
+        from ...envs.recordings.sources import open_source
+
+        decoder = Decoder()
+        self.counts = decoder.counts
+        for chunk in open_source(self.source):
+            yield from decoder.feed(chunk)
+            yield None
+        yield from decoder.finish()
+
+    def _values(self, epoch: Any) -> list[float]:
+        """The doubles of a datagram; an unknown number is 0, an unknown HDOP the worst."""
+        X, Y = self._place(epoch)
+        hdop = epoch.hdop if math.isfinite(epoch.hdop) else WORST_HDOP
+        course, speed = (each if math.isfinite(each) else 0.0 for each in epoch[3:5])
+        age = epoch.age + self.latency
+        age = min(max(age, 0.0), LONGEST_AGE) if math.isfinite(age) else LONGEST_AGE
+        return [course, speed, X, Y, hdop, float(epoch.satellites), age, float(epoch.quality)]
+
+    def _place(self, epoch: Any) -> tuple[float, float]:
+        """m to the east and north of the first fix; 0 without one."""
+        if not epoch.fixed:
+            return 0.0, 0.0
+        if self._origin is None:
+            self._origin = epoch.latitude, epoch.longitude
+        north, east = (math.radians(each) for each in (
+            epoch.latitude - self._origin[0], epoch.longitude - self._origin[1]))  # fmt: skip
+        return EARTH * math.cos(math.radians(self._origin[0])) * east, EARTH * north

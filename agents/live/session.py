@@ -1,0 +1,145 @@
+"""A session on disk: every datagram accepted with its tick, and its replay bit for bit.
+
+A file is a head (MAGIC, the length of its JSON, the JSON) and blocks that are appended as they are
+full: a crash loses the last one at most, and a file that is cut anywhere is read up to there. A
+block carries a checksum of itself and one of all estimates so far, by which a replay checks
+itself. Nothing in a file is run.
+"""
+
+import json
+import struct
+import zlib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from .assemble import Arrival, Assembler
+from .onboard import Onboard
+
+MAGIC = b"SLIPSES1"
+BATCHES, BYTES = 100, 1 << 13  # of a block at most: a tenth of a second
+_LENGTH = struct.Struct("!I")
+_BLOCK = struct.Struct("!4sIIII")  # magic, batches, bytes, checksums of these and of estimates
+_ITEM = struct.Struct("!HH")  # which batch of the block, bytes of the datagram
+_MAGIC = b"BLOK"
+
+
+class Recorder:
+    """Writes a session. setup: what it takes to replay it, as JSON takes it.
+
+    Raises FileExistsError for a file that is there: a session is never overwritten.
+    """
+
+    def __init__(self, path: Path | str, setup: Mapping[str, Any]) -> None:
+        self._file = open(path, "xb", buffering=0)  # noqa: SIM115, closed by `close`
+        text = json.dumps(dict(setup)).encode()
+        self._file.write(MAGIC + _LENGTH.pack(len(text)) + text)
+        self._items, self._batches, self._digest = bytearray(), 0, 0
+
+    def note(self, onboard: Onboard) -> None:
+        """An estimate, for the checksum."""
+        self._digest = digest_of(onboard, self._digest)
+
+    def take(self, accepted: list[bytes]) -> None:
+        """The datagrams of a batch that were accepted."""
+        for data in accepted:
+            self._items += _ITEM.pack(self._batches, len(data)) + data
+        self._batches += 1
+        if self._batches == BATCHES or len(self._items) > BYTES:
+            self._write()
+
+    def _write(self) -> None:
+        sizes = len(self._items), zlib.crc32(self._items), self._digest
+        self._file.write(_BLOCK.pack(_MAGIC, self._batches, *sizes) + self._items)
+        self._items, self._batches = bytearray(), 0
+
+    def close(self) -> None:
+        """Write the last block."""
+        if self._batches:
+            self._write()
+        self._file.close()
+
+
+def digest_of(onboard: Onboard, before: int) -> int:
+    """A checksum of an estimate and of all before it."""
+    return zlib.crc32(onboard.std.tobytes(), zlib.crc32(onboard.x.tobytes(), before))
+
+
+class Block(NamedTuple):
+    """A block: its batches of datagrams, and the checksum of the estimates after it."""
+
+    batches: list[list[Arrival]]
+    digest: int
+
+
+def read_setup(path: Path | str) -> dict[str, Any]:
+    """The setup of a session; ValueError for a file that is none."""
+    with open(path, "rb") as file:
+        return _setup(path, file)
+
+
+def _setup(path: Path | str, file: Any) -> dict[str, Any]:
+    if file.read(len(MAGIC)) == MAGIC:
+        length = file.read(_LENGTH.size)
+        if len(length) == _LENGTH.size:
+            try:
+                found = json.loads(file.read(*_LENGTH.unpack(length)))
+            except (ValueError, RecursionError):
+                found = None
+            if isinstance(found, dict):
+                return found
+    raise ValueError(f"{path} is no session of `sideslip live --record`, or only its beginning")
+
+
+def blocks_of(path: Path | str) -> Iterator[Block]:
+    """The blocks of a session up to its end, or to where it was cut or damaged."""
+    with open(path, "rb") as file:
+        _setup(path, file)
+        while len(head := file.read(_BLOCK.size)) == _BLOCK.size:
+            magic, count, size, check, digest = _BLOCK.unpack(head)
+            data = file.read(size) if magic == _MAGIC and count <= BATCHES else b""
+            if magic != _MAGIC or len(data) != size or zlib.crc32(data) != check:
+                return
+            yield Block(_batches(data, count), digest)
+
+
+def _batches(data: bytes, count: int) -> list[list[Arrival]]:
+    batches: list[list[Arrival]] = [[] for _ in range(count)]
+    at = 0
+    while at < len(data):
+        which, size = _ITEM.unpack_from(data, at)
+        at += _ITEM.size + size
+        batches[which].append(Arrival(0, data[at - size : at]))
+    return batches
+
+
+class Replay(NamedTuple):
+    """What a replay gives: ticks (T,), x and std (T, n), and whether every block's checksum of the
+    estimates is the session's."""
+
+    ticks: npt.NDArray[np.int64]
+    x: npt.NDArray[np.float64]
+    std: npt.NDArray[np.float64]
+    same: bool
+
+
+def replay(path: Path | str, onboard: Onboard, patience: int | None) -> Replay:
+    """Take a session again; patience: of its `Assembler`."""
+    assembler, digest, same = Assembler(patience), 0, True
+    ticks: list[int] = []
+    numbers: list[list[npt.NDArray[np.float64]]] = [[], []]
+    for block in blocks_of(path):
+        for batch in block.batches:
+            for tick in assembler.take(batch):
+                onboard.take(tick)
+                digest = digest_of(onboard, digest)
+                ticks.append(tick.number)
+                numbers[0].append(onboard.x.copy())
+                numbers[1].append(onboard.std.copy())
+        same = same and digest == block.digest
+    shape = len(ticks), len(onboard.names)
+    x, std = (np.array(each).reshape(shape) for each in numbers)
+    return Replay(np.array(ticks, np.int64), x, std, same)

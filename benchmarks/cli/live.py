@@ -1,0 +1,267 @@
+"""`sideslip live`: an estimator on datagrams in real time, the simulated car, the relay, replay."""
+
+import json as writer
+import os
+import signal
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from threading import Thread
+from time import monotonic
+from typing import TYPE_CHECKING, Annotated, Any
+
+import gymnasium as gym
+import numpy as np
+import typer
+from rich.console import Console
+from rich.markup import escape
+
+from ...envs.arguments import check_choice
+from ...envs.backend.files import write_whole
+from ..harness.verdict import verdict
+from .contestant import Contestant
+from .export import Trust
+from .names import check_env, complete
+from .output import check_files, options_of, show_episode, wrote
+
+if TYPE_CHECKING:
+    from ...agents.live.onboard import Onboard
+
+_Options = list[str] | None
+_Text = str | None
+console = Console(soft_wrap=True, highlight=False)
+
+
+def live_command(
+    estimator: Annotated[
+        _Text,
+        typer.Argument(
+            help="A name, FILE.py:Class or module:Name.", autocompletion=complete("estimators")
+        ),
+    ] = None,
+    agent: Annotated[str, typer.Option(help="What answers with controls.")] = "none",
+    env: Annotated[
+        _Text, typer.Option(help="The id whose sensors the car has; default: one that fits.")
+    ] = None,
+    vehicle: Annotated[_Text, typer.Option(help="The car: a name or a file.")] = None,
+    scenario: Annotated[_Text, typer.Option(help="Of --simulate: a name or a file.")] = None,
+    option: Annotated[_Options, typer.Option(help="NAME=VALUE of the id; repeatable.")] = None,
+    agent_option: Annotated[_Options, typer.Option(help="NAME=VALUE; repeatable.")] = None,
+    estimator_option: Annotated[_Options, typer.Option(help="NAME=VALUE; repeatable.")] = None,
+    seed: Annotated[int, typer.Option(help="Of --simulate, and of drawn sensor phases.")] = 0,
+    control_period: Annotated[int, typer.Option(help="Ticks of 1 ms.")] = 10,
+    host: Annotated[str, typer.Option(help="Where port and page are bound.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(help="UDP port of what comes in.")] = 47001,
+    publish: Annotated[
+        _Options, typer.Option(help="HOST:PORT that gets every estimate; repeatable.")
+    ] = None,
+    gps: Annotated[
+        _Text, typer.Option(help="NMEA: a file, serial:PORT[:BAUD] or tcp:HOST:PORT.")
+    ] = None,
+    latency: Annotated[float, typer.Option(help="s that the receiver is late.")] = 0.0,
+    page: Annotated[int | None, typer.Option(help="Port of a live page; 0: any.")] = None,
+    simulate: Annotated[
+        bool, typer.Option("--simulate", help="The other end: a simulated car.")
+    ] = False,
+    relay: Annotated[_Text, typer.Option(help="Only relay this NMEA by UDP; as --gps.")] = None,
+    to: Annotated[_Text, typer.Option(help="HOST:PORT for --relay, --simulate alone.")] = None,
+    step: Annotated[bool, typer.Option("--step", help="Lock-step, as fast as it goes.")] = False,
+    speed: Annotated[float, typer.Option(min=0.001, help="Of --simulate and of a file.")] = 1.0,
+    duration: Annotated[float, typer.Option(help="s, after which it ends.")] = float("inf"),
+    record: Annotated[Path | None, typer.Option(help="Write the session to a new file.")] = None,
+    replay: Annotated[Path | None, typer.Option(help="Take a session again.")] = None,
+    json: Annotated[Path | None, typer.Option("--json", help="Write what was measured.")] = None,
+    trust: Trust = False,
+) -> None:
+    """Run an estimator in real time on datagrams of a car's sensors, and an agent if asked to.
+
+    With --simulate a simulated car is at the other end; without an ESTIMATOR it is alone.
+    """
+    from ...agents.live.port import LOOPBACK, address_of
+
+    check_files(json=json)
+    target = address_of(to) if to else (LOOPBACK, port)
+    chosen = {"scenario": scenario, "vehicle": vehicle, "control_period": control_period}
+    options = {name: value for name, value in chosen.items() if value is not None}
+    setup: dict[str, Any] = {
+        "estimator": estimator,
+        "agent": agent,
+        "env": env,
+        "options": options | options_of(option),
+        "agent_options": options_of(agent_option),
+        "estimator_options": options_of(estimator_option),
+        "seed": seed,
+    }
+    if relay is not None:
+        _relay(relay, target, latency, speed, duration, json)
+    elif replay is not None:
+        _replay(replay, setup, trust, json)
+    elif estimator is not None:
+        web = None if page is None else (host, page)
+        everyone = [address_of(each) for each in publish or []]
+        receiver = None if gps is None else (gps, latency)
+        ends = _Ends((host, port), everyone, web, receiver, simulate, speed, step, trust)
+        _live(setup, ends, duration, record, json)
+    elif simulate:
+        _drive(env or "sideslip/YawVision-v0", setup, target, step, speed)
+    else:
+        raise ValueError("name an ESTIMATOR, or --simulate, --relay or --replay")
+
+
+@dataclass
+class _Ends:
+    """What the loop is connected to. bound, page: (host, port). receiver: (source, latency)."""
+
+    bound: tuple[str, int]
+    publish: list[Any]
+    page: tuple[str, int] | None
+    receiver: tuple[str, float] | None
+    simulate: bool
+    speed: float
+    step: bool
+    trust: bool
+
+
+def _contestant(setup: dict[str, Any], trust: bool) -> tuple[Any, Any]:
+    names = setup["agent"], setup["agent_options"], setup["estimator"], setup["estimator_options"]
+    return Contestant(*names, trust).on(setup["env"], setup["options"])
+
+
+def _onboard(setup: dict[str, Any], trust: bool) -> "Onboard":
+    from ...agents.live.onboard import Onboard
+
+    return Onboard(*_contestant(setup, trust), setup["seed"])
+
+
+def _stopping() -> list[int]:
+    """A list that a signal to end fills."""
+    signals: list[int] = []
+    for each in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(each, lambda number, _: signals.append(number))
+    return signals
+
+
+def _live(
+    setup: dict[str, Any], ends: _Ends, duration: float, record: Path | None, json: Path | None
+) -> None:
+    """The loop with all that is connected to it, and what it measured."""
+    from ...agents.live.assemble import PATIENCE, Assembler
+    from ...agents.live.loop import Loop
+    from ...agents.live.port import Port
+    from ...agents.live.relay import Relay
+    from ...agents.live.session import Recorder
+    from ...agents.live.simulate import Other
+    from ...agents.live.viewer import Viewer
+
+    patience = None if ends.step else round(PATIENCE / min(ends.speed, 1.0))
+    with ExitStack() as stack:
+        port = stack.enter_context(Port(*ends.bound))
+        onboard = _onboard(setup, ends.trust)
+        setup["env"] = onboard.base.spec.id
+        loop = Loop(onboard, Assembler(patience), port, ends.publish, step=ends.step)
+        if record is not None:
+            loop.recorder = Recorder(record, setup | {"patience": patience})
+            stack.callback(loop.recorder.close)
+        if ends.page is not None or console.is_terminal:
+            title = f"{setup['estimator']}, {setup['agent']}"
+            viewer = stack.enter_context(Viewer(title, ends.page, console.is_terminal))
+            loop.viewer = viewer.address
+            console.print(viewer.url and f"page: {viewer.url}")
+        other = None
+        if ends.simulate:
+            asked = setup["env"], setup["options"], port.address, setup["seed"]
+            other = stack.enter_context(Other(*asked, ends.step, ends.speed))
+        signals = _stopping()
+        relay = None
+        if ends.receiver is not None:
+            source, latency = ends.receiver
+            relay = Relay(source, stack.enter_context(Port()), port.address, latency, ends.speed)
+            Thread(target=relay.run, args=(lambda: bool(loop.ended),), daemon=True).start()
+        console.print(f"listening on {port.address[0]}:{port.address[1]}")
+        if other is not None:
+            other.go()
+        loop.run(lambda: bool(signals), duration)
+        drive = other.result() if other is not None and loop.assembler.over else None
+    numbers = setup | loop.numbers() | {"load": os.getloadavg(), "cores": os.cpu_count()}
+    lines = loop.lines(setup["estimator"])
+    if relay is not None and relay.error:
+        lines.append(f"The receiver was lost: {relay.error}")
+    if drive is not None:
+        lines.append(_beside_offline(drive, setup, ends.trust, numbers))
+    console.print(f"[bold]{escape(verdict(*lines))}[/]")
+    if record is not None:
+        wrote(console, record)
+    _write(json, numbers)
+
+
+def _beside_offline(
+    found: tuple[Any, int, int], setup: dict[str, Any], trust: bool, numbers: dict[str, Any]
+) -> str:
+    """How far the drive over the wires is from the one without them."""
+    from ...agents.rollout import rollout
+
+    columns, late, periods = found
+    offline = rollout(*_contestant(setup, trust), setup["seed"]).columns
+    same = all(np.array_equal(offline[name], each) for name, each in columns.items())
+    rows = min(len(columns["beta"]), len(offline["beta"]))
+    away = float(np.max(np.abs(columns["beta"][:rows] - offline["beta"][:rows])))
+    numbers |= {"same": same, "late": late, "periods": periods, "beta_away": away}
+    if same:
+        return f"The drive is the offline one bit for bit; {late} of {periods} controls late."
+    return (
+        f"Beside the offline drive sideslip is {1e3 * away:.3g} mrad off at most: {late} of "
+        f"{periods} controls came a period late."
+    )
+
+
+def _drive(env_id: str, setup: dict[str, Any], target: Any, step: bool, speed: float) -> None:
+    """The simulated car alone."""
+    from ...agents.live.port import Port
+    from ...agents.live.simulate import simulate
+
+    check_env(env_id)
+    env, seed = gym.make(env_id, **setup["options"]), setup["seed"]
+    with Port() as port:
+        drive, wires = simulate(env, port, target, seed, step, speed)
+    show_episode(console, drive, "the other end")
+    console.print(f"{wires.late} of {wires.periods} controls came a period late")
+
+
+def _relay(
+    source: str, target: Any, latency: float, speed: float, duration: float, json: Path | None
+) -> None:
+    from ...agents.live.port import Port
+    from ...agents.live.relay import Relay
+
+    signals, end = _stopping(), monotonic() + duration
+    with Port() as port:
+        relay = Relay(source, port, target, latency, speed)
+        relay.run(lambda: bool(signals) or monotonic() > end)
+    for what, count in relay.counts.rows():
+        console.print(f"{count:8d} {what}")
+    console.print(f"{relay.sent} datagrams to {target[0]}:{target[1]}")
+    _write(json, {"sent": relay.sent, "error": relay.error, **dict(relay.counts.rows())})
+    if relay.error:
+        raise OSError(relay.error)
+
+
+def _replay(path: Path, asked: dict[str, Any], trust: bool, json: Path | None) -> None:
+    from ...agents import AGENTS
+    from ...agents.live.session import read_setup, replay
+    from ...estimators.filters import FILTERS
+
+    setup = read_setup(path)
+    for kind, known in (("estimator", FILTERS), ("agent", AGENTS)):
+        if setup.get(kind) != asked[kind]:  # a file's text may not choose what code is run
+            check_choice(f"{kind} in {path}, name it in the command to run it:", setup[kind], known)
+    onboard = _onboard(asked | setup, trust)
+    found = replay(path, onboard, setup["patience"])
+    same = "those of the session bit for bit" if found.same else "NOT those of the session"
+    console.print(f"{len(found.ticks)} ticks; the estimates are {same}")
+    _write(json, setup | {"ticks": len(found.ticks), "same": found.same})
+
+
+def _write(path: Path | None, numbers: dict[str, Any]) -> None:
+    if path is not None:
+        write_whole(path, (writer.dumps(numbers, indent=1) + "\n").encode())
+        wrote(console, path)

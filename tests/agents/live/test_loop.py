@@ -1,0 +1,152 @@
+"""The loop ends with a reason, and what it measures is what happened."""
+
+import math
+import time
+from threading import Thread
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sideslip.agents.live.assemble import Arrival, Assembler
+from sideslip.agents.live.datagrams import FIELDS, STAMP, Kind, Message, decode
+from sideslip.agents.live.loop import PERIOD, Histogram, Loop
+from sideslip.agents.live.onboard import Onboard
+from sideslip.agents.live.port import MOST_AT_ONCE, Port, address_of, clock
+from tests.agents.live.both_ends import SEED, VISION, contestant
+
+ROW = [0.0, 0.0, 0.0, 0.0, 7.0, 7.0] + [0.0] * (len(FIELDS[Kind.INERTIAL]) - 6)
+
+
+def onboard() -> Onboard:
+    return Onboard(*contestant(VISION, "exact-kf", "lqr"), SEED)
+
+
+def test_no_inertial_data_is_an_error_with_the_address() -> None:
+    with Port() as port:
+        loop = Loop(onboard(), Assembler(), port, patience=0.2)
+        with pytest.raises(
+            TimeoutError, match=rf"no inertial datagram came to .*{port.address[1]}"
+        ):
+            loop.run()
+
+
+def test_inertial_data_that_ends_ends_the_loop_after_a_while() -> None:
+    """Meanwhile the last row is held, and every tick is counted."""
+    with Port() as port, Port() as car:
+        loop = Loop(onboard(), Assembler(), port, patience=0.3)
+        car.send(port.address, Kind.INERTIAL, 0, ROW)
+        loop.run()
+        assert loop.ended == "no inertial data for 0.3 s"
+        assert loop.statistics.ticks == loop.assembler.counts["held"] + 1 > 10
+
+
+def test_it_stops_when_asked_and_when_the_time_is_over() -> None:
+    with Port() as port:
+        loop = Loop(onboard(), Assembler(), port)
+        loop.run(lambda: True)
+        assert loop.ended == "stopped"
+        loop.run(duration=0.05)
+        assert loop.ended == "the time is over"
+
+
+def test_estimates_go_to_everybody_and_controls_back_to_the_car() -> None:
+    with Port() as port, Port() as car, Port() as user, Port() as viewer:
+        loop = Loop(onboard(), Assembler(None), port, [user.address], viewer.address, step=True)
+        for number in range(201):
+            car.send(port.address, Kind.INERTIAL, number * STAMP, ROW)
+        car.send(port.address, Kind.END, 0)
+        loop.run()
+        sent, shown, controls = ([decode(each.data) for each in end.wait(1.0)]
+                                 for end in (user, viewer, car))  # fmt: skip
+    assert all(isinstance(each, Message) for each in (*sent, *shown, *controls))
+    stamps = [each.stamp // STAMP for each in controls if isinstance(each, Message)]
+    assert stamps == list(range(0, 201, 10))
+    kinds = [each.kind for each in shown if isinstance(each, Message)]
+    assert kinds.count(Kind.ESTIMATE) == 21 and kinds.count(Kind.STATUS) == 3
+    assert len(sent) == 201 and isinstance(sent[-1], Message)
+    assert sent[-1].names == loop.onboard.names
+    assert sent[-1].values == (*loop.onboard.x, *loop.onboard.std)
+
+
+def test_a_busy_loop_counts_the_deadlines_it_missed_and_catches_none_up() -> None:
+    with Port() as port, Port() as car:
+        loop = Loop(onboard(), Assembler(), port)
+        loop.watch = lambda tick: time.sleep(0.0205) if tick.number == 1 else None
+        car.send(port.address, Kind.INERTIAL, 0, ROW)
+        assert loop._take(port.wait(1.0)) == 1
+        car.send(port.address, Kind.INERTIAL, STAMP, ROW)
+        deadline = clock() + PERIOD
+        following = loop._tick(deadline)
+        assert following > clock() - 5 * PERIOD
+        assert loop.statistics.deadlines == 1 + loop.statistics.misses >= 21
+        assert (following - deadline - PERIOD * (1 + loop.statistics.misses)) < PERIOD / 100
+        assert loop.statistics.latency.most > 20_000
+
+
+def test_the_phase_follows_the_senders_clock() -> None:
+    """A deadline is drawn towards LEAD behind the rows, a little each tick."""
+    from sideslip.agents.live.loop import LEAD, MOST_PULL, PULL
+
+    class Fake(Port):
+        def until(self, when: int) -> list[Arrival]:
+            sound = super().until(when)
+            return [each._replace(at=when - 900_000) for each in sound]
+
+    with Fake() as port, Port() as car:
+        loop = Loop(onboard(), Assembler(), port)
+        car.send(port.address, Kind.INERTIAL, 0, ROW)
+        start = clock() + 50_000_000
+        following = loop._tick(start)
+        drawn = following - start - PERIOD * (1 + loop.statistics.misses)
+        assert drawn == max(-MOST_PULL, round(PULL * (LEAD - 900_000))) < 0
+
+
+def test_quantiles_are_those_of_the_times() -> None:
+    times = np.random.default_rng(0).gamma(2.0, 50.0, 10_001)
+    histogram = Histogram()
+    assert math.isnan(histogram.quantile(0.5))
+    for each in times:
+        histogram.add(float(each))
+    for share in (0.5, 0.9, 0.999):
+        exact = np.quantile(times, share, method="inverted_cdf")
+        assert exact <= histogram.quantile(share) <= exact + 1.0
+    histogram.add(1e9)
+    assert histogram.most == histogram.quantile(1.0) == 1e9
+
+
+def test_a_port_in_use_is_an_error_and_a_flood_ends() -> None:
+    with Port() as port, Port() as other:
+        with pytest.raises(OSError, match=f"UDP port {port.address[1]} of 127.0.0.1 is in use"):
+            Port(port=port.address[1])
+        with pytest.raises(OSError, match=r"of 192.0.2.1 is none"):
+            Port("192.0.2.1", 0)
+        assert port.address[0] == "127.0.0.1"
+        for _ in range(MOST_AT_ONCE + 100):
+            other.send(port.address, Kind.END, 0)
+        assert len(port.wait(1.0)) <= MOST_AT_ONCE
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [("h:1", ("h", 1)), ("8", ("127.0.0.1", 8)), (":8", ("127.0.0.1", 8)), ("[::1]:2", ("::1", 2))],
+)
+def test_addresses(text: str, found: Any) -> None:
+    assert address_of(text) == found
+
+
+@pytest.mark.parametrize("text", ["", "h", "h:", "h:x", "h:70000", "h:-1"])
+def test_what_is_no_address(text: str) -> None:
+    with pytest.raises(ValueError, match="HOST:PORT"):
+        address_of(text)
+
+
+def test_a_thread_that_stops_leaves_the_collector_as_it_was() -> None:
+    import gc
+
+    with Port() as port:
+        loop = Loop(onboard(), Assembler(), port)
+        thread = Thread(target=loop.run, kwargs={"duration": 0.01})
+        thread.start()
+        thread.join()
+    assert gc.isenabled() and gc.get_freeze_count() == 0

@@ -1,0 +1,97 @@
+"""A session on disk gives the same estimates bit for bit, as far as it goes."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sideslip.agents.live import session
+from sideslip.agents.live.assemble import PATIENCE
+from sideslip.agents.live.onboard import Onboard
+from sideslip.agents.live.session import Recorder, blocks_of, read_setup, replay
+from tests.agents.live.both_ends import SEED, STEERING, contestant, drive
+
+SETUP = {"estimator": "dakf", "agent": "lqr", "patience": None}
+
+
+def onboard() -> Onboard:
+    return Onboard(*contestant(STEERING, "dakf", "lqr"), SEED)
+
+
+@pytest.fixture(scope="module", params=[True, False], ids=["lock-step", "real time"])
+def driven(request: Any, tmp_path_factory: Any) -> tuple[Path, Any, int | None]:
+    """(a session's file, its estimates (T, 2 n), its patience); the real one at a fifth of the
+    speed, so that rows are missing at many a deadline."""
+    path = tmp_path_factory.mktemp("session") / "drive.session"
+    car, found = onboard(), []
+    recorder = Recorder(path, SETUP)
+    drive(
+        STEERING, car, request.param, recorder,
+        lambda _: found.append(np.concatenate([car.x, car.std])),
+        speed=1.0 if request.param else 0.2,
+    )  # fmt: skip
+    recorder.close()
+    return path, np.array(found), None if request.param else 5 * PATIENCE
+
+
+def test_a_replay_has_the_same_bits(driven: tuple[Path, Any, int | None]) -> None:
+    path, estimates, patience = driven
+    found = replay(path, onboard(), patience)
+    assert found.same and read_setup(path) == SETUP
+    assert np.array_equal(np.hstack([found.x, found.std]), estimates)
+    assert len(set(found.ticks.tolist())) == len(estimates) >= 500
+
+
+def test_a_file_that_is_cut_anywhere_is_read_up_to_there(
+    driven: tuple[Path, Any, int | None], tmp_path: Path
+) -> None:
+    path, estimates, patience = driven
+    data, cut = path.read_bytes(), tmp_path / "cut.session"
+    blocks, car, lengths = list(blocks_of(path)), onboard(), set()
+    assert len(blocks) >= 5
+    beginning = data.index(b"BLOK")
+    for size in [*range(beginning, len(data), len(data) // 23), len(data) - 1]:
+        cut.write_bytes(data[:size])
+        found = replay(cut, car, patience)
+        assert found.same and len(found.ticks) < len(estimates)
+        assert np.array_equal(np.hstack([found.x, found.std]), estimates[: len(found.ticks)])
+        lengths.add(len(list(blocks_of(cut))))
+    assert lengths == set(range(len(blocks)))
+    for size in range(beginning):
+        cut.write_bytes(data[:size])
+        with pytest.raises(ValueError, match="no session"):
+            read_setup(cut)
+
+
+def test_a_damaged_block_ends_the_replay_and_another_filter_is_found_out(
+    driven: tuple[Path, Any, int | None], tmp_path: Path
+) -> None:
+    path, estimates, patience = driven
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    damaged = tmp_path / "damaged.session"
+    damaged.write_bytes(data)
+    assert 0 < len(replay(damaged, onboard(), patience).ticks) < len(estimates)
+    other = Onboard(*contestant(STEERING, "exact-kf", "lqr"), SEED)
+    assert not replay(path, other, patience).same
+
+
+def test_a_session_is_never_overwritten(tmp_path: Path) -> None:
+    path = tmp_path / "a.session"
+    path.write_text("precious")
+    with pytest.raises(FileExistsError):
+        Recorder(path, SETUP)
+    assert path.read_text() == "precious"
+
+
+def test_after_a_crash_all_but_the_last_block_is_there(tmp_path: Path) -> None:
+    """Nothing waits in memory but the block at hand."""
+    path = tmp_path / "a.session"
+    recorder = Recorder(path, SETUP)
+    for i in range(3 * session.BATCHES + 7):
+        recorder.take([bytes([i % 256])])
+    batches = [batch for block in blocks_of(path) for batch in block.batches]
+    assert [batch[0].data[0] for batch in batches] == [i % 256 for i in range(300)]
+    recorder.close()
+    assert sum(len(block.batches) for block in blocks_of(path)) == 307

@@ -1,0 +1,81 @@
+"""`sideslip live`: both ends, sessions, and each way to ask for what cannot be."""
+
+import json
+import socket
+from pathlib import Path
+
+import pytest
+
+from tests.benchmarks.conftest import Run
+
+BOTH = ("live", "exact-kf", "--agent", "lqr", "--simulate", "--port", 0)
+
+
+@pytest.fixture
+def short(tmp_path: Path) -> Path:
+    path = tmp_path / "short.toml"
+    path.write_text('base = "gust"\nduration = 0.3\n')
+    return path
+
+
+def test_both_ends_in_lock_step_and_the_session_again(
+    run: Run, short: Path, tmp_path: Path
+) -> None:
+    session, numbers = tmp_path / "a.session", tmp_path / "a.json"
+    files = "--record", session, "--json", numbers
+    status, out, _ = run(*BOTH, "--step", "--scenario", short, *files)
+    assert status == 0 and "exact-kf: 301 ticks" in out and "the drive is over" in out
+    assert "The drive is the offline one bit for bit; 0 of 30 controls late." in out
+    found = json.loads(numbers.read_text())
+    assert found["same"] and found["ticks"] == 301 and found["counts"]["lost"] == 0
+    status, out, _ = run("live", "--replay", session)
+    assert status == 0 and "301 ticks; the estimates are those of the session bit for bit" in out
+
+
+def test_in_real_time_what_was_measured_is_printed(run: Run, short: Path, tmp_path: Path) -> None:
+    numbers = tmp_path / "a.json"
+    status, out, _ = run(*BOTH, "--scenario", short, "--json", numbers, "--page", 0, "--speed", 0.1)
+    assert status == 0 and "page: http://127.0.0.1:" in out and "deadlines missed" in out
+    assert len(out[out.index("exact-kf:") : out.index("wrote")].splitlines()) <= 5
+    found = json.loads(numbers.read_text())
+    assert found["deadlines"] > 100 and set(found["latency_us"]) == {"median", "p999", "max"}
+
+
+def test_a_session_may_not_choose_code(run: Run, tmp_path: Path) -> None:
+    from sideslip.agents.live.session import Recorder
+
+    mine, session = tmp_path / "mine.py", tmp_path / "a.session"
+    mine.write_text("raise SystemExit('it ran')\n")
+    setup = {"estimator": f"{mine}:Mine", "agent": "none", "patience": None}
+    Recorder(session, setup).close()
+    status, _, err = run("live", "--replay", session)
+    assert status == 2 and "name it in the command" in err and "it ran" not in err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("live",), "name an ESTIMATOR, or --simulate, --relay or --replay"),
+        (("live", "exact-kff"), "did you mean 'exact-kf'?"),
+        (("live", "exact-kf", "--agent", "lqrr"), "did you mean 'lqr'?"),
+        (("live", "exact-kf", "--publish", "nowhere"), "HOST:PORT"),
+        (("live", "exact-kf", "--host", "192.0.2.1"), "is none"),
+        (("live", "exact-kf", "--json", "a.txt"), "ends in .json"),
+        (("live", "--simulate", "--env", "sideslip/YawVison-v0"), "did you mean"),
+        (("live", "--relay", "no-such-file"), "no-such-file"),
+        (("live", "--replay", "no-such-file"), "no-such-file"),
+        (("live", "--replay", __file__), "is no session"),
+        (("live", "exact-kf", "--record", __file__), "exists"),
+    ],
+)
+def test_a_mistake_is_one_line(run: Run, arguments: tuple[str, ...], message: str) -> None:
+    status, _, err = run(*arguments)
+    assert status == 2 and message in err and "Traceback" not in err
+
+
+def test_a_port_in_use_is_one_line(run: Run) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("127.0.0.1", 0))
+        number = other.getsockname()[1]
+        status, _, err = run("live", "exact-kf", "--port", number)
+    assert status == 2 and f"UDP port {number} of 127.0.0.1 is in use" in err
