@@ -38,7 +38,7 @@ class Epoch(NamedTuple):
     satellites: int  # used
     in_view: int  # satellites, of the newest GSV of each system
     quality: int  # of the course: 0 without a fix or below COURSE_SPEED, else 1
-    age: float  # s since the newest fix, by t: 0 with a fix, NaN before the first
+    age: float  # s since the newest fix, by t: 0 with a fix, NaN before the first or without a time
 
     @property
     def fixed(self) -> bool:
@@ -187,14 +187,14 @@ class Decoder:
         self._sent = True
         t = math.nan if self._time is None else self._since_1970(self._time)
         rmc, gga, gsa, vtg = (self._parts.get(kind, {}) for kind in ("RMC", "GGA", "GSA", "VTG"))
-        both = vtg | rmc | gga
+        known = vtg | rmc | gga
         flags = [rmc["status"] == "A"] if "status" in rmc else []
         flags += [gga["quality"] not in _NOT_MEASURED] if "quality" in gga else []
-        latitude, longitude = signed(both, "lat", "NS", "S"), signed(both, "lon", "EW", "W")
+        latitude, longitude = signed(known, "lat", "NS", "S"), signed(known, "lon", "EW", "W")
         fixed = bool(flags) and all(flags) and math.isfinite(latitude + longitude)
-        knots = both.get("spd", both.get("sogn", both.get("sogk", math.nan) / 1.852))
+        knots = known.get("spd", known.get("sogn", known.get("sogk", math.nan) / 1.852))
         speed = KNOT * knots if fixed else math.nan
-        north = both.get("cog", both.get("cogt", math.nan)) if fixed else math.nan
+        north = known.get("cog", known.get("cogt", math.nan)) if fixed else math.nan
         hdop = gga.get("HDOP", gsa.get("HDOP", 0.0))
         self._fix = t if fixed else self._fix
         self.counts.epochs += 1
@@ -210,7 +210,7 @@ class Decoder:
             gga.get("numSV", gsa.get("numSV", 0)),
             sum(self._view.values()),
             int(speed >= COURSE_SPEED and math.isfinite(north)),
-            t - self._fix,
+            max(t - self._fix, 0.0),
         )
 
     def _since_1970(self, time: float) -> float:

@@ -105,6 +105,8 @@ def test_without_a_fix_nothing_but_satellites_is_known() -> None:
     assert first.fixed and not second.fixed
     assert all(math.isnan(x) for x in (second.latitude, second.course, second.speed))
     assert (second.satellites, second.quality, second.age) == (2, 0, 3.0)
+    set_back, unknown = decoded(data + rmc("110000", status="V") + rmc("", status="V"))[0][2:]
+    assert set_back.age == 0.0 and math.isnan(unknown.age)
 
 
 @pytest.mark.parametrize(("status", "quality"), [("V", "1"), ("A", "0"), ("A", "6")])

@@ -2,6 +2,8 @@
 
 import os
 import socket
+import subprocess
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -166,3 +168,24 @@ def test_a_log_is_known_by_its_content(tmp_path: Path) -> None:
     assert not is_nmea(tmp_path / "d.txt")
     assert not is_nmea(tmp_path / "gone.csv")
     assert is_nmea(tmp_path / "gone.nmea")
+
+
+@pytest.mark.parametrize("library", ["pynmeagps", "serial"])
+def test_a_missing_library_is_named_with_its_extra(library: str, tmp_path: Path) -> None:
+    (tmp_path / "a.nmea").write_bytes(LOG)
+    code = f"""
+import sys
+sys.modules[{library!r}] = None
+from sideslip.envs.recordings.sources import open_source, read_nmea
+try:
+    read_nmea("a.nmea")
+    list(open_source("serial:/no/such/port"))
+except ModuleNotFoundError as error:
+    print(error)
+"""
+    command = [sys.executable, "-c", code]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    run = subprocess.run(
+        command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True
+    )
+    assert "pip install 'sideslip[wires]'" in run.stdout and "needs py" in run.stdout
