@@ -71,7 +71,7 @@ for _id, _entry in {
     "sideslip/Outside-v0": "sideslip.envs.outside.env:OutsideEnv",
 }.items():
     if _id not in registry:
-        register(_id, entry_point=_entry)
+        register(_id, entry_point=_entry, kwargs={"sensors": "fusion"})
 
 
 def __getattr__(name: str) -> Any:

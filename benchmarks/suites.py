@@ -57,11 +57,17 @@ def _following(suite: Any, r: Request) -> Any:
     return suite.run(*numbers, r.jobs, r.console)
 
 
+def _highway(suite: Any, r: Request) -> Any:
+    numbers = (suite.QUICK_SEEDS, suite.QUICK_DRIVES) if r.quick else (suite.SEEDS, suite.DRIVES)
+    return suite.run(*numbers, r.jobs, r.console)
+
+
 SUITES: dict[str, tuple[str, _Run]] = {
     "estimation": (".estimation", _seeds),
     "control": (".control.suite", _control),
     "papers": (".papers.suite", _seeds),
     "following": (".following", _following),
+    "highway": (".highway", _highway),
     "recovery": (".recovery", lambda suite, r: suite.run(r.quick, r.jobs, r.console)),
     "procedures": (".procedures.suite", lambda suite, r: suite.run(r.quick, r.jobs, r.console)),
     "speed": (".speed.suite", lambda suite, r: suite.run(r.quick, r.console)),

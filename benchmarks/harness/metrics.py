@@ -153,8 +153,9 @@ _OTHERS = {
     "Hz": "hertz",
     "rad s2/m": "understeer_gradient",
     "-": "rmse_over_bound score cost_vs_nominal share_won worst_cost failure_rate spin_rate "
-    "departure_rate saved_rate not_finite_rate bad_action_rate gap ratio difference residual rank "
-    "share spectral_radius count amplitude overshoot log_likelihood nis",
+    "departure_rate collision_rate success_rate saved_rate not_finite_rate bad_action_rate "
+    "gap ratio difference residual rank share spectral_radius count amplitude overshoot "
+    "log_likelihood nis",
 }
 METRICS = {metric.name: metric.unit for metric in EPISODE} | {
     name: unit for unit, names in _OTHERS.items() for name in names.split()

@@ -18,6 +18,7 @@ from ..stability import StabilityEnv
 from ..task.cost import rest_of_cost
 from ..task.failures import COLLISION, DEPARTURE, RUNNING
 from ..task.info import REPORT
+from ..vehicle.dynamics import Motion
 from ..vehicle.vehicles import VehicleSource
 from .roads import ROADS
 from .traffic import PERIOD, Start, Traffic, hazard_from
@@ -146,19 +147,26 @@ class HighwayEnv(StabilityEnv):
         """What a picture is drawn from, its road by highway-env's own graphics."""
         return super().shot(row)._replace(world=self._world)
 
-    def _world(self, size: tuple[int, int]) -> Any:
-        """The road around our car as highway-env draws it, a surface of so many pixels."""
+    def _world(self, size: tuple[int, int], others: list[Motion]) -> Any:
+        """The road around our car as highway-env draws it, and others of ours as shadows on it."""
         import pygame
         from highway_env.road.graphics import RoadGraphics, WorldSurface
+        from highway_env.vehicle.graphics import VehicleGraphics
 
         assert self._around is not None
+        road, ours = self._around.road, self._around.ours
         world = WorldSurface(size, 0, pygame.Surface(size))
-        world.scaling, world.centering_position = 8.0, [0.3, 0.5]
-        self._around.ours.put(self.motion)
-        world.move_display_window_to(self._around.ours.position)
-        RoadGraphics.display(self._around.road, world)
-        RoadGraphics.display_road_objects(self._around.road, world, offscreen=True)
-        RoadGraphics.display_traffic(self._around.road, world, offscreen=True)
+        world.scaling, world.centering_position = 10.0, [0.3, 0.5]
+        ours.put(self.motion)
+        world.move_display_window_to(ours.position)
+        RoadGraphics.display(road, world)
+        RoadGraphics.display_road_objects(road, world, offscreen=True)
+        for motion in others:
+            shadow = copy.copy(ours)
+            shadow.put(motion)
+            shadow.color = (170, 170, 170)
+            VehicleGraphics.display(shadow, world, offscreen=True)
+        RoadGraphics.display_traffic(road, world, offscreen=True)
         return world
 
     def get_state(self) -> dict[str, Any]:

@@ -81,6 +81,8 @@ class Start(NamedTuple):
 class OurCar(HighwayVehicle):  # type: ignore[misc]
     """Our car as the others see it: it is where it was put, and a vehicle like any other."""
 
+    color = (50, 200, 0)  # highway-env's own for the car that is driven
+
     def __init__(self, road: Any, start: Start) -> None:
         front, rear, half = body(start.vehicle)
         self.LENGTH, self.WIDTH, self._centre = front - rear, 2.0 * half, 0.5 * (front + rear)

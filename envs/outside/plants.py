@@ -17,7 +17,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from importlib import import_module
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -98,6 +98,23 @@ def outside_vehicle() -> Vehicle:
         roll_stiffness=1.0 / (1.0 / body + 1.0 / tyres),
         roll_damping=0.5 * (p.T_f**2 * p.K_sdf + p.T_r**2 * p.K_sdr),
     )
+
+
+class Plant(Protocol):
+    """What moves a car in place of our own plant: `OutsidePlant` has a word on each."""
+
+    specific_force: tuple[float, float]
+
+    @property
+    def motion(self) -> Motion:
+        """Where the car is, how fast, and on which road."""
+
+    @property
+    def finite(self) -> bool:
+        """Whether the state is made of numbers."""
+
+    def step(self, acting: Acting, h: float) -> None:
+        """Move for h seconds."""
 
 
 class OutsidePlant(ABC):

@@ -52,7 +52,8 @@ def draw(shot: Shot, name: str = "true", ghosts: Sequence[tuple[str, Shot]] = ()
     _heading(canvas, scene, config.scenario.name, now[MOMENT.t], failures)
     picture = canvas.finished()
     if world is not None:
-        picture.blit(world((int(_ROAD[2]), int(_ROAD[3]))), _ROAD[:2])
+        size = int(_ROAD[2]), int(_ROAD[3])
+        picture.blit(world(size, [each.scene.motion for each in beside]), _ROAD[:2])
     return picture
 
 

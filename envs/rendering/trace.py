@@ -9,6 +9,7 @@ from ..engine.layout import Z
 from ..engine.packing import EpisodeConfig
 from ..record import Array
 from ..task.info import REPORT
+from ..vehicle.dynamics import Motion
 
 
 class Moment(NamedTuple):
@@ -77,6 +78,10 @@ class Trace:
         return self._rows[chosen], {name: each[chosen] for name, each in self._estimates.items()}
 
 
+World = Callable[[tuple[int, int], list[Motion]], Any]
+"""Draws a road around a car, and others at their motions, on a surface of so many pixels."""
+
+
 class Shot(NamedTuple):
     """What a picture is drawn from: an episode's packed numbers, and what was seen of it."""
 
@@ -87,7 +92,7 @@ class Shot(NamedTuple):
     config: EpisodeConfig
     trace: Trace
     ours: bool = True  # its tyres are those of our plant
-    world: Callable[[tuple[int, int]], Any] | None = None  # draws the road instead, a surface
+    world: World | None = None  # draws the road instead
 
 
 def _grown(rows: Array) -> Array:
