@@ -29,9 +29,10 @@ from .ticks import TICK
 from .vehicle.dynamics import Motion
 from .vehicle.vehicle import Vehicle
 from .vehicle.vehicles import VehicleSource, vehicle_from
+from .vision import Seeing
 
 
-class StabilityEnv(DrawnOne, gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
+class StabilityEnv(Seeing, DrawnOne, gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
     """Keep a car's sideslip angle where it should be, by two motors and, if asked, by steering.
 
     ## Action
@@ -87,7 +88,7 @@ class StabilityEnv(DrawnOne, gym.Env[npt.NDArray[np.float32], npt.NDArray[np.flo
     (its steady state), "limited" (by friction) or "lagged" (so limited, understeering, lag 0.1 s).
     fast: "summary" or "all". slow, by name ("camera", "gps"): fields of `SlowSensor` that replace
     the id's. yaw_first: yaw moment before acceleration where both pass the motors' limit. steering:
-    the action may steer too. render_mode: of `Drawn`.
+    the action may steer too. vision, delay, appearance: as of `Seeing`. render_mode: of `Drawn`.
     """
 
     def __init__(
@@ -102,26 +103,23 @@ class StabilityEnv(DrawnOne, gym.Env[npt.NDArray[np.float32], npt.NDArray[np.flo
         yaw_first: bool = True,
         steering: bool = False,
         on_bad_action: str = "raise",
+        vision: str = "analytic",
+        delay: str | None = None,
+        appearance: Mapping[str, Any] | None = None,
         render_mode: str | None = None,
         **slow: Mapping[str, Any] | None,
     ) -> None:
         car = vehicle_from(vehicle)
+        believed = car if nominal is None else vehicle_from(nominal)
         self.config = EnvConfig(
-            sensors,
-            scenario_from(scenario),
-            car,
-            car if nominal is None else vehicle_from(nominal),
-            control_period,
-            reference,
-            fast,
-            yaw_first,
-            steering,
-            on_bad_action,
-            slow,
-        )
+            sensors, scenario_from(scenario), car, believed, control_period, reference, fast,
+            yaw_first, steering, on_bad_action, vision, delay, slow,
+        )  # fmt: skip
         self.control_period, self.reference = int(control_period), reference
         self._now = self.config.base
         self._draw_in(render_mode)
+        self._see_in(vision, delay, appearance)
+
         self.layout: tuple[Entry, ...] = self.config.layout
         self._bounds = self.config.bounds
         low, high = self._bounds.astype(np.float32)
@@ -161,9 +159,6 @@ class StabilityEnv(DrawnOne, gym.Env[npt.NDArray[np.float32], npt.NDArray[np.flo
             self._seen()
         return obs, info
 
-    def _begin(self) -> None:
-        """What else begins with an episode whose tick 0 is packed."""
-
     def step(
         self, action: npt.ArrayLike
     ) -> tuple[npt.NDArray[np.float32], float, bool, bool, dict[str, Any]]:
@@ -172,11 +167,14 @@ class StabilityEnv(DrawnOne, gym.Env[npt.NDArray[np.float32], npt.NDArray[np.flo
             raise ResetNeeded("the episode is over or was never started: call reset() first")
         force = action_of(action, self._width, self._fails)
         obs = np.empty(self._entries, np.float32)
+        before = None if self.eye is None else self._state.copy()
         done = self._advance(force, obs)
         if done <= 0:
             if done == REFUSED:
                 raise ValueError(f"action {force.tolist()} is not finite; nothing was stepped")
             obs = np.zeros_like(obs)
+        elif self.eye is not None:
+            self.eye.look(before, self._row(obs), done, self._bounds, self._window)
         info = self._info(done)
         terminated = info["failure"] != RUNNING
         truncated = info["is_success"]
@@ -209,7 +207,7 @@ class StabilityEnv(DrawnOne, gym.Env[npt.NDArray[np.float32], npt.NDArray[np.flo
     def _info(self, done: int) -> dict[str, Any]:
         self.ticks_done = done
         info, self.delivered = info_of(self._report)
-        return info
+        return info if self.eye is None else info | self.eye.marks
 
     @property
     def record(self) -> Record:

@@ -245,6 +245,10 @@ class StabilityVectorEnv(DrawnRows, Episodes, VectorEnv[Observations, Any, npt.N
 
 def _rows_of(arguments: Mapping[str, Any], count: int) -> tuple[StabilityEnv, list[EnvConfig]]:
     """The first row's env, and the config of each row; rows with the same values share one."""
+    if arguments.get("vision") == "image":
+        raise ValueError(
+            "vision='image' sees for one car at a time: make_vec(..., vectorization_mode='sync')"
+        )
     columns = {name: each_of(name, arguments.get(name), count) for name in _BY_ROW}
     envs: dict[tuple[int, ...], StabilityEnv] = {}
     rows = []

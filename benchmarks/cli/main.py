@@ -1,4 +1,4 @@
-"""The command line: list, run, bench, replay, live, train, export, enjoy, tune, calibrate."""
+"""The command line: list, run, bench, replay, live, lane, train, export, enjoy, tune, calibrate."""
 
 import sys
 from pathlib import Path
@@ -19,6 +19,7 @@ from .challenge import Agents, EnvId, Estimators, Fresh, Limit, Scenarios, chall
 from .cluster import Address, EngineName
 from .enjoy import enjoy_command
 from .export import Trust, export_command
+from .lane import lane_command
 from .live import live_command
 from .names import KINDS, complete
 from .output import check_files, options_of, show_episode, write_output, wrote
@@ -30,6 +31,7 @@ app.add_typer(tune_app, name="tune")
 app.command("calibrate")(calibrate_command)
 app.command("enjoy")(enjoy_command)
 app.command("export")(export_command)
+app.command("lane")(lane_command)
 app.command("live")(live_command)
 app.command("train")(train_command)
 console = Console()

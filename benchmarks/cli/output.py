@@ -32,7 +32,9 @@ if TYPE_CHECKING:
     from ...agents.rollout import Rollout
 
 _ENDINGS = {
+    "film": (".mp4", ".avi"),
     "html": (".html", ".htm"),
+    "image": (".png", ".jpg", ".jpeg"),
     "json": (".json",),
     "kml": (".kml",),
     "parquet": (".parquet",),

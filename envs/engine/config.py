@@ -14,6 +14,7 @@ from ..scenarios.checks import SHORTEST_GPS_PERIOD
 from ..scenarios.draws import range_of
 from ..scenarios.manoeuvres import scenario_from
 from ..scenarios.scenario import Scenario
+from ..sensors.camera.detector import DELAYS, SLOWEST, VISIONS, detector, ticks_taken
 from ..sensors.link import IN_FLIGHT, SlowSensor
 from ..sensors.slow import SENSOR_SETS, SLOW_NAMES, with_changes
 from ..task.observation import Entry, observation_layout
@@ -56,6 +57,20 @@ def most_packets(sensor: SlowSensor, n: int) -> int:
     return 2 * (n // int(ticks(period)) + 1) + IN_FLIGHT
 
 
+def detected(camera: SlowSensor, delay: str | None) -> SlowSensor:
+    """The camera whose pictures a detector looks at: its delay is described by its range.
+
+    Raises ValueError where a picture would arrive as it is taken.
+    """
+    if delay == "link":
+        if ticks(min(camera.delays)) < 1:
+            raise ValueError("a picture takes a tick at least: camera delays of 0.001 s or more")
+        return camera
+    least, most = (TICK, SLOWEST) if delay == "measured" else detector().range
+    first, last = ticks_taken(least), ticks_taken(most)
+    return dataclasses.replace(camera, delays=(first * TICK,), jitter=(last - first) * TICK)
+
+
 OPTIONS = ("scenario", "vehicle", "friction", "state", "duration")
 
 
@@ -77,6 +92,8 @@ class EnvConfig:
     yaw_first: bool
     steering: bool
     on_bad_action: str
+    vision: str
+    delay: str | None
     slow_changes: Mapping[str, Mapping[str, Any] | None]
 
     def __post_init__(self) -> None:
@@ -96,6 +113,13 @@ class EnvConfig:
         bad = self.on_bad_action
         if not isinstance(bad, str) or bad not in ("raise", "fail"):
             raise ValueError(f"on_bad_action is 'raise' or 'fail', got {brief(bad)}")
+        check_choice("vision", self.vision, VISIONS)
+        if self.vision == "image" and "camera" not in SENSOR_SETS[self.sensors]:
+            raise ValueError(f"vision='image' needs a camera, and {self.sensors!r} has none")
+        if self.delay is not None:
+            check_choice("delay", self.delay, DELAYS)
+            if self.vision != "image":
+                raise ValueError(f"delay={self.delay!r} is of pictures: vision='image'")
 
     @property
     def slow(self) -> dict[str, SlowSensor]:
@@ -132,11 +156,15 @@ class EnvConfig:
         self, scenario: Scenario, vehicle: Vehicle, motion: Array | None = None
     ) -> EpisodeConfig:
         """An episode of a scenario with a true vehicle and a start, as of `motion_from`."""
+        slow = in_scenario(self.slow, scenario)
+        if self.vision == "image":
+            slow["camera"] = detected(slow["camera"], self.delay)
+            scenario = scenario.replace(noise={**scenario.noise, **detector().noise})
         return episode_config(
             scenario,
             vehicle,
             self.nominal,
-            in_scenario(self.slow, scenario),
+            slow,
             self.reference,
             motion,
             self.fast == "all",

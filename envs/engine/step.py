@@ -153,12 +153,26 @@ def write_end(
 @apart
 def conclude(row: Row, n: int, done: int, bounds: Any, window: Any) -> None:
     """The slow sensors along `done` ticks of one vehicle, its observation and its report."""
-    z, report, rows = row.z, row.report, row.rows
-    count, first = 0, z[Z.clock.tick] - done
-    for j in range(done):
-        tick = first + (j + 1)
+    sum_up(row, n, done, sense_ticks(row, 0, done, 0, done, window), bounds)
+
+
+@jit
+def sense_ticks(row: Row, first: int, last: int, count: int, done: int, window: Any) -> int:
+    """The slow sensors at the ticks first to last - 1 of the `done` of a step; returns how many
+    packets there are then, of `count` before."""
+    z = row.z
+    before = z[Z.clock.tick] - done
+    for j in range(first, last):
+        tick = before + (j + 1)
         if due(z, tick):
             count = sense_slow(row, read(window, WINDOW.track, j), tick, count)
+    return count
+
+
+@jit
+def sum_up(row: Row, n: int, done: int, count: int, bounds: Any) -> None:
+    """The observation and the report of a step of `done` ticks and `count` packets."""
+    z, report, rows = row.z, row.report, row.rows
     refs = (report[REPORT.beta_ref], report[REPORT.gamma_ref])
     shown = done
     if row.switches[FLAGS.all_samples]:  # the last one stands for the missing

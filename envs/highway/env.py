@@ -118,6 +118,7 @@ class HighwayEnv(StabilityEnv):
         self._around = Traffic(self.road, start, self.hazard, self.traffic, key)
         if self._around.path is not None:
             p[list(P.path)] = self._around.path
+        super()._begin()
 
     def _advance(self, force: npt.NDArray[np.float32], obs: npt.NDArray[np.float32]) -> int:
         """One control period of our car on the lane as it is here, then the road's steps in it."""

@@ -1,4 +1,4 @@
-"""Pictures and films from files. Needs the extra `vision`."""
+"""Pictures and films from files, and what was found drawn on them. Needs the extra `vision`."""
 
 import os
 from collections.abc import Iterator
@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from .finder import Lane, LaneFinder
 from .road_image import Image
 
 PICTURES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
@@ -40,16 +41,61 @@ class Film:
         there, first = self._reader.read()
         if not there:
             raise ValueError(f"{path}: this is no film that can be read")
-        self.first = np.asarray(first, np.uint8)
+        self._ahead = [np.asarray(first, np.uint8)]
+
+    def head(self, count: int) -> list[Image]:
+        """The first frames, at most so many, which `iter` has again."""
+        while len(self._ahead) < count:
+            there, frame = self._reader.read()
+            if not there:
+                break
+            self._ahead.append(np.asarray(frame, np.uint8))
+        return list(self._ahead)
 
     def __iter__(self) -> Iterator[Image]:
-        """The frames, the first one again; it ends where the file does, or what is whole of it."""
-        yield self.first
+        """The frames, once; it ends where the file does, or what is whole of it."""
+        while self._ahead:
+            yield self._ahead.pop(0)
         while True:
             there, frame = self._reader.read()
             if not there:
                 return
             yield np.asarray(frame, np.uint8)
+
+
+def drawn(picture: Image, finder: LaneFinder, lane: Lane) -> Image:
+    """A copy of a picture in colour with the markings that the finder found in it just now."""
+    shown = cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR) if picture.ndim == 2 else picture.copy()
+    thick = max(shown.shape[1] // 400, 1)
+    if finder.fit is not None:
+        edges = [
+            finder.camera.pixels_of(finder.rows_ahead, finder.marking(finder.fit, side))
+            for side in (1, -1)
+        ]
+        left, right = (np.round(edge[np.isfinite(edge[:, 0])]).astype(np.int32) for edge in edges)
+        lit = shown.copy()
+        cv2.fillPoly(lit, [np.concatenate([left, right[::-1]])], (80, 160, 0))
+        shown = cv2.addWeighted(lit, 0.3, shown, 0.7, 0.0)
+        for edge, colour in ((left, (0, 120, 255)), (right, (255, 160, 0))):
+            cv2.polylines(shown, [edge], False, colour, 2 * thick, cv2.LINE_AA)
+    size = 0.3 * thick
+    place = int(30 * size), int(50 * size)
+    for colour, width in (((0, 0, 0), 3 * thick), ((255, 255, 255), thick)):
+        cv2.putText(
+            shown, described(lane), place, cv2.FONT_HERSHEY_SIMPLEX, size, colour, width,
+            cv2.LINE_AA,
+        )  # fmt: skip
+    return np.asarray(shown, np.uint8)
+
+
+def described(lane: Lane) -> str:
+    """A line on a lane."""
+    if lane.quality == 0.0:
+        return "no lane"
+    return (
+        f"psi {np.degrees(lane.psi):+.2f} deg, offset {lane.y:+.2f} m, "
+        f"curvature {lane.curvature:+.4f} 1/m, quality {lane.quality:.2f}"
+    )
 
 
 def _check(path: "str | os.PathLike[str]") -> None:

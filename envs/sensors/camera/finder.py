@@ -108,8 +108,9 @@ class LaneFinder:
 
     def _bright(self, picture: Image) -> tuple[Array, Array, Array]:
         """(X, Y, strength): ridges across the road, in m and grey levels, the strongest ones."""
-        grey = picture if picture.ndim == 2 else picture.max(2)  # yellow is bright in red
-        road = cv2.remap(grey, self._map, self._fine, cv2.INTER_LINEAR)
+        road = cv2.remap(picture, self._map, self._fine, cv2.INTER_LINEAR)
+        if road.ndim == 3:
+            road = cv2.max(road[..., 1], road[..., 2])  # yellow is bright in red
         light = cv2.sepFilter2D(road, cv2.CV_32F, self._ridge, np.ones(1, np.float32))
         middle = light[:, 1:-1]
         level = max(CONTRAST, 4.0 * 1.4826 * float(np.median(np.abs(middle[::4, ::4]))))

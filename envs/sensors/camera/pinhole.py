@@ -17,7 +17,7 @@ import numpy.typing as npt
 from ...arguments import brief, is_finite, unknown_names
 from ...documents import read_document, write_document
 
-Array = npt.NDArray[np.float64]
+Array = npt.NDArray[np.floating[Any]]
 _MATRIX = ((640.0, 0.0, 639.5), (0.0, 640.0, 359.5), (0.0, 0.0, 1.0))
 _MEASURED = ("rms_px", "boards")  # a calibration file may hold them
 
@@ -86,12 +86,6 @@ class Pinhole:
         """Write a file that `read` reads back; measured: what else a calibration found."""
         write_document(path, dataclasses.asdict(self) | measured)
 
-    def scaled(self, size: tuple[int, int]) -> "Pinhole":
-        """The same camera with pictures of another size."""
-        across, down = size[0] / self.size[0], size[1] / self.size[1]
-        K = np.diag([across, down, 1.0]) @ np.array(self.K)
-        return dataclasses.replace(self, K=tuple(map(tuple, K.tolist())), size=size)
-
     def undistorted(self, pixels: Array) -> Array:
         """Points on the plane one unit ahead of the lens, (..., 2), of pixels (..., 2)."""
         points = np.ascontiguousarray(pixels, float).reshape(-1, 1, 2)
@@ -120,10 +114,10 @@ class Pinhole:
         inside &= (pixels >= 0.0).all(-1) & (pixels <= np.array([width, height]) - 1.0).all(-1)
         return np.where((seen & inside)[..., None], pixels, np.nan)
 
-    def rays(self) -> Array:
-        """Directions (height, width, 3) of all pixels in car axes, of unit depth."""
-        width, height = self.size
-        grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1).astype(float)
-        across, down = np.moveaxis(self.undistorted(grid), -1, 0)
+    def rays(self, first: int, last: int) -> Array:
+        """Directions (rows, width, 3) of the pixels of the rows first to last - 1 in car axes, of
+        unit depth."""
+        grid = np.stack(np.meshgrid(np.arange(self.size[0]), np.arange(first, last)), -1)
+        across, down = np.moveaxis(self.undistorted(grid.astype(float)), -1, 0)
         s, c = sin(self.tilt), cos(self.tilt)
         return np.stack([c - s * down, -across, -s - c * down], -1)

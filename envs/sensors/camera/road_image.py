@@ -76,8 +76,9 @@ class Painter:
         rows: tuple[int, int] | None = None,
     ) -> None:
         self.camera, self.appearance = camera, appearance or Appearance()
-        self.rows = slice(*(rows or (0, camera.size[1])))
-        self._rays = np.moveaxis(camera.rays()[self.rows], -1, 0).astype(np.float32).copy()
+        first, last = rows or (0, camera.size[1])
+        self.rows = slice(first, last)
+        self._rays = np.moveaxis(camera.rays(first, last), -1, 0).astype(np.float32).copy()
 
     def picture(self, scene: Scene, seed: Any = 0) -> Image:
         """The picture (height, width) in grey levels; seed: of `np.random.Philox`, a number or a

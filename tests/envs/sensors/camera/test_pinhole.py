@@ -29,9 +29,9 @@ def test_a_point_lies_where_its_angles_put_it(x: float, y: float) -> None:
 
 def test_rays_meet_the_road_where_its_points_are_seen() -> None:
     camera = Pinhole()
-    rays = camera.rays()
+    rays = camera.rays(400, 601)
     rows, columns = np.array([400, 450, 600]), np.array([80, 700, 1250])
-    ray = rays[rows, columns]
+    ray = rays[rows - 400, columns]
     reach = -camera.height / ray[:, 2]
     x, y = camera.ahead + reach * ray[:, 0], reach * ray[:, 1]
     np.testing.assert_allclose(camera.pixels_of(x, y), np.stack([columns, rows], 1), atol=1e-3)
@@ -46,8 +46,6 @@ def test_a_file_of_a_camera_comes_back(tmp_path: Path) -> None:
     camera = Pinhole(tilt=0.1, height=1.1)
     camera.write(tmp_path / "camera.json", rms_px=0.8, boards=6)
     assert Pinhole.read(tmp_path / "camera.json") == camera
-    half = camera.scaled((640, 360))
-    assert half.K[0][0] == 320.0 and half.size == (640, 360)
 
 
 @pytest.mark.parametrize(

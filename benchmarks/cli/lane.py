@@ -1,0 +1,209 @@
+"""`sideslip lane`: the lane in a picture or a film, and a camera's intrinsics from chessboards."""
+
+import time
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.progress import track
+
+from ...envs.backend.files import whole, write_whole
+from ...envs.documents import read_document, write_document
+from .output import check_files, wrote
+
+if TYPE_CHECKING:
+    from ...envs.sensors.camera.finder import Lane, LaneFinder
+    from ...envs.sensors.camera.pinhole import Pinhole
+    from ...envs.sensors.camera.road_image import Image
+
+NEAR, FAR = 6.0, 30.0  # m: beyond a bonnet, and where markings are still wide enough
+TRIES = 60  # frames in which a lane is looked for that shows how the camera is mounted
+
+
+def lane_command(
+    source: Annotated[
+        Path | None, typer.Argument(metavar="IMAGE|VIDEO", help="A picture or a film.")
+    ] = None,
+    intrinsics: Annotated[
+        Path | None,
+        typer.Option(help="The camera: TOML or JSON with K, dist, size, perhaps height and tilt."),
+    ] = None,
+    lane_width: Annotated[float, typer.Option(help="m, from marking to marking.")] = 3.7,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Write what was found on it.")
+    ] = None,
+    json: Annotated[Path | None, typer.Option("--json", help="Write the numbers.")] = None,
+    calibrate: Annotated[
+        Path | None, typer.Option(help="A folder of chessboards (9 x 6): find the intrinsics.")
+    ] = None,
+) -> None:
+    """Find the lane: heading, offset, curvature and a quality, drawn over the picture.
+
+    Without height and tilt among the intrinsics they are estimated from a picture, for a straight
+    lane of the width stated; without intrinsics a lens of usual width is assumed.
+    """
+    try:
+        import cv2
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(
+            f"the lane finder needs {error.name}: pip install 'sideslip[vision]'"
+        ) from None
+    from ...envs.sensors.camera.films import PICTURES, Film, read_picture
+
+    console = Console(soft_wrap=True)
+    check_files(json=json)
+    if (source is None) == (calibrate is None):
+        raise ValueError("expected a picture or a film, or --calibrate FOLDER")
+    if source is None:
+        assert calibrate is not None
+        _calibrate(calibrate, json or Path("intrinsics.json"), console)
+        return
+    if not 1.0 < lane_width < 10.0:
+        raise ValueError(f"--lane-width is 1 to 10 m, got {lane_width}")
+    cv2.setNumThreads(1)
+    still = source.suffix.lower() in PICTURES
+    check_files(**{"image" if still else "film": out})
+    if still:
+        picture = read_picture(source)
+        finder = _finder([picture], intrinsics, lane_width, source)
+        lanes, seconds = _still(picture, finder, out)
+    else:
+        film = Film(source)
+        finder = _finder(film.head(TRIES), intrinsics, lane_width, source)
+        lanes, seconds = _film(film, finder, out, console)
+        if len(lanes) < film.promised:
+            console.print(
+                f"the film ends after {len(lanes)} of the {film.promised} frames it promises"
+            )
+    _report(console, source, finder.camera, lanes, seconds)
+    if json is not None:
+        frames = [lane._asdict() for lane in lanes]
+        write_document(json, {"source": str(source), "frames": frames})
+    for path in (out, json):
+        if path is not None:
+            wrote(console, path)
+
+
+def _calibrate(folder: Path, path: Path, console: Console) -> None:
+    """Write the intrinsics that a folder's chessboards give."""
+    from ...envs.sensors.camera.chessboard import calibrated
+    from ...envs.sensors.camera.films import PICTURES
+
+    if not folder.is_dir():
+        raise FileNotFoundError(f"{folder}: there is no such folder")
+    check_files(json=path)
+    boards = sorted(each for each in folder.iterdir() if each.suffix.lower() in PICTURES)
+    camera, error = calibrated(boards)
+    write_document(path, {"K": camera.K, "dist": camera.dist, "size": camera.size, "rms_px": error})
+    console.print(f"corners within {error:.2f} px rms in {len(boards)} pictures", highlight=False)
+    wrote(console, path)
+
+
+def _finder(
+    pictures: "list[Image]", intrinsics: Path | None, lane_width: float, source: Path
+) -> "LaneFinder":
+    """A finder for the camera of some pictures, the first of which that can shows its mounting.
+
+    Raises ValueError for intrinsics of another size, and where no picture shows a lane.
+    """
+    from ...envs.sensors.camera.finder import LaneFinder
+    from ...envs.sensors.camera.mounting import default_camera, mounted
+    from ...envs.sensors.camera.pinhole import Pinhole
+
+    height, width = pictures[0].shape[:2]
+    known: Any = {}
+    if intrinsics is None:
+        camera = default_camera((width, height))
+    else:
+        camera, known = Pinhole.read(intrinsics), read_document(intrinsics, "camera")
+    if camera.size != (width, height):
+        raise ValueError(
+            f"{intrinsics}: the camera's pictures are {camera.size[0]} x {camera.size[1]} pixels, "
+            f"those of {source} {width} x {height}"
+        )
+    failed = None
+    for picture in pictures if not {"height", "tilt"} <= known.keys() else ():
+        try:
+            camera, failed = mounted(camera, picture, lane_width), None
+            break
+        except ValueError as error:
+            failed = error
+    if failed is not None:
+        raise ValueError(f"{source}: {failed}")
+    return LaneFinder(camera, lane_width, near=NEAR, far=FAR)
+
+
+def _still(picture: "Image", finder: "LaneFinder", out: Path | None) -> tuple[list["Lane"], float]:
+    """(lanes, seconds a picture) of a picture, which is drawn; the fastest of some runs."""
+    import cv2
+
+    from ...envs.sensors.camera.films import drawn
+
+    lane, seconds = finder.find(picture), np.inf
+    for _ in range(10):
+        began = time.thread_time()
+        finder.find(picture)
+        seconds = min(seconds, time.thread_time() - began)
+    if out is not None:
+        _, data = cv2.imencode(out.suffix.lower(), drawn(picture, finder, lane))
+        write_whole(out, data.tobytes())
+    return [lane], seconds
+
+
+def _film(
+    film: Any, finder: "LaneFinder", out: Path | None, console: Console
+) -> tuple[list["Lane"], float]:
+    """(lanes, seconds a picture, the median) of a film, which is drawn."""
+    import cv2
+
+    from ...envs.sensors.camera.films import drawn
+
+    lanes, times = [], []
+    with TemporaryDirectory() as folder:
+        part = Path(folder, f"lane{out.suffix.lower() if out else '.avi'}")
+        writer = None
+        if out is not None:
+            code = cv2.VideoWriter.fourcc(*("mp4v" if part.suffix == ".mp4" else "MJPG"))
+            writer = cv2.VideoWriter(str(part), code, film.rate, finder.camera.size)
+        for picture in track(film, "lane", film.promised or None, console=console):
+            began = time.thread_time()
+            lanes.append(finder.find(picture))
+            times.append(time.thread_time() - began)
+            if writer is not None:
+                writer.write(drawn(picture, finder, lanes[-1]))
+        if writer is not None and out is not None:
+            writer.release()
+            with whole(out) as file:
+                file.write(part.read_bytes())
+    return lanes, float(np.median(times))
+
+
+def _report(
+    console: Console, source: Path, camera: "Pinhole", lanes: list["Lane"], seconds: float
+) -> None:
+    """Print what was found."""
+    from ...envs.sensors.camera.films import described
+
+    found = [lane for lane in lanes if lane.quality > 0.0]
+    if len(lanes) == 1:
+        lines = [f"{source.name}: {described(lanes[0])}"]
+    else:
+        lines = [f"{source.name}: a lane in {len(found)} of {len(lanes)} frames"]
+        if found:
+            psi, offset = (
+                np.array([getattr(lane, name) for lane in found]) for name in ("psi", "y")
+            )
+            lines.append(
+                f"psi {np.degrees(psi.mean()):+.2f} deg (sd {np.degrees(psi.std()):.2f}), offset "
+                f"{offset.mean():+.2f} m (sd {offset.std():.2f}), quality "
+                f"{np.mean([lane.quality for lane in found]):.2f}"
+            )
+    lines.append(
+        f"camera {camera.height:.2f} m high, tilted {np.degrees(camera.tilt):+.2f} deg; "
+        f"{1.0 / seconds:.0f} frames a second of one core"
+    )
+    for line in lines:
+        console.print(line, highlight=False, markup=False)

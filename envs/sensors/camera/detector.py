@@ -1,0 +1,56 @@
+"""The lane finder as it was measured: how long it takes, and its errors while driving.
+
+`detector.json` is written by `python -m sideslip.benchmarks.speed.lane_finder --write`.
+"""
+
+import functools
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import NormalDist
+from typing import Any
+
+from ...ticks import TICK
+
+FILE = Path(__file__).with_suffix(".json")
+VISIONS = ("analytic", "image")
+DELAYS = ("fitted", "measured", "link")
+SLOWEST = 0.1  # s: a measured delay counts as no more
+_NORMAL = NormalDist()
+
+
+@dataclass(frozen=True)
+class Detector:
+    """The time from a picture to its lane, shift + exp(normal), and the standard deviations of
+    what is found."""
+
+    shift: float  # s
+    log_mean: float
+    log_sd: float
+    range: tuple[float, float]  # s, the least and the most that is drawn
+    noise: dict[str, float]  # by the names of `Noise`
+
+    @classmethod
+    def of(cls, values: dict[str, Any]) -> "Detector":
+        """From what the file holds."""
+        times, found = values["seconds"], values["errors"]
+        noise = {"camera_psi": found["psi_rad"], "camera_y": found["y_l_m"]}
+        least, most = times["range"]
+        return cls(times["shift"], times["log_mean"], times["log_sd"], (least, most), noise)
+
+    def delay(self, share: float) -> float:
+        """Seconds, at a share in (0, 1) of the distribution."""
+        drawn = self.shift + math.exp(self.log_mean + self.log_sd * _NORMAL.inv_cdf(share))
+        return min(max(drawn, self.range[0]), self.range[1])
+
+
+def ticks_taken(seconds: float) -> int:
+    """Whole ticks after which what took so long arrives, one at least."""
+    return max(math.ceil(seconds / TICK - 1e-9), 1)
+
+
+@functools.cache
+def detector() -> Detector:
+    """The one on file."""
+    return Detector.of(json.loads(FILE.read_text()))
