@@ -1,8 +1,10 @@
 """From datagrams to ticks: fast rows and packets as estimators take them, whatever came.
 
 Time is that of the inertial stamps, so that two clocks may drift apart. A fast row ends its tick;
-packets of slow sensors go with the next row. What is lost or late is counted and bridged by the
-last row, held. The same batches give the same ticks, which is how a session is replayed.
+packets of slow sensors go with the next row. They were captured their age before their stamp, or
+before that row where the stamp is 0: their sender has another clock. What is lost or late is
+counted and bridged by the last row, held. The same batches give the same ticks, which is how a
+session is replayed.
 """
 
 from collections import Counter
@@ -140,7 +142,8 @@ class Assembler:
             packets = np.zeros((len(self._waiting), PACKET_WIDTH))
             for packet, (sensor, message) in zip(packets, self._waiting, strict=True):
                 *values, age, quality = message.values
-                captured = tick.number - round(age / TICK)
+                sent = round(message.stamp / STAMP) if message.stamp else tick.number
+                captured = sent - round(age / TICK)
                 head = sensor, captured, tick.number, quality, message.sequence
                 packet[: PACKET.value + len(values)] = *head, *values
             order = np.lexsort((packets[:, PACKET.sensor], packets[:, PACKET.captured]))

@@ -9,7 +9,7 @@ Network byte order: a header of 20 bytes, `count` doubles and, behind the estima
 | 5 | kind, of `Kind` |
 | 6-7 | count, the doubles that follow |
 | 8-11 | sequence number: of this sender's datagrams of this kind, modulo 2^32 |
-| 12-19 | stamp, us of the sender's clock since a start of its own, int64, not negative |
+| 12-19 | stamp, us of the inertial sender's clock, int64, not negative; 0: of another clock |
 
 FIELDS names the doubles of each kind, in SI units. A change of any of it is another VERSION.
 """

@@ -3,7 +3,7 @@
 import gc
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -81,6 +81,10 @@ class Statistics:
         return 1e6 * self.misses / max(self.deadlines, 1)
 
 
+def _listed(counts: Mapping[str, int]) -> str:
+    return ", ".join(f"{count} {what}" for what, count in counts.items() if count)
+
+
 @dataclass
 class Loop:
     """An Onboard on a port.
@@ -99,7 +103,7 @@ class Loop:
     step: bool = False
     recorder: Recorder | None = None
     watch: Callable[[Tick], None] | None = None
-    patience: float = 10.0
+    patience: float = 30.0
     statistics: Statistics = field(default_factory=Statistics)
     ended: str = ""
 
@@ -109,10 +113,8 @@ class Loop:
         Raises TimeoutError where no inertial data comes at all.
         """
         begun = heard = time.monotonic()
-        gc.collect()
-        gc.freeze()  # a collection takes longer than a tick
         was = gc.isenabled()
-        gc.disable()
+        gc.disable()  # a collection takes hundreds of ms
         deadline: int | None = None
         try:
             while not self._over(stop, begun + duration):
@@ -130,7 +132,6 @@ class Loop:
         finally:
             if was:
                 gc.enable()
-            gc.unfreeze()
             self.statistics.seconds = time.monotonic() - begun
 
     def _over(self, stop: Callable[[], bool], end: float) -> bool:
@@ -216,15 +217,16 @@ class Loop:
         """All that was measured, as JSON takes it."""
         measured = self.statistics
         times = {f"{name}_us": getattr(measured, name).summary() for name in TIMES}
-        counts = {"counts": dict(self.assembler.counts), "unsent": self.port.unsent}
+        counts = {"counts": dict(self.assembler.counts), "refused": self.onboard.refused}
         return {name: getattr(measured, name) for name in COUNTED} | times | counts
 
     def lines(self, name: str) -> list[str]:
         """The beginning of a verdict on the loop of an estimator of that name."""
         m, counts = self.statistics, self.assembler.counts
         ended = f"{name}: {m.ticks} ticks in {m.seconds:.1f} s, {self.ended}"
-        ignored = ", ".join(f"{n} {what}" for what, n in counts.items() if n) or "nothing"
-        lines = [f"{ended}.", f"Ignored or bridged: {ignored}."]
+        ignored, refused = map(_listed, (counts, self.onboard.refused))
+        by = f"; packets that the estimator refused: {refused}" if refused else ""
+        lines = [f"{ended}.", f"Ignored or bridged: {ignored or 'nothing'}{by}."]
         if m.deadlines:
             jitter, latency = (
                 f"median {t['median']:.0f}, 99.9 % {t['p999']:.0f}, most {t['max']:.0f} us"

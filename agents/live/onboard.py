@@ -71,6 +71,11 @@ class Onboard:
         now: Array = self._S[0]
         return now
 
+    @property
+    def refused(self) -> dict[str, int]:
+        """What the estimator, one of ours, has counted of packets that it did not use."""
+        return self.estimator.counts if self._ours else {}
+
     def begin(self, first: int) -> None:
         """Forget everything; the next tick is `first`."""
         self.estimator.reset(self.sensors, first)

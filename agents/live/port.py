@@ -20,11 +20,14 @@ clock = time.monotonic_ns
 
 
 def address_of(text: str, host: str = LOOPBACK) -> tuple[str, int]:
-    """HOST:PORT or PORT; ValueError for another text."""
+    """The IPv4 address of HOST:PORT or PORT; ValueError for another text or an unknown host."""
     before, _, number = text.rpartition(":")
     if not (number.isascii() and number.isdigit() and 0 <= int(number) < 65536):
         raise ValueError(f"an address is HOST:PORT or PORT, got {text!r}")
-    return before.strip("[]") or host, int(number)
+    try:
+        return socket.gethostbyname(before or host), int(number)
+    except OSError as error:
+        raise ValueError(f"{text!r} is no address of IPv4: {error}") from None
 
 
 def spin_until(when: int) -> None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from .datagrams import LONGEST_AGE, Kind
-from .port import Port, clock
+from .port import Port
 
 EARTH = 6_371_000.0  # m
 WORST_HDOP = 99.0  # of a receiver without a fix
@@ -37,7 +37,7 @@ class Relay:
     def run(self, stop: Callable[[], bool] = lambda: False) -> None:
         """Relay until the source ends, is lost for good, or `stop`."""
         plays = not self.source.startswith(("serial:", "tcp:"))
-        begun, before, due = clock(), math.nan, time.monotonic()
+        before, due = math.nan, time.monotonic()
         try:
             for epoch in self._epochs():
                 if epoch is not None and plays and epoch.t > before:
@@ -48,8 +48,7 @@ class Relay:
                     return
                 if epoch is not None:
                     before = epoch.t
-                    stamp = (clock() - begun) // 1000
-                    self.port.send(self.to, Kind.GPS, stamp, self._values(epoch))
+                    self.port.send(self.to, Kind.GPS, 0, self._values(epoch))
                     self.sent += 1
         except OSError as error:
             self.error = str(error)

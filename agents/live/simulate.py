@@ -1,5 +1,6 @@
 """The other end: a simulated car that sends what its sensors measure and takes controls."""
 
+import gc
 import signal
 import time
 from dataclasses import dataclass, field
@@ -187,10 +188,13 @@ def _other(
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the loop at the car's end has the summary
     try:
         env = gym.make(env_id, **options)
-        rollout(env, None, seed, {"duration": 0.1})  # what is to be compiled is compiled now
-        pipe.send("ready")
-        pipe.recv()
         with Port() as port:
+            idle = Wires(env, port, port.address, speed=10.0)
+            rollout(env, idle, seed, {"duration": 0.1})  # what is to be compiled is compiled now
+            gc.collect()
+            gc.freeze()
+            pipe.send("ready")
+            pipe.recv()
             drive, wires = simulate(env, port, to, seed, step, speed)
         pipe.send((drive.columns, wires.late, wires.periods))
     except Exception as error:

@@ -5,6 +5,7 @@ A process of its own, which the loop sends datagrams: drawing would cost it its 
 
 import asyncio
 import json
+import os
 import signal
 from collections import deque
 from contextlib import suppress
@@ -150,6 +151,8 @@ async def _view(title: str, page: tuple[str, int] | None, screen: bool, pipe: An
 
 def _main(title: str, page: tuple[str, int] | None, screen: bool, pipe: Any) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the loop ends it, with its summary
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))  # whatever the loop's is
+    os.nice(5)
     try:
         asyncio.run(_view(title, page, screen, pipe))
     except (OSError, ModuleNotFoundError) as error:

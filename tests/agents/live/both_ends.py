@@ -18,13 +18,13 @@ from sideslip.agents.rollout import Rollout
 from sideslip.estimators import EstimateObservation
 
 VISION, STEERING = "sideslip/YawVision-v0", "sideslip/AfsYawFusion-v0"
-GUST = {"base": "gust", "duration": 0.5}
+SHORT = {"base": "tie-vision-fig7", "duration": 0.5}
 SEED = 3
 
 
 def contestant(env_id: str, estimator: Any, agent: Any, **options: Any) -> tuple[Any, Any]:
     """(env with its estimator, agent)."""
-    env = EstimateObservation(gym.make(env_id, scenario=GUST, **options), estimator)
+    env = EstimateObservation(gym.make(env_id, scenario=SHORT, **options), estimator)
     return env, make_agent(agent, env)
 
 
@@ -43,7 +43,7 @@ def drive(
         loop.recorder, loop.watch = recorder, watch
         thread = Thread(target=loop.run)
         thread.start()
-        env = gym.make(env_id, scenario=GUST, **options)
+        env = gym.make(env_id, scenario=SHORT, **options)
         found, wires = simulate(env, other, car.address, SEED, step, speed)
         thread.join(20.0)
         assert not thread.is_alive() and loop.ended == "the drive is over"

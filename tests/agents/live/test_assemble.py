@@ -28,6 +28,15 @@ def test_a_row_ends_its_tick_and_packets_go_with_the_next_row() -> None:
     assert found.tolist() == [11.0, 41.0, 1.0, 0.1]
 
 
+def test_a_stamp_tells_the_capture_even_where_its_row_is_late() -> None:
+    """0 is of another clock: then the age counts from the row with which it goes."""
+    assembler = Assembler()
+    ticks_of(assembler, inertial(100))
+    late = camera(0, age=0.03, stamp=102_000), camera(1, age=0.05)
+    tick = ticks_of(assembler, *late, inertial(105))[-1]
+    assert tick.packets[:, [PACKET.captured, PACKET.arrived]].tolist() == [[55, 105], [72, 105]]
+
+
 def test_packets_of_a_tick_have_the_records_order() -> None:
     batch = camera(0, age=0.01), camera(1, age=0.03), inertial(50)
     (tick,) = ticks_of(Assembler(), *batch)

