@@ -33,7 +33,7 @@ CONTEST = Contest("", ID, "passenger-car", "lagged", "wet-evasion")
 ORACLE = STATES[0]
 READS = {"none": "", "ppo-yaw-vision": "", ORACLE: ""}
 CONTROLLERS = ("none", "ppo-yaw-vision", "two-dof", "lqr", "nmpc", ORACLE)
-SEEDS, QUICK_SEEDS, CHUNK = 200, 16, 10
+SEEDS, QUICK_SEEDS, CHUNK = 64, 16, 8
 FIRST_SEED = 2**29
 ENDS = ("spin", "collision", "departure")
 
