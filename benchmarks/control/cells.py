@@ -34,6 +34,13 @@ RUNGS = (NOMINAL, PARAMETERS, STATE)
 LEARNED: tuple[tuple[str, str], ...] = (("", "ppo-yaw-vision"),)
 """(estimator, policy), a policy by its shipped name or path; in tier 1, whose car it knows. One
 that was trained on fewer sensors reads what it knows by name."""
+SHARED = {
+    "mpc": {"grip", "disturbance_time"},
+    "nmpc": {"grip", "disturbance_time"},
+    PARAMETERS: {"grip", "steer_weight"},
+}
+"""What contestants too slow to be tuned take over from `nominal`'s controller; of its filter all,
+where they are not told the truth."""
 SLOW_CONTROLLERS = ("mpc", "nmpc", STATES[1], PARAMETERS)
 
 EPISODES, QUICK_EPISODES, SLOW_EPISODES = 1000, 8, 128
@@ -80,14 +87,20 @@ class Cell:
     @property
     def best(self) -> Options:
         """The options of its filter and its controller: `tuned`, or those of `agents.tuned`, where
-        the reference controller, `nominal`'s design on any filter, has the rung's, and a user's own
-        the rung's filter."""
+        the reference controller, `nominal`'s design on any filter, has the rung's, a user's own the
+        rung's filter, and one that was not tuned what it shares with the rung."""
         if self.tuned is not None:
             return self.tuned
         if self.is_users:
             return tuned(self.contest.kind, NOMINAL) | {"controller": {}}
-        name = NOMINAL if self.controller == REFERENCE_CONTROLLER else self.controller
-        return tuned(self.contest.kind, name)
+        kind, name = self.contest.kind, self.controller
+        if name in SHARED and not any(tuned(kind, name).values()):
+            best = tuned(kind, NOMINAL)
+            shared = {
+                key: best["controller"][key] for key in SHARED[name] & best["controller"].keys()
+            }
+            return {"filter": {} if name == PARAMETERS else best["filter"], "controller": shared}
+        return tuned(kind, NOMINAL if name == REFERENCE_CONTROLLER else name)
 
     @property
     def label(self) -> str:

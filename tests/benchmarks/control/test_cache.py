@@ -1,5 +1,6 @@
 """A case on disk is a result only where it is whole and its own."""
 
+import zipfile
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -24,9 +25,15 @@ def _spoiled(path: Path, **changes: Any) -> None:
     np.savez_compressed(path, **{name: each for name, each in arrays.items() if each is not None})
 
 
-def _turned_over(path: Path, share: float) -> None:
+def _turned_over(path: Path, array: str, share: float) -> None:
+    """Eight bytes of an array's data; some of a header mean nothing."""
+    with zipfile.ZipFile(path) as archive:
+        entry = archive.getinfo(f"{array}.npy")
     content = bytearray(path.read_bytes())
-    for i in range(int(share * len(content)), int(share * len(content)) + 8):
+    at = entry.header_offset
+    start = at + 30 + sum(int.from_bytes(content[at + k : at + k + 2], "little") for k in (26, 28))
+    first = start + int(share * (entry.compress_size - 8))
+    for i in range(first, first + 8):
         content[i] ^= 0xFF
     path.write_bytes(content)
 
@@ -35,7 +42,11 @@ DAMAGE: dict[str, Callable[[Path], object]] = {
     "empty": lambda path: path.write_bytes(b""),
     "no archive": lambda path: path.write_bytes(b"PK\x03\x04" + b"\0" * 99),
     "another archive": lambda path: path.write_bytes(b"\x93NUMPY\x01\x00v\x00{'descr': "),
-    **{f"turned over at {s}": partial(_turned_over, share=s) for s in (0.1, 0.4, 0.7, 0.9)},
+    **{
+        f"{array} turned over at {share}": partial(_turned_over, array=array, share=share)
+        for array in ("numbers", "series")
+        for share in (0.1, 0.9)
+    },
     "few seeds": lambda path: _spoiled(path, numbers=np.zeros((1, NUMBERS))),
     "few numbers": lambda path: _spoiled(path, numbers=np.zeros((len(SEEDS), NUMBERS - 1))),
     "a number": lambda path: _spoiled(path, numbers=np.float64(1.0)),

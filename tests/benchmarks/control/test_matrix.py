@@ -32,7 +32,7 @@ PAIRS = (
 
 @pytest.mark.parametrize(("estimator", "controller"), PAIRS)
 def test_a_cell_is_its_single_episodes(estimator: str, controller: str) -> None:
-    cell = Cell(DWELL, estimator, controller)
+    cell = Cell(DWELL, estimator, controller, tuned={"filter": {}, "controller": {}})
     driven = drive.drive(Chunk(cell, SEEDS, keep=True))
     assert driven.error == ""
     env: gym.Env[Any, Any] = gym.make(YAW, scenario=cell.contest.scenario)
