@@ -17,7 +17,7 @@ def _opened(size: tuple[int, int]) -> pygame.Surface:
     try:
         pygame.display.init()
         driver = pygame.display.get_driver()
-        if driver in _NO_WINDOW and os.environ.get("SDL_VIDEODRIVER") != driver:
+        if driver in _NO_WINDOW and os.environ.get("SDL_VIDEODRIVER") not in _NO_WINDOW:
             raise pygame.error("SDL finds no screen")
         screen = pygame.display.set_mode(size)
     except pygame.error as error:
