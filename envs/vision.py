@@ -23,6 +23,7 @@ from .engine.layout import P, Z
 from .engine.step import sense_ticks, sum_up
 from .engine.window import WINDOW
 from .record import PACKET, PACKET_WIDTH, Array
+from .sensors.camera.analytic import at_preview
 from .sensors.camera.detector import SLOWEST, detector, ticks_taken
 from .sensors.slow import BLOCKS, CAMERA
 from .vehicle.dynamics import Motion
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
     from .sensors.camera.finder import Lane
     from .sensors.camera.road_image import Image
 
-_uniforms = plain(uniforms)
+_uniforms, _at_preview = plain(uniforms), plain(at_preview)
 _SLOW = slice(Z.slow[0].frames, Z.driver)  # the slow sensors and the queue of packets
 
 
@@ -98,8 +99,7 @@ class Eye:
         began = time.perf_counter()
         self.lane = lane = self.finder.find(self.picture)
         took = time.perf_counter() - began
-        l_pre = p[P.car.l_pre]
-        y_l = lane.y + l_pre * lane.psi - 0.5 * lane.curvature * l_pre * l_pre
+        y_l = _at_preview(lane.y, lane.psi, lane.curvature, p[P.car.l_pre])
         queue[mine, PACKET.quality] = lane.quality
         queue[mine, PACKET.value], queue[mine, PACKET.value + 1] = lane.psi, y_l
         if self.delay != "link":

@@ -20,14 +20,18 @@ import numpy as np
 import typer
 
 from ...envs.backend.files import write_whole
+from ...envs.backend.rebuild import plain
 from ...envs.documents import write_document
 from ...envs.record import PACKET, Array, concatenate
+from ...envs.sensors.camera import at_preview
 from ...envs.sensors.camera.detector import FILE
 from ...envs.sensors.camera.films import drawn
 from ...envs.sensors.camera.finder import LaneFinder
 from ...envs.sensors.camera.pinhole import Pinhole
 from ...envs.sensors.camera.road_image import Appearance, Painter, Scene
 from ...envs.vehicle.dynamics import Road
+
+_at_preview = plain(at_preview)
 
 HEADING, OFFSET = 0.35, 4.0  # rad, m: the scored scenarios' field of view
 LOOKS: dict[str, dict[str, float]] = {
@@ -70,8 +74,7 @@ def errors(look: Appearance, bend: float, more: dict[str, Any], count: int) -> t
         lane = FINDER.find(picture)
         times.append(time.thread_time() - began)
         if lane.quality > 0.0:
-            y_l = y + l_pre * psi - 0.5 * kappa * l_pre**2
-            rest.append((lane.psi - psi, lane.y_l - y_l))
+            rest.append((lane.psi - psi, lane.y_l - _at_preview(y, psi, kappa, l_pre)))
     return np.array(rest).reshape(-1, 2), 1.0 - len(rest) / count, np.array(times)
 
 

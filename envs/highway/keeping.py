@@ -17,10 +17,12 @@ import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 
+from ..backend.rebuild import plain
 from ..engine.layout import P, Z
 from ..outside.env import PlantEnv
 from ..outside.plants import Acting
 from ..scenarios.scenario import Scenario
+from ..sensors.camera import at_preview
 from ..task.observation import Entry
 from ..ticks import TICK
 from ..vehicle.dynamics import Motion
@@ -30,6 +32,7 @@ from .roads import place_on
 from highway_env.envs.lane_keeping_env import LaneKeepingEnv  # isort: skip  # after `roads`
 from highway_env.vehicle.dynamics import BicycleVehicle  # isort: skip
 
+_at_preview = plain(at_preview)
 _MASS = 1000.0  # kg; theirs is 1 kg, and only ratios to it count
 KEEPING = Scenario(
     name="lane-keeping-v0",
@@ -133,7 +136,7 @@ class KeepingPlant:
         lateral, heading, slide, turn = np.ravel(seen["state"]).tolist()
         centre, lane = np.ravel(seen["reference_state"])[:2].tolist()
         psi, speed = math.remainder(lane - heading, 2.0 * math.pi), float(self.env.vehicle.speed)
-        y_l = centre - lateral + preview * psi - 0.5 * self.curvature * preview**2
+        y_l = _at_preview(centre - lateral, psi, self.curvature, preview)
         return math.atan2(-slide, speed), -turn, psi, y_l
 
 
@@ -190,15 +193,10 @@ class KeepingEnv(PlantEnv):
     @property
     def truth(self) -> tuple[float, ...]:
         """The true `STATES`."""
-        motion, preview = self.motion, self.vehicle.preview
+        motion = self.motion
         psi = motion.psi - motion.theta
-        bend = 0.5 * self.plant.curvature * preview**2
-        return (
-            math.atan2(motion.v_y, motion.v_x),
-            motion.gamma,
-            psi,
-            motion.y + preview * psi - bend,
-        )
+        y_l = _at_preview(motion.y, psi, self.plant.curvature, self.vehicle.preview)
+        return math.atan2(motion.v_y, motion.v_x), motion.gamma, psi, y_l
 
     def get_state(self) -> dict[str, Any]:
         """Refused."""

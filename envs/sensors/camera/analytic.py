@@ -2,7 +2,7 @@
 
 from typing import Any, NamedTuple
 
-from ...backend.decorators import jit
+from ...backend.decorators import inlined, jit
 from ...backend.elementary import PI, wrap
 from ...backend.primitives import absolute, select
 from ...backend.random import CHANNELS
@@ -31,14 +31,19 @@ def lane_in_view(motion: Any, sight: Any) -> Any:
     return select(turned | (absolute(motion.y) > sight.offset), 0.0, 1.0)
 
 
+@inlined
+def at_preview(y: Any, psi: Any, kappa: Any, l_pre: Any) -> Any:
+    """Lateral offset y_l in m at the preview point, positive to the left of the lane's centre line.
+
+    y: m, of the centre of gravity. psi: rad, relative to the lane. kappa: 1/m. l_pre: m.
+    """
+    return y + l_pre * psi - 0.5 * kappa * l_pre * l_pre  # tie-vision (4) with curvature
+
+
 @jit
 def lane_offset(motion: Any, road: Any, l_pre: Any) -> Any:
-    """Lateral offset in m at the preview point, positive to the left of the lane's centre line.
-
-    y_l = y_cg + l_pre psi - kappa l_pre^2 / 2, tie-vision (4) with curvature.
-    """
-    bend = 0.5 * curvature_at(road, motion.s) * l_pre * l_pre
-    return motion.y + l_pre * (motion.psi - motion.theta) - bend
+    """`at_preview` of a Motion on a road."""
+    return at_preview(motion.y, motion.psi - motion.theta, curvature_at(road, motion.s), l_pre)
 
 
 @jit

@@ -10,10 +10,13 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from .analytic import View
+from ...backend.rebuild import plain
+from .analytic import View, at_preview
 from .consensus import Array, Fit, Place, across, fit, levelled, reach_of, search
 from .pinhole import Pinhole
 from .road_image import Image
+
+_at_preview = plain(at_preview)
 
 CELL = 0.05  # m across
 MARKING = 0.07  # m, of the Gaussian: half a marking's width
@@ -102,8 +105,7 @@ class LaneFinder:
         if best is None or (quality := self._quality(best, x)) == 0.0:
             return LOST
         self.fit = found = best
-        l_pre = self.camera.preview
-        y_l = found.y + l_pre * found.psi - 0.5 * found.kappa * l_pre**2
+        y_l = _at_preview(found.y, found.psi, found.kappa, self.camera.preview)
         return Lane(found.psi, y_l, found.kappa, quality, found.y)
 
     def _bright(self, picture: Image) -> tuple[Array, Array, Array]:
