@@ -6,10 +6,11 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
+from ...envs.recordings.geodesy import metres
+from ...envs.recordings.sources import open_source
 from .datagrams import LONGEST_AGE, Kind
 from .port import Port
 
-EARTH = 6_371_000.0  # m
 WORST_HDOP = 99.0  # of a receiver without a fix
 LONGEST_PAUSE = 10.0  # s between two epochs of a file
 
@@ -21,7 +22,7 @@ class Relay:
     port: from which it sends, to the address `to`. latency: s from an epoch to its sentences, which
     the receiver adds. speed: of a file, which is played in the time of its epochs. A lost line is
     opened again; `error` has why the relay ended, "" at a file's end. `sent`: datagrams. `counts`:
-    of the decoder.
+    of the decoder. Raises what `open_source` does.
     """
 
     source: str
@@ -33,6 +34,9 @@ class Relay:
     error: str = ""
     counts: Any = None
     _origin: tuple[float, float] | None = field(default=None)
+
+    def __post_init__(self) -> None:
+        self._chunks = open_source(self.source)
 
     def run(self, stop: Callable[[], bool] = lambda: False) -> None:
         """Relay until the source ends, is lost for good, or `stop`."""
@@ -56,18 +60,17 @@ class Relay:
     def _epochs(self) -> Iterator[Any]:
         """The epochs, and None after each chunk of bytes."""
         from ...envs.recordings.nmea import Decoder
-        from ...envs.recordings.sources import open_source
 
         decoder = Decoder()
         self.counts = decoder.counts
-        for chunk in open_source(self.source):
+        for chunk in self._chunks:
             yield from decoder.feed(chunk)
             yield None
         yield from decoder.finish()
 
     def _values(self, epoch: Any) -> list[float]:
         """The doubles of a datagram; an unknown number is 0, an unknown HDOP the worst."""
-        X, Y = self._place(epoch)
+        X, Y = self._place(epoch) if epoch.fixed else (0.0, 0.0)
         hdop = epoch.hdop if math.isfinite(epoch.hdop) else WORST_HDOP
         course, speed = (each if math.isfinite(each) else 0.0 for each in epoch[3:5])
         age = epoch.age + self.latency
@@ -75,11 +78,8 @@ class Relay:
         return [course, speed, X, Y, hdop, float(epoch.satellites), age, float(epoch.quality)]
 
     def _place(self, epoch: Any) -> tuple[float, float]:
-        """m to the east and north of the first fix; 0 without one."""
-        if not epoch.fixed:
-            return 0.0, 0.0
+        """m to the east and north of the first fix."""
         if self._origin is None:
             self._origin = epoch.latitude, epoch.longitude
-        north, east = (math.radians(each) for each in (
-            epoch.latitude - self._origin[0], epoch.longitude - self._origin[1]))  # fmt: skip
-        return EARTH * math.cos(math.radians(self._origin[0])) * east, EARTH * north
+        east, north = metres(epoch.latitude, epoch.longitude, self._origin)
+        return float(east), float(north)

@@ -103,17 +103,23 @@ def blocks_of(path: Path | str) -> Iterator[Block]:
             data = file.read(size) if magic == _MAGIC and count <= BATCHES else b""
             if magic != _MAGIC or len(data) != size or zlib.crc32(data) != check:
                 return
-            yield Block(_batches(data, count), digest)
+            batches = _batches(data, count)
+            if batches is None:
+                return
+            yield Block(batches, digest)
 
 
-def _batches(data: bytes, count: int) -> list[list[Arrival]]:
+def _batches(data: bytes, count: int) -> list[list[Arrival]] | None:
+    """The datagrams of each batch; None where somebody made up what the checksum is of."""
     batches: list[list[Arrival]] = [[] for _ in range(count)]
     at = 0
-    while at < len(data):
+    while len(data) - at >= _ITEM.size:
         which, size = _ITEM.unpack_from(data, at)
         at += _ITEM.size + size
+        if which >= count or at > len(data):
+            return None
         batches[which].append(Arrival(0, data[at - size : at]))
-    return batches
+    return batches if at == len(data) else None
 
 
 class Replay(NamedTuple):

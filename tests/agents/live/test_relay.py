@@ -95,6 +95,6 @@ def test_it_stops_when_asked(tmp_path: Path) -> None:
 
 def test_a_source_that_is_none_is_an_error() -> None:
     with Port() as port:
-        relay = Relay("no such file", port, port.address)
-        relay.run()
-    assert "no such file" in relay.error
+        for source, message in (("no such file", "no such file"), ("tcp:nowhere", "tcp:HOST:PORT")):
+            with pytest.raises((OSError, ValueError), match=message):
+                Relay(source, port, port.address)

@@ -1,5 +1,6 @@
 """A session on disk gives the same estimates bit for bit, as far as it goes."""
 
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,15 @@ import pytest
 from sideslip.agents.live import session
 from sideslip.agents.live.assemble import PATIENCE
 from sideslip.agents.live.onboard import Onboard
-from sideslip.agents.live.session import Recorder, blocks_of, read_setup, replay
+from sideslip.agents.live.session import (
+    _BLOCK,
+    _ITEM,
+    _MAGIC,
+    Recorder,
+    blocks_of,
+    read_setup,
+    replay,
+)
 from tests.agents.live.both_ends import SEED, STEERING, contestant, drive
 
 SETUP = {"estimator": "dakf", "agent": "lqr", "patience": None}
@@ -75,6 +84,16 @@ def test_a_damaged_block_ends_the_replay_and_another_filter_is_found_out(
     assert 0 < len(replay(damaged, onboard(), patience).ticks) < len(estimates)
     other = Onboard(*contestant(STEERING, "exact-kf", "lqr"), SEED)
     assert not replay(path, other, patience).same
+
+
+@pytest.mark.parametrize("items", [_ITEM.pack(7, 1) + b"a", _ITEM.pack(0, 9) + b"a", b"abc"])
+def test_a_block_that_somebody_made_up_ends_the_replay(tmp_path: Path, items: bytes) -> None:
+    """Its checksum is right: batches that are not there, lengths beyond its end."""
+    path = tmp_path / "made-up.session"
+    Recorder(path, {}).close()
+    with path.open("ab") as file:
+        file.write(_BLOCK.pack(_MAGIC, 2, len(items), zlib.crc32(items), 0) + items)
+    assert list(blocks_of(path)) == []
 
 
 def test_a_session_is_never_overwritten(tmp_path: Path) -> None:

@@ -80,6 +80,7 @@ def test_a_session_may_not_choose_code(run: Run, tmp_path: Path) -> None:
         (("live", "exact-kf", "--json", "a.txt"), "ends in .json"),
         (("live", "--simulate", "--env", "sideslip/YawVison-v0"), "did you mean"),
         (("live", "--relay", "no-such-file"), "no-such-file"),
+        (("live", "exact-kf", "--port", "0", "--gps", "tcp:nowhere"), "expected tcp:HOST:PORT"),
         (("live", "--replay", "no-such-file"), "no-such-file"),
         (("live", "--replay", __file__), "is no session"),
         (("live", "exact-kf", "--port", "0", "--record", __file__), "exists"),
