@@ -40,7 +40,7 @@ SHARED = {
     PARAMETERS: {"grip", "steer_weight"},
 }
 """What contestants too slow to be tuned take over from `nominal`'s controller; of its filter all,
-where they are not told the truth."""
+where they do not know the truth."""
 SLOW_CONTROLLERS = ("mpc", "nmpc", STATES[1], PARAMETERS)
 
 EPISODES, QUICK_EPISODES, SLOW_EPISODES = 1000, 8, 128

@@ -38,7 +38,7 @@ class HighwayEnv(StabilityEnv):
     own and stays so while the driver swerves. Needs the extra `highway`.
 
     ## Episode end
-    `terminated` also by a "collision", or a "departure" of the centre of gravity from all lanes,
+    `terminated` also by a "collision", or a "departure" of the whole car beyond the road's edge,
     charged as every failure is.
 
     ## Arguments
