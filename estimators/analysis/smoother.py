@@ -20,6 +20,7 @@ from ..core.intersample import NONE
 from ..core.memory import WINDOW, Gains, Memory, Row
 from ..core.packets import receive
 from ..core.run import tick
+from ..core.transition import BETA, LATERAL
 from ..design.schedule import whole_ticks
 from ..estimates import Estimates
 from ..estimator import Estimator
@@ -115,6 +116,8 @@ def _forwards(
             for k in range(n):
                 same = f.decay[i] if i == k else 0.0
                 F[j, i, k] = f.G[i, k] if i < dense else same
+            if f.kind == LATERAL and f.speed_before > 0.0:
+                F[j, i, BETA] *= f.speed_before / f.model_speed
         while at < len(packets) and not packets[at, PACKET.arrived] > f.tick:
             receive(f, gains, packets[at])
             nis[at] = f.nis

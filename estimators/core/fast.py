@@ -17,7 +17,7 @@ from .intersample import (
 )
 from .memory import COUNTERS, SLOW, Gains, Memory, Row
 from .speed import cell_of, finite, measured_speed, moved, step_row
-from .transition import KINEMATIC, LINEAR, VELOCITY_ROLL, build
+from .transition import BETA, KINEMATIC, LINEAR, VELOCITY_ROLL, build
 
 
 @jit
@@ -72,8 +72,26 @@ def _predict(f: Memory, v: Row) -> None:
 
 
 @jit
+def _change_speed(f: Memory) -> None:
+    """beta = v_y / V at the model's new speed V, since v_y is what stays."""
+    f.x[BETA] *= f.stretch
+    f.e[BETA] *= f.stretch
+    if f.periodic == 0:
+        for i in range(f.total):
+            f.P[BETA, i] *= f.stretch
+        for i in range(f.total):
+            f.P[i, BETA] *= f.stretch
+        for s in range(SLOW):
+            for i in range(f.rows[s]):
+                f.larsen_gain[s, i, BETA] *= f.stretch
+    f.stretch = 1.0
+
+
+@jit
 def advance_state(f: Memory, u: Row) -> None:
     """x <- F x + H u for the inputs u (INPUTS,), and P or e with it."""
+    if f.stretch != 1.0:
+        _change_speed(f)
     _predict(f, f.x)
     for i in range(f.dense):
         for j in range(f.inputs):

@@ -160,6 +160,7 @@ _SPEED = [
     ("smoothing", _FLOAT),  # share of a new sample in the low-pass
     ("speed", _FLOAT),  # m/s, low-passed
     ("model_speed", _FLOAT),  # the present model's
+    ("stretch", _FLOAT),  # of beta = v_y / V before the next step: old speed over new
     ("speed_before", _FLOAT),  # the model's at the row before
     ("turning", _FLOAT),  # rad/s, the present model's yaw rate; KINEMATIC, VELOCITY_ROLL
     ("cell", _INT),  # the present table of gains

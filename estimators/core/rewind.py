@@ -145,6 +145,7 @@ def _filter_anew(f: Memory, gains: Gains, first: int, new: int) -> bool:
             correct_fast(f, gains)
             if (tick - f.start) % EVERY == 0:
                 _snapshot(f, _slot(f, tick))
+        f.stretch = 1.0  # what was restored is of this tick's speed
         if not _measure_again(f, gains, tick, count, new):  # no snapshot was changed before
             passed = False
             break
@@ -152,6 +153,7 @@ def _filter_anew(f: Memory, gains: Gains, first: int, new: int) -> bool:
     if not passed:
         _recall(f, now)
         _restore(f, _NOW)
+        f.stretch = 1.0
     return passed
 
 

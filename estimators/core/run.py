@@ -76,6 +76,7 @@ def begin(f: Memory, first: int) -> None:
         f.speed, f.model_speed = 0.0, 0.0
     else:
         build(f, f.speed, 0.0)
+    f.stretch = 1.0
 
 
 @jit

@@ -177,6 +177,8 @@ def variance(f: Memory, s: int, i: int, V: Any) -> Any:
 def build(f: Memory, speed: Any, turning: Any) -> None:
     """The model at a speed in m/s and a yaw rate in rad/s, and the noise that goes with 1/V."""
     V = maximum(speed, SLOWEST)
+    if f.kind == LATERAL and f.model_speed > 0.0:
+        f.stretch *= f.model_speed / V
     f.model_speed, f.turning = V, turning
     if f.kind != LINEAR:
         continuous(f, V, turning)

@@ -21,7 +21,7 @@ from .models import write_model
 from .periodic import measured_rows
 from .schedule import NO_SENSOR, Schedule, schedules, whole_ticks
 
-SMOOTHING_TIME = 0.2  # s, of the measured speed
+SMOOTHING_TIME = 0.015  # s, of the measured speed
 FASTEST = 80.0  # m/s, of the tables of gains
 SPACING = 0.5  # m/s between them
 

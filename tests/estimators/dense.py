@@ -77,7 +77,7 @@ def transition(names: Any, V: float, dt: float) -> Any:
 
 def speeds(fast: Any, dt: float) -> Any:
     """The speed of the model in every row: low-passed, and renewed where it moved by 0.5 %."""
-    share = 1.0 - math.exp(-dt / 0.2)
+    share = 1.0 - math.exp(-dt / 0.015)
     now = 0.5 * (fast[:, FAST.wheel_left] + fast[:, FAST.wheel_right])
     smooth, model = now[0], max(now[0], 1.5)
     found = [model]
@@ -131,6 +131,7 @@ class Posterior:
         for k in range(1, K):
             a, u = n + (k - 1) * q, acted[k]
             F, B, _, _ = models[V[k]]
+            F = F @ np.diag([V[k - 1] / V[k]] + [1.0] * (n - 1))  # beta = v_y / V; v_y stays
             self.mean[k] = F @ self.mean[k - 1] + B @ u
             self.T[k, :, :a] = F @ self.T[k - 1, :, :a]
             self.T[k, noisy, np.arange(a, a + q)] = np.sqrt(Q[noisy])

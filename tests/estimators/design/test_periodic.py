@@ -66,7 +66,7 @@ def test_a_changing_speed_rebuilds_the_model_by_half_a_percent() -> None:
         speeds.append(float(filter_.filters[0].model_speed))
     lowpass = 3.0
     for k, row in enumerate(np.repeat(rows[::10, FAST.wheel_left], 10)):
-        lowpass = row if k == 0 else lowpass + (1.0 - np.exp(-0.005)) * (row - lowpass)
+        lowpass = row if k == 0 else lowpass + (1.0 - np.exp(-0.001 / 0.015)) * (row - lowpass)
     assert speeds[-1] == pytest.approx(lowpass, rel=0.0051)
     steps = np.diff([s for i, s in enumerate(speeds) if i == 0 or s != speeds[i - 1]])
     assert steps.min() > 0.005 * 3.0
