@@ -46,7 +46,7 @@ class Experiment:
 
 def _filters(*names: str) -> tuple[Filter, ...]:
     true = Filter(TRUE_MODEL, "exact-kf", vehicle="true")
-    return (*(Filter(name, name) for name in (*names, "exact-kf")), true)
+    return (*(Filter(name, name) for name in (*names, "exact-kf", "joint")), true)
 
 
 EXPERIMENTS = (
@@ -134,7 +134,8 @@ def run(seeds: int = SEEDS, jobs: int | None = None, console: Console | None = N
         "deviation that the optimal filter of the true linear model has on the same arrivals, the "
         "wind included; no estimator can do better on average. exact-kf is exact about delays and "
         "trusts its vehicle: with the true one it is the best, with the nominal one it has no "
-        "process noise to doubt it with. tie-vision reports that its pseudo-residual filter is the "
+        "process noise to doubt it with; joint estimates the tyres' stiffness as it drives. "
+        "tie-vision reports that its pseudo-residual filter is the "
         "best on Fig. 7 and the bicycle model the worst: the second is so among the tuned filters, "
         "the first is not. dakf-stability's order (DAKF before KF) holds on its Fig. 6. Intervals "
         "are 95 % bootstrap over seeds.",

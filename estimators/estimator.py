@@ -13,7 +13,6 @@ from scipy.linalg import block_diag
 from ..envs.record import FAST, FAST_WIDTH, PACKET_WIDTH, Log, Record
 from ..envs.sensors.link import SlowSensor
 from ..envs.sensors.slow import SLOW_NAMES
-from .core.entry import advance_entry, receive_entry, step_entry
 from .core.memory import Counters, Filters, Memory
 from .core.run import begin_all
 from .core.transition import KINEMATIC, LATERAL, VELOCITY_ROLL
@@ -22,6 +21,7 @@ from .design.error_map import MARGINAL, designed, spectral_radius, unobservable
 from .design.models import STATES
 from .design.periodic import table_shape
 from .design.schedule import Schedule, whole_ticks
+from .entry import advance_entry, receive_entry, step_entry
 from .estimates import Estimates, UnobservableWarning
 
 Array = npt.NDArray[np.float64]
@@ -53,6 +53,7 @@ class Estimator:
         self.units = tuple(STATES[state].unit for state in self.names)
         self.sensors = dict(config.sensors)
         self.filters, self._schedules = filters, schedules
+        self._shown = slice(1 if filters[0].members else None)  # layers: of a bank the mixture
         f = self._f
         cells = round((f.high - f.low) / f.spacing) + 1 if f.spacing > 0.0 else 1
         shape = (cells, *table_shape(f, schedules[-1])) if f.periodic else (1, 1, 1)
@@ -249,12 +250,13 @@ class Estimator:
     @property
     def x(self) -> Array:
         """The states now, (n,)."""
-        return np.concatenate([f.x[: f.n] for f in self.filters])
+        return np.concatenate([f.x[: f.n] for f in self.filters[self._shown]])
 
     @property
     def P(self) -> Array:
         """Their covariance now, (n, n); with periodic gains that of the settled cycle."""
-        return np.asarray(block_diag(*(self._covariance(f) for f in self.filters)), np.float64)
+        blocks = map(self._covariance, self.filters[self._shown])
+        return np.asarray(block_diag(*blocks), np.float64)
 
     def _covariance(self, f: Memory) -> Array:
         """P (n, n) of one layer."""

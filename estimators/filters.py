@@ -26,6 +26,7 @@ class Filter:
     a name of `models.MODELS`. fast: what it measures in every row. intersample: "predict",
     "pseudo-residual", "dual-rate" or "single-rate" (`core.intersample`). gains: "periodic",
     "covariance" or "placed". disturbances: of `models.DISTURBANCES`. delay: of `delay.RULES`.
+    unknown: pairs (state of `models.BIASES`, its deviation at the start).
     poles: rad/s, where gains are placed. second: the model of a second layer. hdop: pairs (HDOP,
     factor on the GPS's noise). source: where it comes from, with the equations.
     """
@@ -39,6 +40,7 @@ class Filter:
     delay: str = "clone"
     poles: tuple[float, ...] = ()
     second: str = ""
+    unknown: tuple[tuple[str, float], ...] = ()
     hdop: tuple[tuple[float, float], ...] = ()
     source: str
 
@@ -122,5 +124,12 @@ FILTERS: dict[str, Filter] = {
     ),
     "exact-kf": Filter(
         slow=ANY, gains="covariance", disturbances="forces", source="docs/PAPERS.md section 3"
+    ),
+    "joint": Filter(
+        slow=ANY,
+        gains="covariance",
+        disturbances="forces",
+        unknown=(("front_tyres", 0.23), ("rear_tyres", 0.23)),
+        source="docs/estimators.md, beyond the papers",
     ),
 }

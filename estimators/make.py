@@ -9,7 +9,7 @@ from ..envs.sensors.link import SlowSensor
 from ..envs.ticks import TICK
 from ..envs.vehicle.vehicle import COMS
 from ..envs.vehicle.vehicles import VehicleSource, vehicle_from
-from .design.assemble import alone, assemble
+from .design.assemble import alone, assemble, told_tyres
 from .design.config import configure
 from .estimator import Estimator
 from .filters import FILTERS
@@ -64,7 +64,8 @@ def make_estimator(
     layers, schedules = assemble(config, car, dt, speed)
     estimator = Estimator(config, dt, layers, schedules)
     several = len(config.sensors) > 1  # no cycle of both to check
-    estimator.check(assemble(alone(config), car, dt, speed)[0] if several else layers)
+    checked = told_tyres(alone(config) if several else config)
+    estimator.check(layers if checked is config else assemble(checked, car, dt, speed)[0])
     return estimator
 
 

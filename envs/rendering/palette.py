@@ -32,6 +32,7 @@ FILTERS = {
     "yaw-moment-observer": "#996C6C",
     "lateral-force-observer": "#EA9048",
     "exact-kf": "#0075B4",
+    "joint": "#1B9E1B",
 }
 CONTROLLERS = {
     "none": GREY,

@@ -16,7 +16,6 @@ import numpy.typing as npt
 
 from ...envs.record import FAST_WIDTH, PACKET, PACKET_WIDTH
 from ..core.delay import IGNORE
-from ..core.entry import advance_entry, receive_entry
 from ..core.intersample import DUAL_RATE
 from ..core.memory import CORE, FILTER, INPUTS, ROWS
 from ..core.run import begin_all
@@ -24,6 +23,7 @@ from ..core.transition import LINEAR
 from ..design.checks import covariance, matrix, square, vector
 from ..design.dual_rate import GAINS, RULES, frame_map, shares_of, write_shares
 from ..design.error_map import MARGINAL, spectral_radius, unobservable
+from ..entry import advance_entry, receive_entry
 from ..estimates import Estimates, UnobservableWarning
 
 Array = npt.NDArray[np.float64]

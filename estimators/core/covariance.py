@@ -4,6 +4,7 @@ Only the first n of N = `total` states move; the others are clones. Measurements
 a time, so that a gain is a division and not a matrix inverse.
 """
 
+from math import log
 from typing import Any
 
 from ...envs.backend.decorators import jit
@@ -94,6 +95,8 @@ def _condition(f: Memory, variance: Any, residual: Any) -> None:
     """
     N, x, P, PC, gain = f.total, f.x, f.P, f.PC, f.gain
     per = 1.0 / variance
+    if f.members > 0:
+        f.weight -= 0.5 * (residual * residual * per + log(variance))
     for i in range(N):
         gain[i] = PC[i] * per
         x[i] += gain[i] * residual

@@ -5,7 +5,7 @@ from typing import Any
 from ...envs.backend.decorators import jit
 from ...envs.record import FAST
 from .covariance import measure_state, predict_covariance
-from .delay import LARSEN, carry_gains
+from .delay import BUFFER, LARSEN, carry_gains
 from .intersample import (
     DUAL_RATE,
     PSEUDO,
@@ -18,6 +18,7 @@ from .intersample import (
 from .memory import COUNTERS, SLOW, Gains, Memory, Row
 from .speed import cell_of, finite, measured_speed, moved, step_row
 from .transition import BETA, KINEMATIC, LINEAR, VELOCITY_ROLL, build
+from .tyres import AGAIN, linearise
 
 
 @jit
@@ -92,11 +93,14 @@ def advance_state(f: Memory, u: Row) -> None:
     """x <- F x + H u for the inputs u (INPUTS,), and P or e with it."""
     if f.stretch != 1.0:
         _change_speed(f)
+    if f.tyres > 0 and (f.tick % AGAIN == 0 or f.late == BUFFER):
+        linearise(f, u[0])
+        build(f, f.model_speed, f.turning)
     _predict(f, f.x)
     for i in range(f.dense):
         for j in range(f.inputs):
             f.x[i] += f.H[i, j] * u[j]
-    if f.kind == LINEAR:
+    if f.kind == LINEAR or f.tyres > 0:
         for i in range(f.n):
             f.x[i] += f.drift[i]
     if f.between == PSEUDO:
@@ -113,7 +117,7 @@ def advance_state(f: Memory, u: Row) -> None:
 @jit
 def _residual(f: Memory, i: int) -> Any:
     """The residual of the fast measurement i."""
-    residual = f.y[i]
+    residual = f.y[i] - f.rest_fast[i]
     for k in range(f.n):
         residual -= f.C_fast[i, k] * f.x[k]
     for j in range(f.inputs):

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from ...envs.record import PACKET_WIDTH
 from ...envs.sensors.slow import SLOW_NAMES
 
-CORE = 11  # states of a model
+CORE = 16  # states of a model
 INPUTS = 4  # that drive it
 FASTS = 3  # measurements of a fast row
 SLOW = len(SLOW_NAMES)  # sensors
@@ -87,17 +87,33 @@ _MODEL = [  # dx = A x + B u on the first `dense` states; those behind them deca
     ("roll_arm", _FLOAT),  # M_s h_s / I_x
     ("sway", _FLOAT),  # m, M_s h_s / M
     ("preview", _FLOAT),  # m
+    # tyres that are estimated: `car` has what they give more for more slip, at the present state
+    ("tyres", _INT),  # where the factors of front and rear stiffness stand; 0: they are known
+    ("grip", _INT),  # where the reciprocal of friction stands; 0: tyres without a limit
+    ("stiffness", _FLOAT, (2,)),  # N/rad, nominal, of the axles
+    ("load", _FLOAT, (2,)),  # N, on the axles
+    ("per_tyre", _FLOAT, (2, 2)),  # N, of each axle by its factor, by the grip's state
+    ("rest", _FLOAT, (2,)),  # N, of each axle where all that is linear is zero
     ("step", _FLOAT),  # s, the filter's own step
     ("relax", _FLOAT),  # share by which the delayed states follow in a step
     ("A", _FLOAT, (CORE, CORE)),
     ("B", _FLOAT, (CORE, INPUTS + CORE)),  # inputs, then disturbances
+    ("push", _FLOAT, (CORE,)),  # what `rest` adds to dx
     ("G", _FLOAT, (CORE, CORE)),  # tie-vision (9), rows of the dense states
     ("H", _FLOAT, (CORE, INPUTS)),
-    ("drift", _FLOAT, (CORE,)),  # known part of a step, dual-rate (7) u_d; kind LINEAR
+    ("drift", _FLOAT, (CORE,)),  # known part of a step, dual-rate (7) u_d, or of tyres
     ("decay", _FLOAT, (CORE,)),  # share of a state that is left after a step
     ("Q", _FLOAT, (CORE, CORE)),  # of one step
     ("prior", _FLOAT, (CORE, CORE)),  # P at the start
+    ("first", _FLOAT, (CORE,)),  # x at the start
     ("speed_state", _INT),  # the state that starts at the measured speed; -1: none
+]
+_BANK = [  # several filters beside each other, of which the first record is the mixture
+    ("members", _INT),  # records behind the mixture; 0: no bank
+    ("weight", _FLOAT),  # of a member: the logarithm of its likelihood
+    ("respawn", _INT),  # ticks after which the least likely member begins anew
+    ("hazard", _FLOAT),  # log of the probability of a change within them
+    ("spread", _FLOAT),  # variance by which a new member forgets the tyres
 ]
 _FAST = [  # inputs and fast measurements: sums of two columns of the fast row
     ("inputs", _INT),
@@ -109,6 +125,7 @@ _FAST = [  # inputs and fast measurements: sums of two columns of the fast row
     ("C_fast", _FLOAT, (FASTS, CORE)),
     ("D_fast", _FLOAT, (FASTS, INPUTS)),
     ("accel_row", _INT),  # the fast measurement that is a bicycle's a_y; 0: none
+    ("rest_fast", _FLOAT, (FASTS,)),  # what is measured where states and inputs are zero
     ("r_fast", _FLOAT, (FASTS,)),  # variances
 ]
 _SLOW = [  # slow sensors: what each one measures, how noisy it is, when it captures
@@ -231,7 +248,7 @@ _WINDOW = [  # history: of tick k in row k % WINDOW
 
 FILTER = np.dtype(
     [
-        *(_MODEL + _FAST + _SLOW + _DELAY + _GAINS),
+        *(_MODEL + _BANK + _FAST + _SLOW + _DELAY + _GAINS),
         *(_SPEED + _NOW + _BETWEEN + _SCRATCH + _WINDOW),
     ],
     align=True,

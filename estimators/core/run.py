@@ -15,6 +15,7 @@ from ...envs.backend.primitives import maximum, sqrt
 from ...envs.record import FAST, PACKET
 from .delay import BUFFER, latch_due
 from .fast import advance_state, correct_fast, read
+from .layers import mix, own, pass_on, receive_beside, respawn
 from .memory import (
     CORE,
     COUNTERS,
@@ -30,9 +31,9 @@ from .memory import (
 )
 from .packets import receive, use_waiting
 from .rewind import forget, remember
-from .second_layer import pass_on
 from .speed import next_cell, step_row
 from .transition import CURVATURE, LATERAL, build
+from .tyres import linearise
 
 
 @jit
@@ -48,6 +49,7 @@ def begin(f: Memory, first: int) -> None:
     f.cell, f.wanted, f.cursor, f.waits, f.u_count = 0, -1, 0, 0, 0
     f.first_fix, f.since, f.nis, f.turning, f.road_turn = -1, -1, np.nan, 0.0, 0.0
     _fill(f.x, 0.0)
+    copied(f.first, f.x)
     _fill(f.e, 0.0)
     _fill(f.gain, 0.0)
     _fill(f.eps, 0.0)
@@ -72,6 +74,9 @@ def begin(f: Memory, first: int) -> None:
     for i in range(len(f.counts)):
         f.counts[i] = 0
     forget(f)
+    f.weight = 0.0
+    if f.tyres > 0:
+        linearise(f, 0.0)
     if f.measured == 1:
         f.speed, f.model_speed = 0.0, 0.0
     else:
@@ -152,7 +157,7 @@ def deviation(f: Memory, gains: Gains, i: int) -> Any:
 def _write(layers: Filters, gains: Gains, j: int, X: Any, S: Any) -> None:
     """The states and standard deviations of all layers into row j of X and S (rows, n)."""
     column = 0
-    for layer in range(len(layers)):
+    for layer in range(len(layers) if own(layers) == 0 else 1):
         f = layers[layer]
         for i in range(f.n):
             X[j, column] = f.x[i]
@@ -181,7 +186,8 @@ def advance(
     packet's normalised innovation squared, or empty. Returns the rows done: fewer than `rows` where
     gains are missing, those of the cell `wanted` of the first layer; call again from there.
     """
-    f = layers[0]
+    first = own(layers)
+    f = layers[first]
     at, last = 0 if start == 0 else f.cursor, f.tick + rows - start
     for j in range(start, rows):
         now = 0.5 * (fast[j, FAST.wheel_left] + fast[j, FAST.wheel_right])
@@ -190,16 +196,22 @@ def advance(
             if gains[cell, 0, 0] == 0.0:
                 f.wanted, f.cursor = cell, at
                 return j
-        for layer in range(len(layers)):
+        for layer in range(first, len(layers)):
             read(layers[layer], fast[j], now)
             tick(layers[layer], gains)
         while at < count and not (f.tick < packets[at, PACKET.arrived] <= last):
             used = receive(f, gains, packets[at])  # from beyond the last row: counted here
             if len(nis) > 0:
                 nis[at] = f.nis
-            if used and len(layers) > 1:
+            if first > 0:
+                receive_beside(layers, gains, packets[at])
+            elif used and len(layers) > 1:
                 pass_on(f, layers[1], gains, packets[at])
             at += 1
+        if first > 0 and f.tick % f.respawn == 0 and f.tick > f.start:
+            respawn(layers)
+        if first > 0 and (len(X) > 0 or j == rows - 1):
+            mix(layers)
         if len(X) > 0:
             _write(layers, gains, j, X, S)
     f.counts[COUNTERS.future] += count - at  # of a call without rows
@@ -234,5 +246,9 @@ def begin_all(layers: Filters, first: int) -> None:
 @jit
 def receive_all(layers: Filters, gains: Gains, packet: Row) -> None:
     """`receive` a packet (PACKET_WIDTH,) by all layers of an estimator."""
-    if receive(layers[0], gains, packet) and len(layers) > 1:
+    if own(layers) > 0:
+        receive(layers[1], gains, packet)
+        receive_beside(layers, gains, packet)
+        mix(layers)
+    elif receive(layers[0], gains, packet) and len(layers) > 1:
         pass_on(layers[0], layers[1], gains, packet)

@@ -30,6 +30,8 @@ def _lateral(f: Memory, V: Any) -> None:
         _write_body(f, V)
     if f.accel_row > 0:
         _write_accel(f, V)
+    if f.tyres > 0:
+        _write_tyres(f, V)
     if f.banked >= 0:  # gravity, which an accelerometer does not feel and the body does not roll by
         B[0, INPUTS + f.banked] = -GRAVITY / V
 
@@ -62,6 +64,38 @@ def _write_accel(f: Memory, V: Any) -> None:
     if f.rolling > 0:
         row[f.rolling] += GRAVITY
     f.D_fast[f.accel_row, 0] = V * f.B[0, 0]
+
+
+@jit
+def _pushed(f: Memory, V: Any, front: Any, rear: Any) -> Any:
+    """(beta', gamma', phi_rate') by forces of the axles in N."""
+    beta = (front + rear) / (f.car[CAR.mass] * V)
+    gamma = (f.car[CAR.front_arm] * front - f.car[CAR.rear_arm] * rear) / f.car[CAR.yaw_inertia]
+    if f.rolling == 0:
+        return beta, gamma, 0.0
+    phi_rate = f.roll_arm / (1.0 - f.roll_arm * f.sway) * V * beta
+    return beta + f.sway / V * phi_rate, gamma, phi_rate
+
+
+@jit
+def _write_tyres(f: Memory, V: Any) -> None:
+    """What the estimated tyres do besides their slope by slip: columns of B, and f.push."""
+    for j in range(3):  # both factors, then the grip
+        if j < 2 or f.grip > 0:
+            front = f.per_tyre[0, j // 2] if j != 1 else 0.0
+            rear = f.per_tyre[1, j // 2] if j != 0 else 0.0
+            column = (f.tyres + j if j < 2 else f.grip) - f.dense
+            beta, gamma, phi_rate = _pushed(f, V, front, rear)
+            f.B[0, INPUTS + column], f.B[1, INPUTS + column] = beta, gamma
+            if f.rolling > 0:
+                f.B[f.rolling + 1, INPUTS + column] = phi_rate
+            if f.accel_row > 0:
+                f.C_fast[f.accel_row, f.dense + column] = V * beta
+    beta, gamma, phi_rate = _pushed(f, V, f.rest[0], f.rest[1])
+    f.push[0], f.push[1] = beta, gamma
+    if f.rolling > 0:
+        f.push[f.rolling + 1] = phi_rate
+    f.rest_fast[f.accel_row] = V * beta if f.accel_row > 0 else 0.0
 
 
 @jit
@@ -147,8 +181,10 @@ def discretise(f: Memory) -> None:
     _product(Phi, f.B, T, n, m)
     for i in range(n):
         E[i, i] += 1.0
+        f.drift[i] = 0.0
         for j in range(n):
             f.G[i, j] = E[i, j]
+            f.drift[i] += Phi[i, j] * f.push[j]
         for j in range(f.inputs):
             f.H[i, j] = T[i, j]
         for j in range(f.n - f.dense):

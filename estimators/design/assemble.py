@@ -17,13 +17,16 @@ from ..core.transition import KINEMATIC, SLOWEST, VELOCITY_ROLL
 from .config import FilterConfig
 from .kalman import gain
 from .late_samples import check_window, place_clones
-from .models import write_model
+from .models import TYRES, write_model
 from .periodic import measured_rows
 from .schedule import NO_SENSOR, Schedule, schedules, whole_ticks
 
 SMOOTHING_TIME = 0.015  # s, of the measured speed
 FASTEST = 80.0  # m/s, of the tables of gains
 SPACING = 0.5  # m/s between them
+RESPAWN = 0.5  # s between two members of a bank that begin anew
+HAZARD = 0.05  # 1/s, of tyres that change
+FORGOTTEN = 0.06  # variance of their factors
 
 
 def assemble(
@@ -55,12 +58,36 @@ def assemble(
         _write_rules(f, config, planned)
         check_window(f, config)
     layers[0].store_predictions |= len(layers) > 1
-    return layers, planned
+    return _members(layers, config, dt), planned
+
+
+def _members(layers: Any, config: FilterConfig, dt: float) -> Any:
+    """The mixture and the members of a bank of the filter; the filter itself without one."""
+    if config.bank < 2:
+        return layers
+    f = layers[0]
+    f.members, f.respawn, f.spread = config.bank, round(RESPAWN / dt), FORGOTTEN
+    f.hazard = math.log(HAZARD * RESPAWN)
+    return np.repeat(layers, 1 + config.bank).view(np.recarray)
 
 
 def alone(config: FilterConfig) -> FilterConfig:
     """The same filter with its first slow sensor alone."""
     return replace(config, sensors=dict(list(config.sensors.items())[:1]))
+
+
+def told_tyres(config: FilterConfig) -> FilterConfig:
+    """The same filter with nominal tyres instead of states: that one is linear."""
+    if not any(name in TYRES for name in config.states):
+        return config
+    left = [i for i, name in enumerate(config.states) if name not in TYRES]
+    models = tuple(
+        replace(model, biases=tuple(name for name in model.biases if name not in TYRES))
+        for model in config.models
+    )
+    prior = {name: sd for name, sd in config.prior.items() if name not in TYRES}
+    Q = config.Q[np.ix_(left, left)]
+    return replace(config, models=models, Q=Q, prior=prior, bank=1)
 
 
 def _write_clocks(f: Memory, config: FilterConfig, dt: float) -> None:

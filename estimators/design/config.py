@@ -11,27 +11,17 @@ import numpy.typing as npt
 from ...envs.sensors.link import SlowSensor
 from ...envs.sensors.slow import SLOW_NAMES
 from ..core.delay import RULES
-from ..core.memory import KNOTS
 from ..filters import Filter
 from . import dual_rate
 from .checks import check_covariance
 from .kalman import INVERSES
-from .measurements import COURSE_SPEED, MEASUREMENTS
-from .models import BIASES, DISTURBANCES, INERTIAL, MODELS, STATES, Model, bicycle_model
+from .measurements import hdop_table, noise_levels
+from .models import BIASES, DISTURBANCES, INERTIAL, MODELS, STATES, TYRES, Model, bicycle_model
 from .options import Options
 from .tunings import TUNINGS
 
 Array = npt.NDArray[np.float64]
 
-_ROWS = [row for sensor in MEASUREMENTS.values() for row in sensor.rows]
-_VELOCITIES = [row for sensor in MEASUREMENTS.values() for row in sensor.velocities]
-NOISE = {"gyro_noise": 0.005} | {f"{row.noise}_noise": row.sd for row in _ROWS}  # gyro: rad/s
-MORE_NOISE = {
-    "accel_y_noise": 0.1,  # m/s2
-    "roll_rate_noise": 0.005,  # rad/s
-    "wheel_noise": 0.015,  # m/s, of the mean of both front wheels
-} | {f"{row.noise}_noise": row.sd for row in _VELOCITIES}
-DISTURBANCE = {"force_sd": 50.0, "moment_sd": 20.0, "disturbance_time": 0.3}  # N, N m, s
 SATELLITES = 4.0  # double-layer-gps 4.3
 ASSUMED_DELAY = 0.033  # s
 
@@ -61,6 +51,9 @@ class FilterConfig:
     leak: 1/s, by which disturbances decay on top of that.
     fast: of exact-kf, course-kf and dakf, what is measured in every row: "gyro" (default), and any
         of "accel_y" and "roll_rate", with which the body rolls: states phi and phi_rate.
+    front_tyres_sd, rear_tyres_sd, inverse_friction_sd: of the same, above 0 (default of all but
+        joint) states: factors on both stiffnesses, and the reciprocal of friction, tyres having no
+        limit where it is known. The model is then expanded at the estimate (an EKF).
     bias_sd (rad/s), accel_bias_sd (m/s2), bank_sd (rad): of the same, above 0 (default) a state
         `bias`, `accel_bias` or `bank`, a constant of this deviation that the sensor adds, or by
         which the road leans, the left side up; with q_bias, ... it walks.
@@ -72,6 +65,8 @@ class FilterConfig:
     hdop_table: pairs (HDOP, factor on the GPS's noise), linear in between; None for one noise at
         every HDOP (default: the factor is the HDOP for double-layer, None for the others).
     satellites: the least that a GPS fix needs (default 4).
+    bank: of joint, so many filters side by side, of which the least likely forgets the tyres twice
+        a second (default 1).
     gate: a probability; a sample whose innovation is less likely than 1 - gate is skipped.
     adapt: share of a new innovation in an R that follows them (0: R as configured).
     force_sd (N), moment_sd (N m), disturbance_time (s): of disturbances that are forces.
@@ -97,6 +92,7 @@ class FilterConfig:
     hdop_table: tuple[tuple[float, float], ...]
     satellites: float
     gate: float | None
+    bank: int
     adapt: float
     prior: Mapping[str, float]  # of all states
     allow_unstable: bool
@@ -124,7 +120,7 @@ def configure(
     states = [state for model in models for state in model.names]
     if rules["poles"] and len(rules["poles"]) != len(states):
         raise read.wrong("poles", f"are one for each of {', '.join(states)}", rules["poles"])
-    noise, noise_over_speed = _noise(models[0].forces, read)
+    noise, noise_over_speed = noise_levels(models[0].forces, read)
     config = FilterConfig(
         name=name,
         row=row,
@@ -135,9 +131,10 @@ def configure(
         Q=_process_noise(states, TUNINGS.get((name, ",".join(used)), {}), read),
         noise=noise,
         noise_over_speed=noise_over_speed,
-        hdop_table=_hdop_table(row, read),
+        hdop_table=hdop_table(row, read),
         satellites=read.number("satellites", SATELLITES),
         gate=_gate(read),
+        bank=_bank(states, read),
         adapt=read.number("adapt", 0.0, "is a share from 0 to 1", lambda v: 0.0 <= v < 1.0),
         prior=_prior(states, noise, biases, read),
         allow_unstable=bool(read.value("allow_unstable", False)),
@@ -210,7 +207,13 @@ def _inertial(row: Filter, read: Options) -> tuple[tuple[str, ...], dict[str, fl
     if row.model != "bicycle" or row.gains != "covariance" or row.second:
         return row.fast, {}
     fast = read.some_of("fast", row.fast, INERTIAL)
-    biases = {name: read.not_negative(f"{name}_sd", STATES[name].unit) for name in BIASES}
+    biases = {
+        name: read.not_negative(f"{name}_sd", STATES[name].unit, dict(row.unknown).get(name, 0.0))
+        for name in BIASES
+    }
+    known = [name for name in TYRES if not biases[name] > 0.0]
+    if known not in (list(TYRES), list(TYRES[2:]), []):
+        raise ValueError(f"{read.name}: {known[0]}_sd is above 0 where another tyre's state is")
     for name, sd in biases.items():
         if sd > 0.0 and BIASES[name] not in (*fast, ""):
             raise ValueError(f"{read.name}: {name}_sd needs {BIASES[name]} among fast, got {fast}")
@@ -248,17 +251,6 @@ def _process_noise(states: Sequence[str], tuning: Mapping[str, float], read: Opt
     return Q
 
 
-def _noise(forces: bool, read: Options) -> tuple[dict[str, float], dict[str, float]]:
-    """`FilterConfig.noise` and `noise_over_speed`."""
-    growing = [row.noise for row in _ROWS if row.over_speed and f"{row.noise}_noise" not in read]
-    levels = NOISE | MORE_NOISE
-    noise = {key.removesuffix("_noise"): read.positive(key, sd) for key, sd in levels.items()}
-    if forces:
-        keys = zip(("force", "moment", "time"), DISTURBANCE.items(), strict=True)
-        noise |= {short: read.positive(key, default) for short, (key, default) in keys}
-    return noise, {name: noise[name] * COURSE_SPEED for name in growing}
-
-
 def _prior(
     states: Sequence[str], noise: Mapping[str, float], biases: Mapping[str, float], read: Options
 ) -> dict[str, float]:
@@ -280,21 +272,19 @@ def _prior(
     return found
 
 
+def _bank(states: Sequence[str], read: Options) -> int:
+    count = round(read.number("bank", 1.0, "is a number of filters from 1 to 8", _is_bank))
+    if count > 1 and TYRES[0] not in states:
+        raise read.wrong("bank", "is 1 where tyres are known", count)
+    return count
+
+
+def _is_bank(value: float) -> bool:
+    return 1.0 <= value <= 8.0 and value == round(value)
+
+
 def _gate(read: Options) -> float | None:
     gate = read.value("gate", None)
     if gate is None:
         return None
     return read.checked("gate", gate, "is a probability between 0 and 1", lambda v: 0.0 < v < 1.0)
-
-
-def _hdop_table(row: Filter, read: Options) -> tuple[tuple[float, float], ...]:
-    """Knots (HDOP, factor), or none."""
-    table = read.value("hdop_table", row.hdop)
-    if table is None or (isinstance(table, tuple) and not table):
-        return ()
-    knots = read.numbers("hdop_table", table)
-    pairs = knots.ndim == 2 and knots.shape[1] == 2 and 2 <= len(knots) <= KNOTS
-    if not (pairs and (np.diff(knots[:, 0]) > 0.0).all() and (knots[:, 1] > 0.0).all()):
-        expected = f"is 2 to {KNOTS} pairs (HDOP, factor) with rising HDOP and positive factors"
-        raise read.wrong("hdop_table", expected, table)
-    return tuple((float(hdop), float(factor)) for hdop, factor in knots)

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from ...envs.record import FAST
 from ...envs.sensors.slow import SLOW_NAMES
 from ...envs.vehicle.linear import roll
-from ...envs.vehicle.vehicle import Vehicle
+from ...envs.vehicle.vehicle import GRAVITY, Vehicle
 from ..core.memory import Car, Memory
 from ..core.transition import FORCES, KINEMATIC, LATERAL, ROLL, VELOCITY_ROLL, YAW
 from .measurements import MEASUREMENTS, packet_column
@@ -53,6 +53,9 @@ STATES = {
     "bias": State("rad/s", 0.0, 10.0),
     "accel_bias": State("m/s2", 0.0, 50.0),
     "bank": State("rad", 0.0, 1.0),
+    "front_tyres": State("-", 0.0, 5.0),
+    "rear_tyres": State("-", 0.0, 5.0),
+    "inverse_friction": State("-", 0.0, 5.0),
 }
 """All states of all models, by name."""
 FOREIGN_STATE = State("-", 0.0, 1e6)
@@ -88,9 +91,10 @@ class Model:
 ORDER = ("beta", "gamma", "psi", "y_l")
 BODY = ("phi", "phi_rate")  # of a bicycle whose accelerometer or roll rate is measured
 INERTIAL = ("gyro", "accel_y", "roll_rate")  # the fast sensors of a bicycle, in their order
-BIASES = {"bias": "gyro", "accel_bias": "accel_y", "bank": ""}
-"""States that are constants: what a fast sensor measures on top, and the road's bank, which no
-accelerometer feels."""
+TYRES = ("front_tyres", "rear_tyres", "inverse_friction")
+BIASES = {"bias": "gyro", "accel_bias": "accel_y", "bank": "", **dict.fromkeys(TYRES, "")}
+"""States that are constants: what a fast sensor measures on top, the road's bank, which no
+accelerometer feels, and the tyres: factors of stiffness, and the reciprocal of friction."""
 WALK = (("d1", "beta"), ("d2", "gamma"))  # dakf-stability (8)-(9), (14)
 WALK_ALL = (*WALK, ("d3", "psi"))  # dual-rate (4): one for every state of (37)
 DISTURBANCES = ("none", "walk", "walk-all", "forces")
@@ -194,8 +198,24 @@ def write_model(
         f.Q[dense, dense] += (1.0 - keep * keep) * noise["force"] ** 2
         f.Q[dense + 1, dense + 1] += (1.0 - keep * keep) * noise["moment"] ** 2
     f.speed_state = names.index("v_x") if "v_x" in names else -1
+    _write_tyres(f, model, vehicle)
     _write_signals(f, model, vehicle, noise)
     _write_rows(f, model, noise, noise_over_speed)
+
+
+def _write_tyres(f: Memory, model: Model, vehicle: Vehicle) -> None:
+    """Where the tyres' states stand and start: at the nominal ones."""
+    names = model.names
+    if TYRES[0] not in names:
+        return
+    f.tyres, f.grip = names.index(TYRES[0]), names.index(TYRES[2]) if TYRES[2] in names else 0
+    f.stiffness[:] = 2.0 * vehicle.front_stiffness, 2.0 * vehicle.rear_stiffness
+    wheelbase = vehicle.front_arm + vehicle.rear_arm
+    arms = np.array([vehicle.rear_arm, vehicle.front_arm])
+    f.load[:] = vehicle.mass * GRAVITY * arms / wheelbase
+    f.first[f.tyres : f.tyres + 2] = 1.0
+    if f.grip:
+        f.first[f.grip] = 1.0 / vehicle.friction
 
 
 def _write_signals(f: Memory, model: Model, vehicle: Vehicle, noise: Mapping[str, float]) -> None:

@@ -50,10 +50,10 @@ class Options:
             raise self.wrong(key, f"is {known[0]!r} and any of {', '.join(known[1:])}", value)
         return found
 
-    def not_negative(self, key: str, unit: str) -> float:
-        """A number that is 0 (its default) or more, in a unit."""
+    def not_negative(self, key: str, unit: str, default: float = 0.0) -> float:
+        """A number that is 0 or more, in a unit."""
         expected = f"is in {unit} and not negative"
-        return self.number(key, 0.0, expected, lambda v: 0.0 <= v < np.inf)
+        return self.number(key, default, expected, lambda v: 0.0 <= v < np.inf)
 
     def number(self, key: str, default: float, expected: str = "", fits: Fits = _any) -> float:
         """An option that is a number; raises as `checked`."""

@@ -10,8 +10,8 @@ import numpy as np
 
 from ...envs.backend.decorators import counted
 from ...envs.backend.primitives import maximum
-from ..core.entry import entry
 from ..core.memory import FILTER
+from ..entry import entry
 from ..wrappers.kernel import observe
 
 

@@ -8,9 +8,9 @@ import numpy as np
 from ...envs.backend.decorators import apart, jit
 from ...envs.backend.elementary import wrap
 from ...envs.backend.primitives import maximum, minimum
-from ..core.entry import entry
 from ..core.memory import FILTER
 from ..core.run import advance, covariance_of, deviation
+from ..entry import entry
 
 
 @jit

@@ -7,9 +7,9 @@ import numba
 import numpy as np
 from numba.extending import is_jitted
 
-from ...envs.record import PACKET_WIDTH
-from .memory import FILTER
-from .run import advance, receive_all, step_all
+from ..envs.record import PACKET_WIDTH
+from .core.memory import FILTER
+from .core.run import advance, receive_all, step_all
 
 
 def entry(function: Any, *example: Any) -> Any:

@@ -1,0 +1,123 @@
+"""Estimators of several records: the second layer of double-layer-gps, or a bank and its mixture.
+
+The second layer has velocities and roll, measured by the GPS and the first layer.
+
+A bank: a filter that has settled on its tyres takes seconds to believe that they changed. Every
+half second the least likely member becomes a copy of the likeliest that has forgotten the tyres, at
+the odds of such a change; what is measured makes one or the other likelier. Layer 0 of an estimator
+with a bank is the mixture's mean and covariance, which nothing measures; its members follow.
+"""
+
+from math import exp
+from typing import Any
+
+from ...envs.backend.decorators import apart, copied, jit
+from ...envs.backend.elementary import sincos
+from ...envs.backend.primitives import maximum
+from ...envs.record import PACKET
+from .innovation import dilution
+from .memory import COUNTERS, WINDOW, Filters, Gains, Memory, Row
+from .packets import receive, receive_sample
+from .speed import finite
+from .transition import BETA
+
+LEAST = -60.0  # of a member's weight, below the likeliest
+
+
+@jit
+def pass_on(first: Memory, second: Memory, gains: Gains, packet: Row) -> None:
+    """Correct the second layer by a packet (PACKET_WIDTH,) that the first has used, as a velocity:
+    v_x = V cos(beta), v_y = V sin(beta).
+
+    double-layer-gps (8)-(9), with the first layer's sideslip angle as it was predicted for the
+    captured tick. The noise along is the speed's, after the table of HDOP; the one across is that
+    of the angle, (V sigma_beta)^2, and of the speed, (sigma_V sin(beta))^2.
+    """
+    s, captured = int(packet[PACKET.sensor]), int(packet[PACKET.captured])
+    beta = first.x[BETA]
+    if captured >= maximum(first.start, first.tick - WINDOW + 1) and captured < first.tick:
+        beta = first.predicted[captured % WINDOW, BETA]
+    sine, cosine = sincos(beta)
+    V = packet[first.speed_column[s]]
+    if not finite(V):
+        first.counts[COUNTERS.invalid] += 1
+        return
+    velocity = second.sample
+    copied(packet, velocity)
+    velocity[PACKET.value] = V * cosine
+    velocity[PACKET.value + 1] = V * sine
+    factor = dilution(first, s, packet)
+    along = second.r_speed * factor * factor
+    second.r[s, 0] = along
+    second.r[s, 1] = V * V * first.P[BETA, BETA] + along * sine * sine
+    receive_sample(second, gains)
+
+
+@jit
+def own(layers: Filters) -> int:
+    """The first layer that measures: 1 where there is a bank, else 0."""
+    return 1 if layers[0].members > 0 else 0
+
+
+@jit
+def receive_beside(layers: Filters, gains: Gains, packet: Row) -> None:
+    """`receive` a packet by every member behind the first one."""
+    for m in range(2, len(layers)):
+        receive(layers[m], gains, packet)
+
+
+@jit
+def _likeliest(layers: Filters) -> int:
+    best = 1
+    for m in range(2, len(layers)):
+        if layers[m].weight > layers[best].weight:
+            best = m
+    return best
+
+
+@apart
+def respawn(layers: Filters) -> None:
+    """The least likely member becomes the likeliest, but for tyres that may be others now."""
+    best = _likeliest(layers)
+    top, worst = layers[best].weight, 1
+    for m in range(1, len(layers)):
+        layers[m].weight = maximum(layers[m].weight - top, LEAST)
+        if layers[m].weight <= layers[worst].weight and m != best:
+            worst = m
+    layers[worst] = layers[best]
+    f = layers[worst]
+    for i in range(2):
+        f.P[f.tyres + i, f.tyres + i] += f.spread
+    f.weight = f.hazard
+
+
+@jit
+def _share(layers: Filters, m: int, best: int) -> Any:
+    return exp(maximum(layers[m].weight - layers[best].weight, LEAST))
+
+
+@apart
+def mix(layers: Filters) -> None:
+    """The mean and covariance of the mixture into layer 0."""
+    best = _likeliest(layers)
+    out, front = layers[best], layers[0]
+    total, n = 0.0, out.n
+    for m in range(1, len(layers)):
+        total += _share(layers, m, best)
+    for i in range(n):
+        front.x[i] = 0.0
+        for j in range(n):
+            front.P[i, j] = 0.0
+    for m in range(1, len(layers)):
+        share = _share(layers, m, best) / total
+        for i in range(n):
+            front.x[i] += share * layers[m].x[i]
+    for m in range(1, len(layers)):
+        share, f = _share(layers, m, best) / total, layers[m]
+        for i in range(n):
+            for j in range(n):
+                off = (f.x[i] - front.x[i]) * (f.x[j] - front.x[j])
+                front.P[i, j] += share * (f.P[i, j] + off)
+    front.tick, front.speed, front.nis = out.tick, out.speed, layers[1].nis
+    for i in range(len(front.counts)):
+        front.counts[i] = layers[1].counts[i]

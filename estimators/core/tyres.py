@@ -1,0 +1,61 @@
+"""Tyres that a filter estimates while it drives: an extended Kalman filter on the bicycle.
+
+The factors of both axles' stiffness, and the reciprocal of friction where tyres have a limit, are
+states behind the dense ones. Every few ticks each axle's force is expanded at the present state:
+its slope by slip stands in `car` and makes the bicycle's matrices, its slopes by the states are
+columns beside them, and the rest is a known push.
+"""
+
+from typing import Any
+
+from ...envs.backend.decorators import jit
+from ...envs.backend.primitives import absolute, maximum, minimum
+from .memory import CAR, Memory
+from .transition import SLOWEST
+
+AGAIN = 4  # ticks between two expansions
+FACTORS = (0.2, 3.0)
+MOST = 4.0  # of the reciprocal of friction
+_LEAST = 0.02  # of a tyre's slope, where it slides
+
+
+@jit
+def axle_force(stiffness: Any, load: Any, alpha: Any, factor: Any, grip: Any) -> Any:
+    """(F, dF/dalpha, dF/dfactor, dF/dgrip) of an axle: Fiala's law with friction 1/grip.
+
+    F = C s alpha (1 - |z| + z^2 / 3), z = C s alpha grip / (3 F_z) within +-1; at grip 0 it is
+    linear. stiffness: N/rad of the axle, C. load: N, F_z. alpha: rad.
+    """
+    whole = stiffness * factor
+    per = whole * absolute(alpha) / (3.0 * load)
+    z = minimum(per * grip, 1.0)
+    share = 1.0 - z + z * z * (1.0 / 3.0)
+    if z >= 1.0:  # it slides: F_z / grip
+        force = load / grip if alpha > 0.0 else 0.0 - load / grip
+        return force, _LEAST * whole, 0.0, 0.0 - force / grip
+    slope = (1.0 - z) * (1.0 - z)
+    bent = whole * alpha * per * (z * (2.0 / 3.0) - 1.0)
+    return whole * alpha * share, maximum(slope, _LEAST) * whole, stiffness * alpha * slope, bent
+
+
+@jit
+def linearise(f: Memory, steer: Any) -> None:
+    """Expand both axles' forces at the present state; steer: rad, of the front wheels."""
+    x, V = f.x, maximum(f.model_speed, SLOWEST)
+    for i in range(2):
+        x[f.tyres + i] = minimum(maximum(x[f.tyres + i], FACTORS[0]), FACTORS[1])
+    grip = 0.0
+    if f.grip > 0:
+        grip = minimum(maximum(x[f.grip], 0.0), MOST)
+        x[f.grip] = grip
+    beta, gamma = x[0], x[1]
+    for i in range(2):
+        arm = f.car[CAR.front_arm] if i == 0 else 0.0 - f.car[CAR.rear_arm]
+        alpha = (steer if i == 0 else 0.0) - beta - arm * gamma / V
+        factor = x[f.tyres + i]
+        force, slope, per_factor, per_grip = axle_force(
+            f.stiffness[i], f.load[i], alpha, factor, grip
+        )
+        f.car[CAR.front_stiffness + i] = 0.5 * slope
+        f.per_tyre[i, 0], f.per_tyre[i, 1] = per_factor, per_grip
+        f.rest[i] = force - slope * alpha - per_factor * factor - per_grip * grip

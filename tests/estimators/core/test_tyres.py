@@ -1,0 +1,167 @@
+"""Tyres as states: the law and its slopes, a known tyre, unknown ones, ones that change."""
+
+import functools
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import sideslip
+from sideslip.agents.rollout import rollout
+from sideslip.envs import Log
+from sideslip.envs.record import PACKET
+from sideslip.envs.vehicle.tyres import FIALA, Tyre, lateral_forces
+from sideslip.estimators import Estimator, make_estimator
+from sideslip.estimators.analysis.bound import bound
+from sideslip.estimators.core.tyres import axle_force
+
+assert sideslip.__version__
+LINEAR: dict[str, Any] = {
+    "base": "random-steering",
+    "speed": 25.0 / 3.6,
+    "small_angle": True,
+    "tyres": "linear",
+    "roll": False,
+    "lags": False,
+    "amplitude": (0.03, 0.08),
+    "amplitude_2": (0.02, 0.05),
+    "front_stiffness": (0.6, 1.4),
+    "rear_stiffness": (0.6, 1.4),
+}
+CHANGED = {"tyre_change_time": 4.0, "front_change": 0.6, "rear_change": 1.3}
+SETTLED = 2000  # ticks
+
+
+@functools.cache
+def drives(count: int, changed: bool = False) -> tuple[Any, list[tuple[Log, Any]]]:
+    """The env, and (log, true vehicle) of some seeds."""
+    env: Any = gym.make("sideslip/YawFusion-v0", scenario=LINEAR | (CHANGED if changed else {}))
+    made = []
+    for seed in range(count):
+        log = rollout(env, seed=seed).log
+        made.append((log, env.unwrapped.vehicle))
+    return env.unwrapped, made
+
+
+def built(base: Any, log: Log, name: str = "joint", **options: Any) -> Estimator:
+    return make_estimator(
+        name, vehicle=base.nominal, sensors=log.slow, speed=base.held_speed, slow=["camera", "gps"],
+        **options,
+    )  # fmt: skip
+
+
+def squares(filter_: Estimator, log: Log, since: int = SETTLED) -> tuple[float, float]:
+    """(mean squared error of beta, mean NEES of beta) from a tick on."""
+    found = filter_.run(log)
+    error = (found.x[:, 0] - log.truth["beta"])[since:]
+    return float(np.mean(error**2)), float(np.mean((error / found.std[since:, 0]) ** 2))
+
+
+@pytest.mark.parametrize("factor", [0.6, 1.0])
+@pytest.mark.parametrize("friction", [0.4, 0.9])
+def test_the_law_is_the_plants_and_its_slopes_are_differences(
+    factor: float, friction: float
+) -> None:
+    C, F_z = 24000.0, 4000.0
+    for alpha in (-0.3, -0.02, -0.001, 0.004, 0.05, 0.2):
+        at = (alpha, factor, 1.0 / friction)
+        force, *slopes = axle_force(C, F_z, *at)
+        tyre = Tyre(alpha, friction * F_z / 2, C * factor / 2 / (3.0 * friction * F_z / 2))
+        pair = lateral_forces(tyre, tyre, tyre, tyre, FIALA, 0)
+        assert force == pytest.approx(pair[0] + pair[1], rel=1e-12)
+        whole = abs(alpha) * C * factor / (3.0 * F_z * friction)
+        for i, slope in enumerate(slopes):
+            step = 1e-6 * (np.arange(3) == i)
+            ahead, back = (axle_force(C, F_z, *(np.array(at) + s))[0] for s in (step, -step))
+            if whole < 0.85 or i == 2:  # where it slides the slope by slip is kept above zero
+                assert slope == pytest.approx((ahead - back) / 2e-6, rel=1e-5, abs=1e-3)
+    assert axle_force(C, F_z, 0.1, factor, 0.0)[0] == pytest.approx(C * factor * 0.1)
+
+
+def test_with_known_tyres_it_is_the_linear_filter() -> None:
+    """A prior of almost nothing leaves the nominal bicycle, late camera and GPS included."""
+    base, ((log, _), *_) = drives(1)
+    sure: dict[str, Any] = {"front_tyres_sd": 1e-9, "rear_tyres_sd": 1e-9}
+    joint, exact = built(base, log, **sure).run(log), built(base, log, "exact-kf").run(log)
+    n = exact.x.shape[1]
+    scale = np.abs(exact.x).max(axis=0)
+    assert (np.abs(joint.x[:, :n] - exact.x) < 1e-6 * scale).all()
+    np.testing.assert_allclose(joint.std[1:, :n], exact.std[1:], rtol=1e-6)
+
+
+def test_unknown_tyres_cost_a_tenth_and_not_a_factor_of_five() -> None:
+    """Root mean square over eight cars, over the bound that knows the tyres."""
+    base, made = drives(8)
+    ours, nominal, best, nees = [], [], [], []
+    for log, truth in made:
+        error, consistent = squares(built(base, log, bias_sd=0.005), log)
+        ours.append(error)
+        nees.append(consistent)
+        nominal.append(squares(built(base, log, "exact-kf"), log)[0])
+        least = bound(truth, record=log.record, sensors=log.slow, speed=base.held_speed)
+        best.append(np.mean(least[SETTLED:] ** 2))
+    assert np.sqrt(np.mean(ours) / np.mean(best)) < 1.25
+    assert np.sqrt(np.mean(nominal) / np.mean(best)) > 3.0
+    assert 0.5 < np.mean(nees) < 1.7
+
+
+def test_the_factors_are_found() -> None:
+    base, made = drives(4)
+    for log, truth in made:
+        filter_ = built(base, log)
+        found = filter_.run(log)
+        for axle in ("front", "rear"):
+            at = filter_.names.index(f"{axle}_tyres")
+            true = getattr(truth, f"{axle}_stiffness") / getattr(base.nominal, f"{axle}_stiffness")
+            assert abs(found.x[-1, at] - true) < 4.0 * found.std[-1, at] < 0.4
+
+
+def test_a_bank_believes_a_change_sooner_and_costs_nothing_without_one() -> None:
+    base, made = drives(6, True)
+    late = 4000 + 500
+    single, bank = (
+        [squares(built(base, log, bank=count), log, late)[0] for log, _ in made] for count in (1, 4)
+    )
+    assert np.sqrt(np.mean(bank) / np.mean(single)) < 0.8
+    base, made = drives(4)
+    single, bank = (
+        [squares(built(base, log, bank=count), log)[0] for log, _ in made] for count in (1, 4)
+    )
+    assert np.sqrt(np.mean(bank) / np.mean(single)) < 1.05
+
+
+def test_a_bank_step_by_step_and_from_a_snapshot_is_the_same() -> None:
+    base, ((log, _), *_) = drives(1, True)
+    whole, parts = built(base, log, bank=3), built(base, log, bank=3)
+    expected = whole.run(log).x
+    record = parts.accept(log)
+    ends = np.searchsorted(record.packets[:, PACKET.arrived], record.ticks, "right")
+    start = 0
+    for k in range(0, 5000, 7):
+        rows = slice(k, k + 7)
+        end = int(ends[min(k + 6, len(ends) - 1)])
+        if k == 3500:
+            other = built(base, log, bank=3)
+            other.reset(log.slow, record.first)
+            other.set_state(parts.get_state())
+            parts = other
+        parts.step(record.fast[rows], record.packets[start:end])
+        start = end
+    np.testing.assert_array_equal(parts.x, expected[k + 6])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"front_tyres_sd": 0.0}, "another tyre's state"),
+        ({"front_tyres_sd": 0.0, "rear_tyres_sd": 0.0, "bank": 2}, "bank is 1 where tyres"),
+        ({"bank": 0}, "from 1 to 8"),
+        ({"bank": 2.5}, "from 1 to 8"),
+        ({"rear_tyres_sd": -1.0}, "not negative"),
+    ],
+)
+def test_bad_options(options: dict[str, Any], message: str) -> None:
+    base, ((log, _), *_) = drives(1)
+    with pytest.raises(ValueError, match=message):
+        built(base, log, **options)
