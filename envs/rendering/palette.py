@@ -33,6 +33,7 @@ FILTERS = {
     "lateral-force-observer": "#EA9048",
     "exact-kf": "#0075B4",
     "joint": "#1B9E1B",
+    "joint-robust": "#0B5D0B",
 }
 CONTROLLERS = {
     "none": GREY,

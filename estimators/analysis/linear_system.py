@@ -20,11 +20,11 @@ from ..core.intersample import DUAL_RATE
 from ..core.memory import CORE, FILTER, INPUTS, ROWS
 from ..core.run import begin_all
 from ..core.transition import LINEAR
-from ..design.checks import covariance, matrix, square, vector
 from ..design.dual_rate import GAINS, RULES, frame_map, shares_of, write_shares
 from ..design.error_map import MARGINAL, spectral_radius, unobservable
 from ..entry import advance_entry, receive_entry
 from ..estimates import Estimates, UnobservableWarning
+from ..matrices import covariance, matrix, square, vector
 
 Array = npt.NDArray[np.float64]
 

@@ -8,6 +8,7 @@ from math import log
 from typing import Any
 
 from ...envs.backend.decorators import jit
+from ...envs.backend.primitives import absolute, sqrt
 from .memory import Memory, Row
 
 
@@ -97,6 +98,10 @@ def _condition(f: Memory, variance: Any, residual: Any) -> None:
     per = 1.0 / variance
     if f.members > 0:
         f.weight -= 0.5 * (residual * residual * per + log(variance))
+    if f.robust > 0.0:  # Huber's: the noise is what makes it `robust` deviations
+        size = absolute(residual) * sqrt(per)
+        if size > f.robust:
+            per *= f.robust / size
     for i in range(N):
         gain[i] = PC[i] * per
         x[i] += gain[i] * residual

@@ -3,6 +3,7 @@
 from typing import Any
 
 from ...envs.backend.decorators import jit
+from ...envs.backend.primitives import maximum, minimum
 from ...envs.record import FAST
 from .covariance import measure_state, predict_covariance
 from .delay import BUFFER, LARSEN, carry_gains
@@ -28,6 +29,20 @@ def _sum(row: Row, column: Row, factor: Row) -> Any:
 
 
 @jit
+def _measure_noise(f: Memory, now: float) -> None:
+    """The variance of a_y from its second differences, which a car's motion hardly has.
+
+    White noise of variance r gives them 6 r; what is far beyond counts as 9 times what is expected.
+    """
+    second = now - 2.0 * f.y_past[0] + f.y_past[1]
+    if finite(second):
+        r = f.r_fast[f.accel_row]
+        seen = minimum(second * second * (1.0 / 6.0), 9.0 * r)
+        f.r_fast[f.accel_row] = maximum(r + f.r_share * (seen - r), f.r_told)
+    f.y_past[1], f.y_past[0] = f.y_past[0], now
+
+
+@jit
 def read(f: Memory, row: Row, now: float) -> None:
     """Take a fast row (FAST_WIDTH,): its inputs (the last finite ones), measurements and speed.
 
@@ -44,6 +59,8 @@ def read(f: Memory, row: Row, now: float) -> None:
         f.counts[COUNTERS.invalid] += 1
     for i in range(f.fasts):
         f.y[i] = _sum(row, f.y_column[i], f.y_factor[i])
+    if f.r_share > 0.0:
+        _measure_noise(f, f.y[f.accel_row])
     turning, f.speed_before = f.turning, f.model_speed
     if (f.kind == KINEMATIC or f.kind == VELOCITY_ROLL) and finite(row[FAST.gyro]):
         turning = row[FAST.gyro]

@@ -94,6 +94,9 @@ _MODEL = [  # dx = A x + B u on the first `dense` states; those behind them deca
     ("load", _FLOAT, (2,)),  # N, on the axles
     ("per_tyre", _FLOAT, (2, 2)),  # N, of each axle by its factor, by the grip's state
     ("rest", _FLOAT, (2,)),  # N, of each axle where all that is linear is zero
+    ("model_error", _FLOAT),  # share of the axles' forces by which the tyres' law errs
+    ("q_known", _FLOAT, (2,)),  # variances of a step of F_d, N_d without it
+    ("q_share", _FLOAT),  # share of a disturbance's variance that comes in a step
     ("step", _FLOAT),  # s, the filter's own step
     ("relax", _FLOAT),  # share by which the delayed states follow in a step
     ("A", _FLOAT, (CORE, CORE)),
@@ -127,6 +130,10 @@ _FAST = [  # inputs and fast measurements: sums of two columns of the fast row
     ("accel_row", _INT),  # the fast measurement that is a bicycle's a_y; 0: none
     ("rest_fast", _FLOAT, (FASTS,)),  # what is measured where states and inputs are zero
     ("r_fast", _FLOAT, (FASTS,)),  # variances
+    ("r_told", _FLOAT),  # (m/s2)^2, of a_y, as configured: the least
+    ("r_share", _FLOAT),  # of a new second difference in the variance of a_y; 0: as configured
+    ("y_past", _FLOAT, (2,)),  # a_y of the two rows before
+    ("robust", _FLOAT),  # standard deviations from which a residual counts less; 0: none does
 ]
 _SLOW = [  # slow sensors: what each one measures, how noisy it is, when it captures
     ("rows", _INT, (SLOW,)),  # of C

@@ -49,6 +49,7 @@ def linearise(f: Memory, steer: Any) -> None:
         grip = minimum(maximum(x[f.grip], 0.0), MOST)
         x[f.grip] = grip
     beta, gamma = x[0], x[1]
+    push = 0.0
     for i in range(2):
         arm = f.car[CAR.front_arm] if i == 0 else 0.0 - f.car[CAR.rear_arm]
         alpha = (steer if i == 0 else 0.0) - beta - arm * gamma / V
@@ -59,3 +60,9 @@ def linearise(f: Memory, steer: Any) -> None:
         f.car[CAR.front_stiffness + i] = 0.5 * slope
         f.per_tyre[i, 0], f.per_tyre[i, 1] = per_factor, per_grip
         f.rest[i] = force - slope * alpha - per_factor * factor - per_grip * grip
+        push += absolute(force)
+    if f.model_error > 0.0:
+        wrong = f.model_error * push
+        turn = 0.5 * (f.car[CAR.front_arm] + f.car[CAR.rear_arm]) * wrong
+        f.Q[f.dense, f.dense] = f.q_known[0] + f.q_share * wrong * wrong
+        f.Q[f.dense + 1, f.dense + 1] = f.q_known[1] + f.q_share * turn * turn

@@ -9,7 +9,7 @@ from scipy.stats import chi2
 
 from ...envs.sensors.link import SlowSensor
 from ...envs.sensors.slow import SLOW_NAMES
-from ...envs.vehicle.vehicle import Vehicle
+from ...envs.vehicle.vehicle import GRAVITY, Vehicle
 from ..core.delay import CONSTANT, STORED
 from ..core.intersample import DUAL_RATE, NONE, PSEUDO
 from ..core.memory import FILTER, ROWS, Memory
@@ -43,10 +43,14 @@ def assemble(
         _write_clocks(f, config, dt)
         n, step = len(model.names), f.stride * dt
         own = slice(first, first + n)
-        noise = config.noise, config.noise_over_speed
+        noise = _scaled(config, vehicle), config.noise_over_speed
         write_model(f, model, vehicle, step, *noise, config.Q[own, own])
         f.decay[f.dense : n - len(model.biases)] *= math.exp(-config.leak * f.stride * dt)
         f.prior[:n, :n] = np.diag([config.prior[state] ** 2 for state in model.names])
+        for state, time in config.times.items():
+            if time > 0.0:
+                i, keep = model.names.index(state), math.exp(-step / time)
+                f.decay[i], f.Q[i, i] = keep, (1.0 - keep * keep) * f.prior[i, i]
         place_clones(f, config)
         f.measured, f.speed = int(speed is None), speed or 0.0
         f.smoothing = 1.0 - math.exp(-dt / SMOOTHING_TIME)
@@ -61,14 +65,24 @@ def assemble(
     return _members(layers, config, dt), planned
 
 
+def _scaled(config: FilterConfig, vehicle: Vehicle) -> dict[str, float]:
+    """Noise with the shares of the car's weight in it."""
+    noise, weight = dict(config.noise), vehicle.mass * GRAVITY
+    arm = 0.5 * (vehicle.front_arm + vehicle.rear_arm)
+    for name, share, size in zip(("force", "moment"), config.shares, (1.0, arm), strict=True):
+        if share > 0.0:
+            noise[name] = math.hypot(noise[name], share * weight * size)
+    return noise
+
+
 def _members(layers: Any, config: FilterConfig, dt: float) -> Any:
     """The mixture and the members of a bank of the filter; the filter itself without one."""
-    if config.bank < 2:
+    if config.members < 2:
         return layers
     f = layers[0]
-    f.members, f.respawn, f.spread = config.bank, round(RESPAWN / dt), FORGOTTEN
+    f.members, f.respawn, f.spread = config.members, round(RESPAWN / dt), FORGOTTEN
     f.hazard = math.log(HAZARD * RESPAWN)
-    return np.repeat(layers, 1 + config.bank).view(np.recarray)
+    return np.repeat(layers, 1 + config.members).view(np.recarray)
 
 
 def alone(config: FilterConfig) -> FilterConfig:
@@ -87,7 +101,7 @@ def told_tyres(config: FilterConfig) -> FilterConfig:
     )
     prior = {name: sd for name, sd in config.prior.items() if name not in TYRES}
     Q = config.Q[np.ix_(left, left)]
-    return replace(config, models=models, Q=Q, prior=prior, bank=1)
+    return replace(config, models=models, Q=Q, prior=prior, members=1)
 
 
 def _write_clocks(f: Memory, config: FilterConfig, dt: float) -> None:
@@ -106,7 +120,10 @@ def _write_clocks(f: Memory, config: FilterConfig, dt: float) -> None:
 
 def _write_trust(f: Memory, config: FilterConfig) -> None:
     """What is known of a sample's noise, and which ones are skipped."""
-    f.least_satellites, f.adapt = config.satellites, config.adapt
+    f.least_satellites, f.adapt, f.robust = config.satellites, config.adapt, config.robust
+    f.model_error, f.r_told = config.model_error, config.noise["accel_y"] ** 2
+    if config.accel_time > 0.0 and f.accel_row > 0:
+        f.r_share = 1.0 - math.exp(-f.step / config.accel_time)
     if config.gate is not None:
         f.gate[1:] = chi2.ppf(config.gate, np.arange(1, ROWS + 1))
     knots = config.hdop_table if f.kind != VELOCITY_ROLL else ()  # applied by the first layer

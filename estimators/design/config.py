@@ -1,6 +1,5 @@
 """The options of a filter: `FilterConfig` has them complete, `configure` parses and checks them."""
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -13,10 +12,19 @@ from ...envs.sensors.slow import SLOW_NAMES
 from ..core.delay import RULES
 from ..filters import Filter
 from . import dual_rate
-from .checks import check_covariance
 from .kalman import INVERSES
-from .measurements import hdop_table, noise_levels
-from .models import BIASES, DISTURBANCES, INERTIAL, MODELS, STATES, TYRES, Model, bicycle_model
+from .levels import hdop_table, noise_levels, prior_of, process_noise
+from .models import (
+    BIASES,
+    DISTURBANCES,
+    INERTIAL,
+    MODELS,
+    STATES,
+    TYRES,
+    WANDER,
+    Model,
+    bicycle_model,
+)
 from .options import Options
 from .tunings import TUNINGS
 
@@ -56,7 +64,8 @@ class FilterConfig:
         limit where it is known. The model is then expanded at the estimate (an EKF).
     bias_sd (rad/s), accel_bias_sd (m/s2), bank_sd (rad): of the same, above 0 (default) a state
         `bias`, `accel_bias` or `bank`, a constant of this deviation that the sensor adds, or by
-        which the road leans, the left side up; with q_bias, ... it walks.
+        which the road leans, the left side up; with q_bias, ... it walks, with bias_time, ... (s)
+        above 0 it wanders about 0 with that deviation and forgets within that time.
     q_beta, q_gamma, ...: process noise of a state per second, (unit)^2/s; or Q, (n, n) or (n,)
         (default: of `tunings.toml`).
     gyro_noise (rad/s), psi_noise (rad), y_l_noise (m), course_noise (rad at every speed; default
@@ -65,8 +74,15 @@ class FilterConfig:
     hdop_table: pairs (HDOP, factor on the GPS's noise), linear in between; None for one noise at
         every HDOP (default: the factor is the HDOP for double-layer, None for the others).
     satellites: the least that a GPS fix needs (default 4).
-    bank: of joint, so many filters side by side, of which the least likely forgets the tyres twice
-        a second (default 1).
+    robust: standard deviations of an innovation from which it counts less (Huber); 0 (default of
+        all but joint): none does.
+    force_share, moment_share: shares of the car's weight, and of that at half the wheelbase, that
+        are added to force_sd and moment_sd, as variances (default 0).
+    model_error: of joint, the share of the axles' forces by which its tyres err, added likewise.
+    accel_time: s; above 0 the accelerometer's noise is found while driving, over so long; then
+        `accel_y_noise` is the least.
+    members: of joint, so many filters side by side, of which the least likely forgets the tyres
+        twice a second (default 1).
     gate: a probability; a sample whose innovation is less likely than 1 - gate is skipped.
     adapt: share of a new innovation in an R that follows them (0: R as configured).
     force_sd (N), moment_sd (N m), disturbance_time (s): of disturbances that are forces.
@@ -92,7 +108,12 @@ class FilterConfig:
     hdop_table: tuple[tuple[float, float], ...]
     satellites: float
     gate: float | None
-    bank: int
+    members: int
+    robust: float
+    model_error: float
+    accel_time: float
+    shares: tuple[float, float]
+    times: Mapping[str, float]  # s, of biases
     adapt: float
     prior: Mapping[str, float]  # of all states
     allow_unstable: bool
@@ -112,7 +133,7 @@ def configure(
     that is absent, a value out of range and options that exclude each other; each names filter,
     option and value.
     """
-    read = Options(name, options)
+    read = Options(name, dict(row.options) | dict(options))
     used = _slow_sensors(row, sensors, read)
     rules = _rules(row, used, read)
     fast, biases = _inertial(row, read)
@@ -128,15 +149,20 @@ def configure(
         models=models,
         **rules,
         leak=read.not_negative("leak", "1/s"),
-        Q=_process_noise(states, TUNINGS.get((name, ",".join(used)), {}), read),
+        Q=process_noise(states, TUNINGS.get((name, ",".join(used)), {}), read),
         noise=noise,
         noise_over_speed=noise_over_speed,
         hdop_table=hdop_table(row, read),
         satellites=read.number("satellites", SATELLITES),
         gate=_gate(read),
-        bank=_bank(states, read),
+        members=_members(states, read),
+        robust=read.not_negative("robust", "standard deviations"),
+        model_error=read.not_negative("model_error", "shares of a force"),
+        accel_time=read.not_negative("accel_time", "s"),
+        shares=(read.not_negative("force_share", "1"), read.not_negative("moment_share", "1")),
+        times={name: read.not_negative(f"{name}_time", "s") for name in biases if name in WANDER},
         adapt=read.number("adapt", 0.0, "is a share from 0 to 1", lambda v: 0.0 <= v < 1.0),
-        prior=_prior(states, noise, biases, read),
+        prior=prior_of(states, noise, biases, read),
         allow_unstable=bool(read.value("allow_unstable", False)),
     )
     read.done()
@@ -207,10 +233,7 @@ def _inertial(row: Filter, read: Options) -> tuple[tuple[str, ...], dict[str, fl
     if row.model != "bicycle" or row.gains != "covariance" or row.second:
         return row.fast, {}
     fast = read.some_of("fast", row.fast, INERTIAL)
-    biases = {
-        name: read.not_negative(f"{name}_sd", STATES[name].unit, dict(row.unknown).get(name, 0.0))
-        for name in BIASES
-    }
+    biases = {name: read.not_negative(f"{name}_sd", STATES[name].unit) for name in BIASES}
     known = [name for name in TYRES if not biases[name] > 0.0]
     if known not in (list(TYRES), list(TYRES[2:]), []):
         raise ValueError(f"{read.name}: {known[0]}_sd is above 0 where another tyre's state is")
@@ -237,49 +260,14 @@ def _models(
     return (first, MODELS[row.second]) if row.second else (first,)
 
 
-def _process_noise(states: Sequence[str], tuning: Mapping[str, float], read: Options) -> Array:
-    """Q (n, n) per second: the tuning's, the option's, single states' on its diagonal."""
-    n, matrix = len(states), read.value("Q", None)
-    tuned = [tuning.get(state, 0.0) for state in states]
-    Q = read.numbers("Q", tuned if matrix is None else matrix)
-    if Q.shape not in ((n,), (n, n)):
-        raise ValueError(f"{read.name}: Q has shape ({n}, {n}) or ({n},), got {Q.shape}")
-    Q = np.diag(Q) if Q.ndim == 1 else Q
-    for i, state in enumerate(states):
-        Q[i, i] = read.number(f"q_{state}", float(Q[i, i]))
-    check_covariance(f"{read.name}: Q", Q)
-    return Q
-
-
-def _prior(
-    states: Sequence[str], noise: Mapping[str, float], biases: Mapping[str, float], read: Options
-) -> dict[str, float]:
-    """Standard deviations of all states at the start."""
-    found = {state: STATES[state].prior for state in states} | dict(biases)
-    if "force" in noise:
-        found |= {"F_d": noise["force"], "N_d": noise["moment"]}
-    prior = read.value("prior", {})
-    if not isinstance(prior, Mapping):
-        raise TypeError(f"{read.name}: prior is standard deviations by state, got {prior!r}")
-    for state, value in prior.items():
-        if state not in states:
-            known = ", ".join(states)
-            raise ValueError(f"{read.name} has no state {state!r}; it has: {known}; prior={prior}")
-        sd = read.numbers(f"the prior of {state}", value)
-        if sd.ndim > 0 or not 0.0 <= sd < math.inf:
-            raise read.wrong(f"the prior of {state}", "is a standard deviation", value)
-        found[state] = float(sd)
-    return found
-
-
-def _bank(states: Sequence[str], read: Options) -> int:
-    count = round(read.number("bank", 1.0, "is a number of filters from 1 to 8", _is_bank))
+def _members(states: Sequence[str], read: Options) -> int:
+    count = round(read.number("members", 1.0, "is a number of filters from 1 to 8", _is_count))
     if count > 1 and TYRES[0] not in states:
-        raise read.wrong("bank", "is 1 where tyres are known", count)
+        raise read.wrong("members", "is 1 where tyres are known", count)
     return count
 
 
-def _is_bank(value: float) -> bool:
+def _is_count(value: float) -> bool:
     return 1.0 <= value <= 8.0 and value == round(value)
 
 

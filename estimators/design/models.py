@@ -92,7 +92,8 @@ ORDER = ("beta", "gamma", "psi", "y_l")
 BODY = ("phi", "phi_rate")  # of a bicycle whose accelerometer or roll rate is measured
 INERTIAL = ("gyro", "accel_y", "roll_rate")  # the fast sensors of a bicycle, in their order
 TYRES = ("front_tyres", "rear_tyres", "inverse_friction")
-BIASES = {"bias": "gyro", "accel_bias": "accel_y", "bank": "", **dict.fromkeys(TYRES, "")}
+WANDER = {"bias": "gyro", "accel_bias": "accel_y", "bank": ""}
+BIASES = WANDER | dict.fromkeys(TYRES, "")
 """States that are constants: what a fast sensor measures on top, the road's bank, which no
 accelerometer feels, and the tyres: factors of stiffness, and the reciprocal of friction."""
 WALK = (("d1", "beta"), ("d2", "gamma"))  # dakf-stability (8)-(9), (14)
@@ -197,6 +198,7 @@ def write_model(
         f.decay[dense : dense + 2] = keep
         f.Q[dense, dense] += (1.0 - keep * keep) * noise["force"] ** 2
         f.Q[dense + 1, dense + 1] += (1.0 - keep * keep) * noise["moment"] ** 2
+        f.q_known[:], f.q_share = np.diag(f.Q)[dense : dense + 2], 1.0 - keep * keep
     f.speed_state = names.index("v_x") if "v_x" in names else -1
     _write_tyres(f, model, vehicle)
     _write_signals(f, model, vehicle, noise)

@@ -11,7 +11,7 @@ from sideslip.envs.ticks import TICK
 from sideslip.envs.vehicle.linear import LinearModel, vision
 from sideslip.envs.vehicle.vehicle import Vehicle
 from sideslip.estimators.design.kalman import gain, joseph
-from sideslip.estimators.design.measurements import DISTURBANCE, NOISE
+from sideslip.estimators.design.levels import DISTURBANCE, NOISE
 from tests.estimators.dense import MEASURED
 
 Array = npt.NDArray[np.float64]

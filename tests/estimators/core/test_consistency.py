@@ -16,7 +16,8 @@ from sideslip.envs import Log
 from sideslip.envs.record import PACKET
 from sideslip.envs.scenarios.manoeuvres import scenario_from
 from sideslip.estimators import Estimator, make_estimator
-from sideslip.estimators.design.measurements import DISTURBANCE, MEASUREMENTS, NOISE
+from sideslip.estimators.design.levels import DISTURBANCE, NOISE
+from sideslip.estimators.design.measurements import MEASUREMENTS
 from sideslip.estimators.design.models import states_for
 from tests.estimators.drives import Drives, told
 from tests.estimators.riccati import riccati

@@ -57,7 +57,8 @@ def defaults() -> list[Any]:
         (name, sensor)
         for name, row in FILTERS.items()
         for sensor in row.slow or ("",)
-        if name not in ("constant-delay-kf", "joint")  # joint: its tyres make it nonlinear
+        if name
+        not in ("constant-delay-kf", "joint", "joint-robust")  # joint: its tyres make it nonlinear
     ]
     return [case(name, clocks[sensor]) for name, sensor in cases]
 

@@ -121,19 +121,20 @@ def test_a_bank_believes_a_change_sooner_and_costs_nothing_without_one() -> None
     base, made = drives(6, True)
     late = 4000 + 500
     single, bank = (
-        [squares(built(base, log, bank=count), log, late)[0] for log, _ in made] for count in (1, 4)
+        [squares(built(base, log, members=count), log, late)[0] for log, _ in made]
+        for count in (1, 4)
     )
     assert np.sqrt(np.mean(bank) / np.mean(single)) < 0.8
     base, made = drives(4)
     single, bank = (
-        [squares(built(base, log, bank=count), log)[0] for log, _ in made] for count in (1, 4)
+        [squares(built(base, log, members=count), log)[0] for log, _ in made] for count in (1, 4)
     )
     assert np.sqrt(np.mean(bank) / np.mean(single)) < 1.05
 
 
 def test_a_bank_step_by_step_and_from_a_snapshot_is_the_same() -> None:
     base, ((log, _), *_) = drives(1, True)
-    whole, parts = built(base, log, bank=3), built(base, log, bank=3)
+    whole, parts = built(base, log, members=3), built(base, log, members=3)
     expected = whole.run(log).x
     record = parts.accept(log)
     ends = np.searchsorted(record.packets[:, PACKET.arrived], record.ticks, "right")
@@ -142,7 +143,7 @@ def test_a_bank_step_by_step_and_from_a_snapshot_is_the_same() -> None:
         rows = slice(k, k + 7)
         end = int(ends[min(k + 6, len(ends) - 1)])
         if k == 3500:
-            other = built(base, log, bank=3)
+            other = built(base, log, members=3)
             other.reset(log.slow, record.first)
             other.set_state(parts.get_state())
             parts = other
@@ -155,9 +156,9 @@ def test_a_bank_step_by_step_and_from_a_snapshot_is_the_same() -> None:
     ("options", "message"),
     [
         ({"front_tyres_sd": 0.0}, "another tyre's state"),
-        ({"front_tyres_sd": 0.0, "rear_tyres_sd": 0.0, "bank": 2}, "bank is 1 where tyres"),
-        ({"bank": 0}, "from 1 to 8"),
-        ({"bank": 2.5}, "from 1 to 8"),
+        ({"front_tyres_sd": 0.0, "rear_tyres_sd": 0.0, "members": 2}, "members is 1 where tyres"),
+        ({"members": 0}, "from 1 to 8"),
+        ({"members": 2.5}, "from 1 to 8"),
         ({"rear_tyres_sd": -1.0}, "not negative"),
     ],
 )

@@ -1,0 +1,85 @@
+"""What a filter believes of noise: sensors, disturbances, Q, and deviations at the start."""
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from ..core.memory import KNOTS
+from ..filters import Filter
+from ..matrices import check_covariance
+from .measurements import COURSE_SPEED, MEASUREMENTS
+from .models import STATES
+from .options import Options
+
+Array = npt.NDArray[np.float64]
+
+_ROWS = [row for sensor in MEASUREMENTS.values() for row in sensor.rows]
+_VELOCITIES = [row for sensor in MEASUREMENTS.values() for row in sensor.velocities]
+NOISE = {"gyro_noise": 0.005} | {f"{row.noise}_noise": row.sd for row in _ROWS}  # gyro: rad/s
+MORE_NOISE = {
+    "accel_y_noise": 0.1,  # m/s2
+    "roll_rate_noise": 0.005,  # rad/s
+    "wheel_noise": 0.015,  # m/s, of the mean of both front wheels
+} | {f"{row.noise}_noise": row.sd for row in _VELOCITIES}
+DISTURBANCE = {"force_sd": 50.0, "moment_sd": 20.0, "disturbance_time": 0.3}  # N, N m, s
+
+
+def noise_levels(forces: bool, read: Options) -> tuple[dict[str, float], dict[str, float]]:
+    """`FilterConfig.noise` and `noise_over_speed`; forces: whether its disturbances are."""
+    growing = [row.noise for row in _ROWS if row.over_speed and f"{row.noise}_noise" not in read]
+    levels = NOISE | MORE_NOISE
+    noise = {key.removesuffix("_noise"): read.positive(key, sd) for key, sd in levels.items()}
+    if forces:
+        keys = zip(("force", "moment", "time"), DISTURBANCE.items(), strict=True)
+        noise |= {short: read.positive(key, default) for short, (key, default) in keys}
+    return noise, {name: noise[name] * COURSE_SPEED for name in growing}
+
+
+def hdop_table(row: Filter, read: Options) -> tuple[tuple[float, float], ...]:
+    """Knots (HDOP, factor), or none."""
+    table = read.value("hdop_table", row.hdop)
+    if table is None or (isinstance(table, tuple) and not table):
+        return ()
+    knots = read.numbers("hdop_table", table)
+    pairs = knots.ndim == 2 and knots.shape[1] == 2 and 2 <= len(knots) <= KNOTS
+    if not (pairs and (np.diff(knots[:, 0]) > 0.0).all() and (knots[:, 1] > 0.0).all()):
+        expected = f"is 2 to {KNOTS} pairs (HDOP, factor) with rising HDOP and positive factors"
+        raise read.wrong("hdop_table", expected, table)
+    return tuple((float(hdop), float(factor)) for hdop, factor in knots)
+
+
+def process_noise(states: Sequence[str], tuning: Mapping[str, float], read: Options) -> Array:
+    """Q (n, n) per second: the tuning's, the option's, single states' on its diagonal."""
+    n, matrix = len(states), read.value("Q", None)
+    tuned = [tuning.get(state, 0.0) for state in states]
+    Q = read.numbers("Q", tuned if matrix is None else matrix)
+    if Q.shape not in ((n,), (n, n)):
+        raise ValueError(f"{read.name}: Q has shape ({n}, {n}) or ({n},), got {Q.shape}")
+    Q = np.diag(Q) if Q.ndim == 1 else Q
+    for i, state in enumerate(states):
+        Q[i, i] = read.number(f"q_{state}", float(Q[i, i]))
+    check_covariance(f"{read.name}: Q", Q)
+    return Q
+
+
+def prior_of(
+    states: Sequence[str], noise: Mapping[str, float], biases: Mapping[str, float], read: Options
+) -> dict[str, float]:
+    """Standard deviations of all states at the start."""
+    found = {state: STATES[state].prior for state in states} | dict(biases)
+    if "force" in noise:
+        found |= {"F_d": noise["force"], "N_d": noise["moment"]}
+    prior = read.value("prior", {})
+    if not isinstance(prior, Mapping):
+        raise TypeError(f"{read.name}: prior is standard deviations by state, got {prior!r}")
+    for state, value in prior.items():
+        if state not in states:
+            known = ", ".join(states)
+            raise ValueError(f"{read.name} has no state {state!r}; it has: {known}; prior={prior}")
+        sd = read.numbers(f"the prior of {state}", value)
+        if sd.ndim > 0 or not 0.0 <= sd < math.inf:
+            raise read.wrong(f"the prior of {state}", "is a standard deviation", value)
+        found[state] = float(sd)
+    return found

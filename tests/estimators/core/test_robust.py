@@ -1,0 +1,109 @@
+"""A car that nobody has measured: noise found while driving, outliers, tyres that err."""
+
+import dataclasses
+import functools
+import math
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import sideslip
+from sideslip.agents.rollout import rollout
+from sideslip.envs import Log
+from sideslip.envs.record import FAST
+from sideslip.envs.vehicle.vehicle import GRAVITY
+from sideslip.estimators import Estimator, make_estimator
+
+assert sideslip.__version__
+
+
+@functools.cache
+def drive(accel: float = 0.1) -> tuple[Any, Log]:
+    """A drive of the COMS whose accelerometer has this noise in m/s2."""
+    scenario = {"base": "random-steering", "noise": {"accel": accel}, "duration": 6.0}
+    env: Any = gym.make("sideslip/YawFusion-v0", scenario=scenario)
+    return env.unwrapped, rollout(env, seed=1).log
+
+
+def built(name: str, log: Log, **options: Any) -> Estimator:
+    slow = {"sensors": log.slow, "slow": list(log.slow)}
+    return make_estimator(name, vehicle=drive()[0].nominal, **slow, **options)
+
+
+@pytest.mark.parametrize("noise", [0.03, 0.1, 0.8])
+def test_the_accelerometers_noise_is_found_and_never_less_than_configured(noise: float) -> None:
+    _, log = drive(noise)
+    filter_ = built("joint-robust", log, accel_y_noise=0.05)
+    filter_.run(log)
+    f = filter_.filters[0]
+    assert math.sqrt(f.r_fast[f.accel_row]) == pytest.approx(max(noise, 0.05), rel=0.1)
+    filter_ = built("joint-robust", log, accel_time=0.0)
+    filter_.run(log)
+    assert filter_.filters[0].r_fast[f.accel_row] == pytest.approx(0.1**2)
+
+
+def test_what_is_far_beyond_its_noise_counts_less_and_the_rest_as_it_is() -> None:
+    _, log = drive()
+    plain, robust = (built("joint", log, robust=size).run(log) for size in (0.0, 6.0))
+    assert np.array_equal(plain.x, robust.x)
+    fast = log.record.fast.copy()
+    fast[3000, FAST.gyro] += 3.0
+    hit = dataclasses.replace(log, record=dataclasses.replace(log.record, fast=fast))
+    ours, theirs = (built("joint", log, robust=size).run(hit) for size in (6.0, 0.0))
+    after = slice(3000, 3300)
+    moved = [np.abs(run.x - plain.x)[after, :2].max(axis=0) for run in (ours, theirs)]
+    assert (moved[0] < 0.1 * moved[1]).all()
+
+
+def test_tyres_that_err_push_by_their_share_of_the_force() -> None:
+    """Q of a step holds (share of |F_f| + |F_r|)^2, and the same at half the wheelbase."""
+    base, log = drive()
+    filter_ = built("joint", log, model_error=0.1, disturbance_time=0.2)
+    filter_.run(log)
+    f, car = filter_.filters[0], base.nominal
+    V, (beta, gamma), delta = f.model_speed, f.x[:2], log.record.fast[-1, FAST.steer]
+    alpha = delta - beta - car.front_arm * gamma / V, car.rear_arm * gamma / V - beta
+    stiffness = 2.0 * car.front_stiffness, 2.0 * car.rear_stiffness
+    push = sum(abs(C * a * s) for C, a, s in zip(stiffness, alpha, f.x[f.tyres :][:2], strict=True))
+    share = 1.0 - math.exp(-2.0 * 0.001 / 0.2)
+    arm = 0.5 * (car.front_arm + car.rear_arm)
+    for i, (sd, size) in enumerate(((50.0, 1.0), (20.0, arm))):
+        wanted = share * (sd**2 + (0.1 * size * push) ** 2)
+        assert f.Q[f.dense + i, f.dense + i] == pytest.approx(wanted, rel=0.05)
+
+
+def test_forces_come_in_shares_of_the_weight() -> None:
+    base, log = drive()
+    filter_ = built("joint", log, force_share=0.05, moment_share=0.01, force_sd=30.0)
+    f, car = filter_.filters[0], base.nominal
+    weight, arm = car.mass * GRAVITY, 0.5 * (car.front_arm + car.rear_arm)
+    share = 1.0 - math.exp(-2.0 * 0.001 / 0.3)
+    assert f.q_known[0] == pytest.approx(share * (30.0**2 + (0.05 * weight) ** 2))
+    assert f.q_known[1] == pytest.approx(share * (20.0**2 + (0.01 * weight * arm) ** 2))
+
+
+def test_a_bias_that_wanders_keeps_its_deviation() -> None:
+    _, log = drive()
+    options: dict[str, Any] = {"fast": ["gyro", "accel_y"], "accel_bias_sd": 0.3}
+    filter_ = built("exact-kf", log, **options, accel_bias_time=5.0)
+    f, i = filter_.filters[0], filter_.names.index("accel_bias")
+    assert f.decay[i] == pytest.approx(math.exp(-0.001 / 5.0))
+    assert f.decay[i] ** 2 * 0.3**2 + f.Q[i, i] == pytest.approx(0.3**2)
+    assert built("exact-kf", log, **options).filters[0].decay[i] == 1.0
+
+
+def test_on_a_strange_car_its_intervals_mean_something() -> None:
+    """CommonRoad's multi-body BMW, told tyres that are 0.7 and 1.3 of its own."""
+    noise = {"accel": 0.6, "gyro": 0.004, "gyro_bias": 0.003, "course": math.radians(0.5) * 25.0}
+    scenario = {"base": "random-steering", "speed": 25.0, "amplitude": 0.005, "noise": noise}
+    env: Any = gym.make("sideslip/Outside-v0", model="multi-body", sensors="gps", scenario=scenario)
+    log = rollout(env, seed=2, options={"duration": 12.0}).log
+    car, beta = env.unwrapped.nominal.scaled(0.7, 1.3), log.truth["beta"]
+    nees = []
+    for name in ("joint-robust", "joint"):
+        known = {"sensors": log.slow, "slow": ["gps"], "course_noise": math.radians(0.5)}
+        run = make_estimator(name, vehicle=car, **known).run(log)
+        nees.append(np.mean(((run.x[:, 0] - beta) / run.std[:, 0])[2000:] ** 2))
+    assert nees[0] < 3.0 and nees[1] > 10.0
