@@ -1,4 +1,4 @@
-"""The command line: list, run, bench, replay, live, lane, train, export, enjoy, tune, calibrate."""
+"""The command line: all commands, and `list`, `run` and `bench` themselves."""
 
 import sys
 from pathlib import Path
@@ -23,6 +23,7 @@ from .lane import lane_command
 from .live import live_command
 from .names import KINDS, complete
 from .output import check_files, options_of, show_episode, write_output, wrote
+from .recorded import Mapping, identify_command, replay_command
 from .train import train_command
 from .tune import tune_app
 
@@ -31,8 +32,10 @@ app.add_typer(tune_app, name="tune")
 app.command("calibrate")(calibrate_command)
 app.command("enjoy")(enjoy_command)
 app.command("export")(export_command)
+app.command("identify")(identify_command)
 app.command("lane")(lane_command)
 app.command("live")(live_command)
+app.command("replay")(replay_command)
 app.command("train")(train_command)
 console = Console()
 
@@ -40,10 +43,6 @@ Quick = Annotated[bool, typer.Option("--quick", help="Few seeds: a first look in
 Json = Annotated[Path | None, typer.Option("--json", help="Write the rows as JSON.")]
 Parquet = Annotated[Path | None, typer.Option("--parquet", help="Write the rows as Parquet.")]
 Html = Annotated[Path | None, typer.Option("--html", help="Write a self-contained report.")]
-Mapping = Annotated[
-    list[str] | None,
-    typer.Option("--map", help="NAME_UNIT=COLUMN of the log (yaw_rate_degps=r); repeatable."),
-]
 Vehicle = Annotated[
     str | None,
     typer.Option(
@@ -228,7 +227,7 @@ def bench(
     check_files(html=html, json=json, parquet=parquet, picture=picture)
     done = []
     if log is not None:  # first: a log that cannot be read should not cost minutes
-        from ..recorded.suite import replay_file
+        from ..recorded.replay_file import replay_file
 
         done.append(replay_file(log, vehicle, mapping=mapping))
     request = Request(quick, jobs, console, episodes, keep, clairvoyant, challenge)
@@ -242,52 +241,3 @@ def bench(
 
         write_picture(picture, done)
         wrote(console, picture)
-
-
-@app.command()
-def replay(
-    log: Annotated[Path, typer.Argument(help="A recorded drive: CSV, Parquet, or NMEA.")],
-    vehicle: Vehicle = None,
-    mapping: Mapping = None,
-    course_rate: Annotated[float, typer.Option(help="Hz of the emulated course.")] = 10.0,
-    course_noise: Annotated[float, typer.Option(help="deg, standard deviation.")] = 0.5,
-    course_delay: Annotated[float, typer.Option(help="s the course arrives late.")] = 0.0,
-    course_bias: Annotated[float, typer.Option(help="deg.")] = 0.0,
-    gyro_bias: Annotated[float, typer.Option(help="deg/s added to the gyro.")] = 0.0,
-    html: Html = None,
-    json: Json = None,
-    parquet: Parquet = None,
-    plot: Annotated[
-        Path | None, typer.Option(help="Draw a receiver's track: PNG, PDF, SVG.")
-    ] = None,
-    kml: Annotated[Path | None, typer.Option(help="Write a receiver's track for a map.")] = None,
-) -> None:
-    """Run the estimators over a recorded drive and score them; over a receiver's log (NMEA), which
-    has no gyro, filter the fixes with noise that follows HDOP or does not."""
-    from ...envs.recordings.sources import is_nmea
-    from ..recorded.suite import replay_file
-
-    check_files(html=html, json=json, parquet=parquet, plot=plot, kml=kml)
-    if is_nmea(log):
-        from ..recorded.receiver_suite import draw, receiver_suite, replay_nmea, write_kml
-
-        received = replay_nmea(log, vehicle, mapping)
-        write_output(console, [receiver_suite(received)], html, json, parquet)
-        for path, write in ((plot, draw), (kml, write_kml)):
-            if path is not None:
-                write(path, received)
-                wrote(console, path)
-        return
-    if plot or kml:
-        raise ValueError(f"{log}: --plot and --kml are for a receiver's log (NMEA)")
-    suite = replay_file(
-        log,
-        vehicle,
-        mapping=mapping,
-        course_rate=course_rate,
-        course_noise_deg=course_noise,
-        delay=course_delay,
-        bias_deg=course_bias,
-        gyro_bias_degps=gyro_bias,
-    )
-    write_output(console, [suite], html, json, parquet)

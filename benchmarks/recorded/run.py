@@ -3,7 +3,7 @@
 import dataclasses
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -25,10 +25,13 @@ ESTIMATORS: dict[str, tuple[str, ...]] = {
     "course-kf": ("gps",),
     "dakf": ("gps",),
     "exact-kf": ("gps", "camera"),
+    "joint": ("gps", "camera"),
 }
 """The estimators of a replay and the slow sensors that serve them, the better one first."""
 
 LEAST_NOISE = 0.01  # deg, of the course, the least that estimators assume
+LEAST_GYRO = 0.002  # rad/s; below, what the model lacks weighs more than the sensor's noise
+_MOTION = ("beta", "gamma", "psi", "y_l", "course", "phi", "phi_rate", "F_d", "N_d")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,8 +41,9 @@ class Settings(Emulation):
     estimators: names in `ESTIMATORS`; None: all. The gyro-only one always runs along.
     q_beta, q_gamma, q_psi: process noise of every estimator in rad2/s, (rad/s)2/s, rad2/s; the
     course noise they assume is `course_noise_deg`. seeds: how many noises of the emulated course,
-    from `seed` on. stiffness_factor: of both tyre stiffnesses of the estimators. figures:
-    whether to draw.
+    from `seed` on. options: more options of estimators, by name. noise: standard deviations by
+    option, which estimators assume. stiffness_factor: of both tyre stiffnesses of the estimators.
+    figures: whether to draw.
 
     Raises ValueError for a value out of range and an unknown estimator.
     """
@@ -52,10 +56,13 @@ class Settings(Emulation):
     seed: int = 0
     stiffness_factor: float = 1.0
     figures: bool = True
+    options: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    noise: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        unknown = [name for name in self.estimators or () if name not in ESTIMATORS]
+        asked = (*(self.estimators or ()), *self.options)
+        unknown = [name for name in asked if name not in ESTIMATORS]
         if unknown:
             raise ValueError(
                 f"unknown estimator {', '.join(unknown)}; known here: {', '.join(ESTIMATORS)}"
@@ -80,13 +87,15 @@ class Result:
     """Errors of one vehicle's estimators on one drive.
 
     squares: by estimator, mean squared error in rad2 of each seed (empty without truth). cost: CPU
-    us per row. traces: sideslip of the first seed in rad, (rows,). remarks: by estimator, why it
+    us per row. traces: sideslip of the first seed in rad, (rows,). found: by estimator, its states
+    that are no motion at the end: (name, value, standard deviation). remarks: by estimator, why it
     was left out or what it cannot see.
     """
 
     squares: dict[str, Array] = field(default_factory=dict)
     cost: dict[str, float] = field(default_factory=dict)
     traces: dict[str, Array] = field(default_factory=dict)
+    found: dict[str, list[tuple[str, float, float]]] = field(default_factory=dict)
     remarks: dict[str, str] = field(default_factory=dict)
 
     def rmse(self, name: str) -> tuple[float, float, float]:
@@ -148,6 +157,10 @@ def run_estimators(drives: Sequence[Log], vehicle: Vehicle, how: Settings) -> Re
             result.cost[name] = min(spent, result.cost.get(name, math.inf))
             beta = estimates.x[:, estimates.names.index("beta")]
             result.traces.setdefault(name, beta)
+            ends = zip(estimates.names, estimates.x[-1], estimates.std[-1], strict=True)
+            result.found[name] = [
+                (state, float(x), float(sd)) for state, x, sd in ends if state not in _MOTION
+            ]
             if truth is not None:
                 squares.append(np.mean((beta - truth)[counts] ** 2))
         if truth is not None:
@@ -162,5 +175,9 @@ def _estimator(name: str, slow: str | None, log: Log, vehicle: Vehicle, how: Set
         options |= {"slow": slow, "q_psi": how.q_psi}
     if slow == "gps":
         options["course_noise"] = math.radians(max(how.course_noise_deg, LEAST_NOISE))
+        options |= {key: how.noise[key] for key in ("course_noise",) if key in how.noise}
+    if "gyro_noise" in how.noise:
+        options["gyro_noise"] = max(how.noise["gyro_noise"], LEAST_GYRO)
+    options |= how.options.get(name, {})
     facts = {"vehicle": vehicle, "sensors": sensors, "dt": log.record.dt}
     return quietly(make_estimator, name, **facts, **options)  # the result names what is unseen

@@ -3,18 +3,13 @@
 import json
 import math
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ... import __version__
 from ...envs.record import Log
-from ...envs.recordings.columns import parse_mapping
-from ...envs.recordings.log_file import read_log
-from ...envs.recordings.sources import is_nmea
 from ...envs.vehicle.vehicle import Vehicle
-from ...envs.vehicle.vehicles import VehicleSource, vehicle_from
 from ..harness.drives import SETTLED
 from ..harness.results import Row, Suite, Table
 from ..harness.stats import Estimate
@@ -22,11 +17,9 @@ from ..harness.verdict import leader, verdict
 from .emulate import path
 from .run import ESTIMATORS, GYRO_ONLY, Result, Settings, drives_of, run_estimators
 
-__all__ = ["Settings", "corners", "replay", "replay_file"]
+__all__ = ["Settings", "corners", "replay"]
 
 CORNERS = ((0.7, 0.7), (0.7, 1.3), (1.3, 0.7), (1.3, 1.3))
-FITTED, NOMINAL = "ferrari-250lm-fitted", "ferrari-250lm-nominal"
-FACTOR = 0.7  # of the fitted tyres, where no vehicle is named
 DEGREES = 180.0 / math.pi
 WINDOW = 10.0  # s to either side of the largest sideslip
 HIDDEN = "Names that are pale in the legend are hidden; a click shows them."
@@ -36,9 +29,9 @@ def replay(log: Log, vehicle: Vehicle, **settings: Any) -> Suite:
     """Run the estimators over a recorded drive, designed from this vehicle, and score them.
 
     settings: of `Settings` (course_rate, course_noise_deg, delay, bias_deg, gyro_bias_degps,
-    estimators, q_beta, q_gamma, q_psi, seeds, seed, stiffness_factor, figures). A log that carries
-    slow sensors is replayed with those; else a GPS course is emulated where the log knows the true
-    sideslip; else estimators that need a slow sensor are left out, and the table notes it. Without
+    estimators, options, noise, q_beta, q_gamma, q_psi, seeds, seed, stiffness_factor, figures). A
+    log that carries slow sensors is replayed with those; else a GPS course is emulated where the
+    log knows the true sideslip; else estimators that need one are left out, and noted. Without
     truth nothing is scored, but drawn.
 
     Rows: rmse (rad, from 2 s on), ratio (over gyro-only) and us_per_tick; value is the median, low
@@ -53,6 +46,8 @@ def replay(log: Log, vehicle: Vehicle, **settings: Any) -> Suite:
     suite = Suite("replay", f"A recorded drive: {log.name}", _text(log, drives, car, how))
     suite.rows = _rows(result, log.name, car, how)
     suite.tables = [_table(result, log.name, car, len(drives))]
+    if any(result.found.values()):
+        suite.tables.append(_parameters(result, log.name))
     suite.verdict = answer(result, "gps" in drives[0].slow and "gps" not in log.slow)
     if how.figures:
         suite.figures = _figures(result, log)
@@ -107,44 +102,6 @@ def corners(log: Log, vehicle: Vehicle, **settings: Any) -> Suite:
     cells = [[name, *(_error(result, name) for result in results.values())] for name in names]
     note = "The same process noise in all corners; medians over the noises."
     suite.tables = [Table(title, ("estimator", *results), cells, note)]
-    return suite
-
-
-def replay_file(
-    log: str | Path,
-    vehicle: VehicleSource | None = None,
-    *,
-    mapping: Sequence[str] | None = None,
-    **settings: Any,
-) -> Suite:
-    """Read a drive and its vehicle, replay it, and where it has truth the vehicle's corners too; a
-    receiver's log (NMEA) is replayed as `replay_nmea` does.
-
-    vehicle: of `vehicle_from`: a name or a TOML or JSON file. None: the Ferrari
-    250 LM of the Stanford log, with the fitted tyres x 0.7, and the corners of the nominal one.
-    mapping: texts such as "steer_rad=Delta". settings: of `replay`. Raises what `read_log`,
-    `vehicle_from` and `replay` do.
-    """
-    if is_nmea(log):
-        from .receiver_suite import receiver_suite, replay_nmea
-
-        return receiver_suite(replay_nmea(log, vehicle, mapping))
-    drive = read_log(log, parse_mapping(mapping or ()))
-    if vehicle is None:
-        fitted, nominal = vehicle_from(FITTED), vehicle_from(NOMINAL)
-        suite = replay(drive, fitted, **{"stiffness_factor": FACTOR} | settings)
-        suite.text += (
-            "\n\nNo vehicle was named, so the estimators assume the Ferrari 250 LM of the "
-            f"Stanford log, fitted tyres x {FACTOR}. For another car name its file: "
-            "`--vehicle FILE`."
-        )
-    else:
-        nominal = vehicle_from(vehicle)
-        suite = replay(drive, nominal, **settings)
-    if "beta" in drive.truth:
-        wrong = corners(drive, nominal, **settings)
-        suite.rows += wrong.rows
-        suite.tables += wrong.tables
     return suite
 
 
@@ -213,6 +170,18 @@ def _table(result: Result, name: str, car: Vehicle, noises: int) -> Table:
         cells.append([label, f"{value:.3f}", among, f"{ratio:.2f}", f"{cost:.3f}"])
     title = f"{name}, {car.name}: error of the sideslip angle (median of {noises} noises)"
     return Table(title, header, cells, note)
+
+
+def _parameters(result: Result, name: str) -> Table:
+    """What estimators found of the car and its sensors, at the end of the drive."""
+    cells = [
+        [label, state, f"{value:.4g}", f"{sd:.2g}"]
+        for label, states in result.found.items()
+        for state, value, sd in states
+    ]
+    note = "At the end of the drive, SI units; tyres are factors on the assumed stiffness."
+    header = ("estimator", "state", "value", "deviation")
+    return Table(f"{name}: what the estimators found", header, cells, note)
 
 
 def _figures(result: Result, log: Log) -> list[tuple[str, Any, str]]:

@@ -133,12 +133,13 @@ def read_table(path: Path) -> "pd.DataFrame":
 
 
 def read_quantities(
-    path: Path, mapping: Mapping[str, str], needed: Sequence[str], gaps: Collection[str]
+    path: Path, mapping: Mapping[str, str], needed: Sequence[str], gaps: Collection[str] | None
 ) -> dict[str, Array]:
     """The file's known quantities in SI units, (n,) each; other columns are ignored.
 
     mapping: our column name, unit included, to the file's. needed: quantities that must be there.
-    gaps: quantities that may hold NaN; any other is complete. An empty column counts as absent.
+    gaps: quantities that may hold NaN, any other is complete; None: all but the time. An empty
+    column counts as absent.
 
     Raises what `read_table` does, and ValueError for a missing column, one given twice, a value
     that is no finite number, NaN, and fewer than two rows. Rows count from 1 below the header.
@@ -158,7 +159,7 @@ def read_quantities(
             unknown = np.isnan(column)
             if unknown.all() and quantity not in needed:
                 continue
-            if unknown.any() and quantity not in gaps:
+            if unknown.any() and (quantity not in gaps if gaps is not None else quantity == "time"):
                 row = int(np.argmax(unknown)) + 1
                 raise ValueError(f"column {name!r} has no value (NaN) in row {row}")
             values[quantity] = factor * column

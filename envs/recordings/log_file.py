@@ -30,7 +30,9 @@ _SLOW = {  # the values of a packet, as in SLOW_VALUES; the first tells where th
     "camera": ("camera_psi", "camera_y_l"),
     "gps": ("course", "gps_speed", "gps_x", "gps_y", "gps_hdop", "gps_satellites"),
 }
-_GAPS = {"sideslip", "speed_y", *_SLOW["camera"], *_SLOW["gps"]}
+SLOW_QUANTITIES = {*_SLOW["camera"], *_SLOW["gps"]}
+GAPS = {"sideslip", "speed_y", *SLOW_QUANTITIES}
+"""Quantities that need not be known in every row."""
 _GAP = 1.5  # steps of time
 _STILL = 1e-3  # of a step of time
 _DRIFT = 1e-4  # of the log's length
@@ -59,11 +61,16 @@ def read_log(path: str | Path, mapping: Mapping[str, str] | None = None) -> Log:
     below the header.
     """
     source = Path(path)
-    values = read_quantities(source, mapping or {}, NEEDED, _GAPS)
+    values = read_quantities(source, mapping or {}, NEEDED, GAPS)
     try:
-        first, dt = clock_of(values["time"])
+        return log_of(values, source)
     except ValueError as error:
         raise ValueError(f"{source}: {error}") from None
+
+
+def log_of(values: dict[str, Array], source: Path) -> Log:
+    """The log of quantities in SI units, (n,) each; ValueError for a bad clock."""
+    first, dt = clock_of(values["time"])
     fast, present = _fast(values)
     packets, slow = _slow(values, first, dt)
     record = Record(fast, packets, first, dt, present)

@@ -15,6 +15,9 @@ VehicleSource = str | os.PathLike[str] | Mapping[str, Any] | Vehicle
 
 _LATERAL = ("mass", "yaw_inertia", "front_arm", "rear_arm", "front_stiffness", "rear_stiffness")
 _STIFFNESS = ("front_stiffness", "rear_stiffness")
+WIRES = ("steering", "latency", "noise")
+"""Tables that a vehicle's file may hold beside the car: what `sideslip identify` found of its
+wires, which `sideslip replay` applies and everybody else leaves alone."""
 _CONVENTIONS = {"_per_tyre": 1.0, "_axle": 0.5}  # tyres' share of the number
 _FIELDS = [entry.name for entry in dataclasses.fields(Vehicle)]
 
@@ -50,6 +53,7 @@ def vehicle_from(source: VehicleSource) -> Vehicle:
 
 def _vehicle_in(path: Path) -> Vehicle:
     values = read_document(path, "vehicle")
+    values = {name: value for name, value in values.items() if name not in WIRES}
     try:
         for name in _STIFFNESS:
             if name in values:

@@ -25,7 +25,7 @@ from sideslip.benchmarks.recorded.receiver_suite import (
     replay_nmea,
     write_kml,
 )
-from sideslip.benchmarks.recorded.suite import replay_file
+from sideslip.benchmarks.recorded.replay_file import replay_file
 from sideslip.envs.recordings.geodesy import degrees
 from sideslip.envs.recordings.nmea import Epoch
 from tests.envs.recordings.receiver import ABSENT, REASON, RECORDINGS, sentence

@@ -10,8 +10,9 @@ import pytest
 
 from sideslip.benchmarks.harness.results import Suite, read_json, write_json
 from sideslip.benchmarks.recorded.emulate import Emulation, heading
+from sideslip.benchmarks.recorded.replay_file import replay_file
 from sideslip.benchmarks.recorded.run import ESTIMATORS, GYRO_ONLY
-from sideslip.benchmarks.recorded.suite import corners, replay, replay_file
+from sideslip.benchmarks.recorded.suite import corners, replay
 from sideslip.envs.record import Log
 from sideslip.envs.recordings.log_file import read_log
 from sideslip.envs.vehicle.vehicle import PASSENGER_CAR
@@ -99,7 +100,11 @@ def test_all_estimators_are_scored_tabled_and_drawn(log: Log) -> None:
     suite = replay(log, PASSENGER_CAR, stiffness_factor=0.7, seeds=2)
     assert suite.name == "replay"
     assert set(values(suite, "rmse")) == set(ESTIMATORS) == set(values(suite, "us_per_tick"))
-    (table,) = suite.tables
+    table, found = suite.tables
+    assert [line[:2] for line in found.cells if line[0] == "joint"] == [
+        ["joint", "front_tyres"],
+        ["joint", "rear_tyres"],
+    ]
     assert {line[0] for line in table.cells} == set(ESTIMATORS)
     numbers = [float(line[1]) for line in table.cells]
     assert numbers == sorted(numbers)

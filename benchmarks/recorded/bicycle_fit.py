@@ -1,0 +1,230 @@
+"""The plant's parameters from recorded drives: least squares over windows, jackknife intervals.
+
+In a window the plant's own single-track model drives at the logged speed with the logged steering;
+its first second, in which the unknown start is forgotten, does not count.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from scipy.ndimage import uniform_filter1d
+from scipy.optimize import least_squares
+from scipy.stats import t as student
+
+from ...envs.backend.decorators import jit
+from ...envs.record import FAST, Array, Log
+from ...envs.vehicle.dynamics import Car, Motion, Push, Road, derivative, frame_of, rk4
+from ...envs.vehicle.tyres import LINEAR, TYRE_LAWS, Inputs, load_of
+from ...envs.vehicle.vehicle import GRAVITY, Vehicle
+from .emulate import ground_speed
+
+STEP, SMOOTH = 0.01, 0.03  # s: of the fit's grid, of the mean over a log's rows
+BURN, WINDOW, MARGIN = 1.0, 4.0, 0.3  # s: forgets the start, counts, lets channels be late
+LEAST_SPEED = 4.0  # m/s, in a window
+STRETCHES = 40  # at most, of the log, which the intervals take for independent
+
+
+class Theta(NamedTuple):
+    """What is fitted; the first three are logarithms of factors on the stated car."""
+
+    front: float = 0.0
+    rear: float = 0.0
+    inertia: float = 0.0
+    gain: float = 1.0  # rad at the wheels per unit of logged steering
+    offset: float = 0.0  # rad at the wheels, added
+    gyro_bias: float = 0.0  # rad/s
+    accel_bias: float = 0.0  # m/s2
+    accel_gain: float = 1.0  # above 1 where the body rolls more than the stated one
+    steer_delay: float = 0.0  # s that the logged steering is later than the gyro
+    accel_delay: float = 0.0  # s
+
+
+_STEPS = np.array([1e-3, 1e-3, 1e-3, 1e-3, 1e-4, 1e-4, 1e-3, 1e-3, 4e-3, 4e-3])  # of slopes
+_LOW = np.array([-2.0, -2.0, -2.0, -np.inf, -0.5, -0.5, -5.0, 0.3, -MARGIN, -MARGIN])
+_HIGH = np.array([2.0, 2.0, 2.0, np.inf, 0.5, 0.5, 5.0, 3.0, MARGIN, MARGIN])
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Drives on the fit's grid and where windows start on it.
+
+    rows: (6, n), smoothed gyro, accel_y, speed, steering, left and right torque; the last three
+    acted until their row. starts: (count,). stretch: (count,), of which stretch of the log each
+    window is. dt: s. accel: whether the acceleration was logged. tyres: of `TYRE_LAWS`;
+    the body rolls where they are not linear.
+    """
+
+    rows: Array
+    starts: npt.NDArray[np.int64]
+    stretch: npt.NDArray[np.int64]
+    dt: float
+    accel: bool
+    tyres: str = "linear"
+
+    @property
+    def counted(self) -> npt.NDArray[np.int64]:
+        """(count, rows): places of the rows that count."""
+        first, count = round(BURN / self.dt), round(WINDOW / self.dt)
+        return self.starts[:, None] + np.arange(first + 1, first + count + 1)
+
+    def some(self, wanted: npt.NDArray[np.bool_]) -> "Windows":
+        """Those of a mask."""
+        return replace(self, starts=self.starts[wanted], stretch=self.stretch[wanted])
+
+
+def windows_of(logs: Sequence[Log], left_out: Sequence[npt.NDArray[np.bool_]]) -> Windows:
+    """Windows of drives of one dt; left_out: of each drive, the rows that are not to be used."""
+    dt, first = logs[0].record.dt, 0
+    every, width = max(round(STEP / dt), 1), max(round(SMOOTH / dt), 1)
+    before, after = (round(s / (every * dt)) for s in (MARGIN, BURN + WINDOW + 2.0 * MARGIN))
+    pieces, starts = [], []
+    for log, out in zip(logs, left_out, strict=True):
+        fast = log.record.fast.T
+        rows = np.stack([
+            fast[FAST.gyro], fast[FAST.accel_y], ground_speed(log), fast[FAST.steer],
+            fast[FAST.torque_left], fast[FAST.torque_right],
+        ])  # fmt: skip
+        rows = uniform_filter1d(rows, width, axis=1, mode="nearest")
+        if every > 1:  # an input acts for the whole step up to its row
+            rows[3:] = uniform_filter1d(rows[3:], every, axis=1, origin=(every - 1) // 2)
+        bad = np.maximum.reduceat(out, np.arange(0, len(out), every))
+        rows = rows[:, ::every]
+        for start in range(before, rows.shape[1] - after, round(WINDOW / (every * dt))):
+            piece = slice(start, start + after)
+            if not bad[piece].any() and rows[2, piece].min() >= LEAST_SPEED:
+                starts.append(first + start)
+        first += rows.shape[1]
+        pieces.append(rows)
+    count = len(starts)
+    stretch = np.arange(count) * min(STRETCHES, count) // max(count, 1)
+    accel = all("accel_y" in log.record.present for log in logs)
+    rows = np.ascontiguousarray(np.concatenate(pieces, axis=1))
+    return Windows(rows, np.array(starts, np.int64), stretch, every * dt, accel)
+
+
+@jit
+def _load(rows: Any, i: Any, place: Any, theta: Any, car: Any) -> Any:
+    """The plant's load in row i with the steering logged at a place between the rows."""
+    j = min(max(int(np.floor(place)), 0), rows.shape[1] - 2)
+    logged = rows[3, j] + (place - j) * (rows[3, j + 1] - rows[3, j])
+    return load_of(Inputs(theta[3] * logged + theta[4], rows[4, i], rows[5, i]), car, 0, 1)
+
+
+@jit
+def _drive(
+    rows: Any, starts: Any, theta: Any, fixed: Any, law: int, roll: int, h: float, out: Any
+) -> None:
+    """Fill out (2, windows, rows) with yaw rate and lateral specific force by the plant."""
+    m, l_f, l_r, mu = fixed[0], fixed[2], fixed[3], fixed[9]
+    car = Car(
+        m, fixed[1] * np.exp(theta[2]), l_f, l_r, fixed[4] * np.exp(theta[0]),
+        fixed[5] * np.exp(theta[1]), fixed[6], fixed[7], fixed[8], 1.0, mu, 0.0,
+        fixed[10], fixed[11], fixed[12], fixed[13], fixed[14], 0.0, 0.0, mu, 0.0, 0.0,
+    )  # fmt: skip
+    road, push = Road(0.0, 0.0, 1.0, 0.0, 0.0, 0.0), Push(0.0, 0.0, 0.0)
+    for w in range(len(starts)):
+        at = starts[w]
+        V, gamma = rows[2, at], rows[0, at] - theta[5]
+        v_y = l_r * gamma - m * l_f * V * V * gamma / (2.0 * car.C_r * (l_f + l_r))
+        phi = phi_dot = 0.0
+        after = _load(rows, at, at + 0.5 + theta[8] / h, theta, car)
+        for k in range(out.shape[2]):
+            i = at + k + 1
+            V = 0.5 * (rows[2, i - 1] + rows[2, i])
+            late = i + theta[8] / h  # a row's steering is that of the middle of its step
+            before, after = after, _load(rows, i, late + 0.5, theta, car)
+            loads = (before, _load(rows, i, late, theta, car), after)
+            motion = Motion(V, v_y, gamma, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, phi, phi_dot)
+            motion = rk4(motion, loads, push, car, road, h, 0, law, roll)
+            v_y, gamma, phi, phi_dot = motion.v_y, motion.gamma, motion.phi, motion.phi_dot
+            motion = Motion(V, v_y, gamma, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, phi, phi_dot)
+            slope = derivative(motion, after, push, car, road, frame_of(motion), 0, law, roll)
+            out[0, w, k], out[1, w, k] = gamma, slope.v_y + V * gamma + GRAVITY * phi
+
+
+def residual(car: Vehicle, theta: Theta, w: Windows) -> Array:
+    """(windows, channels, rows): measured less predicted yaw rate and, if logged, acceleration."""
+    first, count = round(BURN / w.dt), round(WINDOW / w.dt)
+    out = np.empty((2, len(w.starts), first + count + round(MARGIN / w.dt)))
+    fixed = np.array([
+        car.mass, car.yaw_inertia, car.front_arm, car.rear_arm, car.front_stiffness,
+        car.rear_stiffness, car.front_track, car.rear_track, car.wheel_radius, car.friction,
+        car.roll_moment_arm, car.roll_inertia, car.roll_stiffness, car.roll_damping,
+        car.gravity_height,
+    ])  # fmt: skip
+    law = TYRE_LAWS.index(w.tyres)
+    _drive(w.rows, w.starts, np.array(theta), fixed, law, int(law != LINEAR), w.dt, out)
+    late = np.arange(first, first + count) - theta.accel_delay / w.dt
+    below = np.minimum(late.astype(np.int64), out.shape[2] - 2)
+    felt = out[1][:, below] + (late - below) * (out[1][:, below + 1] - out[1][:, below])
+    rate = w.rows[0][w.counted] - out[0, :, first : first + count] - theta.gyro_bias
+    felt = w.rows[1][w.counted] - theta.accel_gain * felt - theta.accel_bias
+    return np.stack((rate, felt) if w.accel else (rate,), axis=1)
+
+
+def errors(car: Vehicle, theta: Theta, w: Windows) -> Array:
+    """RMS of the residual of each channel, in rad/s and m/s2."""
+    return np.asarray(np.sqrt(np.mean(residual(car, theta, w) ** 2, axis=(0, 2))))
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A fitted `Theta`, its free ones, and every stretch's normal equations there.
+
+    scale: of the channels' residuals, by which the fit is weighted. H (stretches, n, n), g
+    (stretches, n): curvature and slope of each stretch's squares by the n free ones.
+    """
+
+    theta: Theta
+    free: tuple[str, ...]
+    scale: Array
+    H: Array
+    g: Array
+
+    def without(self, gone: npt.NDArray[np.bool_]) -> Array:
+        """(n,) by how much the free ones move, to first order, when stretches are left out."""
+        rest, slope = self.H[~gone].sum(axis=0), self.g[~gone].sum(axis=0)
+        return np.asarray(-np.linalg.lstsq(rest, slope, rcond=1e-14)[0])
+
+    def half(self, name: str) -> float:
+        """Half of the 95 % interval, by a jackknife over stretches; infinite if it is not free."""
+        count = len(self.g)
+        if name not in self.free or count < 2:
+            return float("inf")
+        moves = np.array([self.without(one) for one in np.eye(count, dtype=bool)])
+        variance = (count - 1) / count * np.sum(moves[:, self.free.index(name)] ** 2)
+        return float(student.ppf(0.975, count - 1) * np.sqrt(variance))
+
+
+def fit(
+    car: Vehicle, w: Windows, start: Theta, free: Sequence[str], scale: Array | None = None
+) -> Fit:
+    """Least squares of the `free` ones of `start`; scale: of the channels, None: found here."""
+    at = [Theta._fields.index(name) for name in free]
+    low, high, steps = _LOW[at], _HIGH[at], (_STEPS * (1, 1, 1, abs(start.gain), *6 * (1,)))[at]
+
+    def whole(x: Array) -> Theta:
+        return start._replace(**dict(zip(free, x.tolist(), strict=True)))
+
+    def weighted(x: Array, scale: Array) -> Array:
+        return np.asarray((residual(car, whole(x), w) / scale[:, None]).ravel())
+
+    def jacobian(x: Array, scale: Array) -> Array:
+        ahead = np.array([weighted(each, scale) for each in x + np.diag(steps)])
+        return np.asarray(((ahead - weighted(x, scale)) / steps[:, None]).T)
+
+    x = np.clip(np.array(start)[at], low, high)
+    for most in (60,) if scale is not None else (10, 10, 60):
+        now = np.maximum(errors(car, whole(x), w), 1e-9) if scale is None else scale
+        found = least_squares(
+            weighted, x, jacobian, (low, high), x_scale=10.0 * steps, args=(now,), max_nfev=most,
+            xtol=1e-6, ftol=1e-7,
+        )  # fmt: skip
+        x = found.x
+    J, r = found.jac.reshape(len(w.starts), -1, len(at)), found.fun.reshape(len(w.starts), -1)
+    of = (w.stretch[:, None] == np.unique(w.stretch)).astype(float)  # (windows, stretches)
+    H = np.einsum("ws,wki,wkj->sij", of, J, J, optimize=True)
+    return Fit(whole(x), tuple(free), now, H, np.einsum("ws,wki,wk->si", of, J, r, optimize=True))

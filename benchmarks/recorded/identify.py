@@ -1,0 +1,285 @@
+"""A car, its steering and its sensors from recorded drives, and what the drives cannot show."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from ...envs.record import Array, Log
+from ...envs.vehicle.vehicle import Vehicle
+from ...estimators.make import make_estimator
+from ..harness.results import Suite, Table
+from ..harness.verdict import verdict
+from .bicycle_fit import Fit, Theta, Windows, errors, fit, residual, windows_of
+from .checks import LEAST_RELATED, moving, saturated, steering_gain, swapped
+from .noises import LATE_WITHIN, WIDE, Finding, sensor_findings
+from .run import GYRO_ONLY
+from .wires import Wires, corrected
+
+TYRES = ("linear", "fiala")
+LEAST_WINDOWS = 6
+LEAST_TURNING = 0.3  # m/s2, RMS of speed x yaw rate
+MILD = 5.0  # m/s2; beyond, a saturating axle looks like another steering ratio
+NEAR = 1.6  # within this factor of the stated ratio, that one may be right
+PAYS = 0.98  # of the error on held-out stretches, at most, where a latency is applied
+FOLDS = 4
+_MOST = Theta(0.3, 0.3, 0.4, 0.2, 0.0175, 0.0087, 0.5, 0.2, LATE_WITHIN, LATE_WITHIN)
+"""Half of the widest interval with which a number is told; of the gain its share."""
+_DELAYS = {"steer_delay": "steer", "accel_delay": "accel_y"}
+_OF_CAR = {"front": "front_stiffness", "rear": "rear_stiffness", "inertia": "yaw_inertia"}
+_NOTE = (
+    "Intervals by a jackknife over 40 stretches of the log (20 for sensors). What this log does "
+    "not tell stays as stated. Latencies of steering and acceleration are applied only where they "
+    "lower the error on stretches that the fit has not seen: the lag of tyres looks like one."
+)
+
+
+@dataclass
+class Identified:
+    """What a log has shown.
+
+    car, wires: the stated ones with the numbers that were found. rates: RMS in rad/s of what the
+    stated car, the found one, and the found one on stretches that its fit had not seen, leave of
+    the yaw rate over 4 s. slips: RMS beside the log's own sideslip in rad, stated and found.
+    reason: why nothing was found of the car, "" otherwise.
+    """
+
+    car: Vehicle
+    wires: Wires
+    findings: list[Finding] = field(default_factory=list)
+    rates: tuple[float, ...] = ()
+    slips: tuple[float, ...] = ()
+    reason: str = ""
+    remarks: list[str] = field(default_factory=list)
+
+
+def identify(
+    logs: Sequence[Log], car: Vehicle, wires: Wires | None = None, tyres: str | None = None
+) -> Identified:
+    """Fit the car to the parts of a log, and the noise of its sensors.
+
+    car, wires: the stated ones, where the search starts. tyres: "linear", as stiff as the log's
+    accelerations have them, without roll, or "fiala", as stiff as at small slips, with the stated
+    friction and roll; None: what errs less on held-out stretches. Raises ValueError for swapped
+    columns.
+    """
+    if tyres not in (None, *TYRES):
+        raise ValueError(f"tyres are {' or '.join(TYRES)}, got {tyres!r}")
+    if what := swapped(logs):
+        raise ValueError(f"{logs[0].name}: columns are swapped, {what}")
+    car.check_roll()
+    stated = wires or Wires()
+    found = Identified(car, stated)
+    w = windows_of(logs, [saturated(log) for log in logs])
+    gain, related = steering_gain(logs, car)
+    if reason := _reason(w, related):
+        found.reason = reason
+        found.findings = [
+            Finding(label, value, unit=unit, remark=reason)
+            for _, label, value, unit in _rows(car, stated)
+        ]
+    else:
+        near = 1.0 / NEAR < gain / stated.gain < NEAR
+        start = Theta(gain=stated.gain if near else gain, offset=stated.offset)
+        _fit_car(found, w, start, near, TYRES if tyres is None else (tyres,))
+    slips = _slips(logs, found.car, found.wires)
+    both = (_slips(logs, car, stated), slips)
+    found.slips = tuple(_beside_truth(logs, each) for each in both)
+    findings, noise, latency = sensor_findings(logs, slips)
+    found.findings += findings
+    found.wires = found.wires._replace(noise=noise, latency={**found.wires.latency, **latency})
+    return found
+
+
+def _reason(w: Windows, related: float) -> str:
+    """Why a log shows nothing of a car, "" if it may."""
+    if len(w.starts) < LEAST_WINDOWS:
+        return f"{len(w.starts)} of {LEAST_WINDOWS} windows of 5 s are fast enough and whole"
+    turns = w.rows[2][w.counted] * w.rows[0][w.counted]
+    if np.std(turns) < LEAST_TURNING:
+        return f"no excitation, speed x yaw rate has {np.std(turns):.2g} m/s2 RMS"
+    if abs(related) < LEAST_RELATED:
+        return f"steering and yaw rate are unrelated (correlation {related:.2f})"
+    return ""
+
+
+def _rows(car: Vehicle, wires: Wires) -> list[tuple[str, str, float, str]]:
+    """(name in `Theta`, label, stated value, unit) of what the car's fit tells."""
+    return [
+        ("front", "front_stiffness_axle", 2.0 * car.front_stiffness, "N/rad"),
+        ("rear", "rear_stiffness_axle", 2.0 * car.rear_stiffness, "N/rad"),
+        ("inertia", "yaw_inertia", car.yaw_inertia, "kg m2"),
+        ("gain", "steering ratio", wires.ratio, ""),
+        ("gain", "steering sign", float(wires.sign), ""),
+        ("offset", "steering offset", math.degrees(wires.offset), "deg"),
+        ("gyro_bias", "gyro bias", 0.0, "deg/s"),
+        ("accel_bias", "accel_y bias", 0.0, "m/s2"),
+    ]
+
+
+def _vagueness(fitted: Fit, name: str) -> float:
+    """Half of the interval over the most with which the number is told."""
+    share = abs(fitted.theta.gain) if name == "gain" else 1.0
+    return fitted.half(name) / (share * float(getattr(_MOST, name)))
+
+
+def _settled(car: Vehicle, w: Windows, start: Theta, free: Sequence[str]) -> Fit:
+    """The fit of those that the windows determine: the vaguest goes back to its start, one by one,
+    until none is left that is too vague."""
+    now = fit(car, w, start, free)
+    while len(now.free) > 1:
+        vague = {name: _vagueness(now, name) for name in now.free}
+        worst = max(vague, key=lambda name: vague[name])
+        if vague[worst] <= 1.0:
+            break
+        back = now.theta._replace(**{worst: getattr(start, worst)})
+        now = fit(car, w, back, [name for name in now.free if name != worst], now.scale)
+    return now
+
+
+def _fit_car(found: Identified, w: Windows, start: Theta, near: bool, laws: Sequence[str]) -> None:
+    """Fill in all that the car's motion tells. near: whether the stated ratio may be right."""
+    car, stated = found.car, found.wires
+    hard = float(np.percentile(np.abs(w.rows[2] * w.rows[0])[w.counted], 95))
+    held = ["gain"] if near and hard > MILD else []
+    free = [
+        name for name in Theta._fields[:8]
+        if name not in held and (w.accel or not name.startswith("accel"))
+    ]  # fmt: skip
+    tried = []
+    for law in laws:
+        windows = replace(w, tyres=law)
+        base = _settled(car, windows, start, free)
+        tried.append((_held_out(car, windows, base)[0] * float(base.scale[0]), windows, base))
+    _, w, base = min(tried, key=lambda each: each[0])
+    rows, best, free_too = _with_latency(car, w, base)
+    found.findings = _car_findings(car, stated, best, free_too, held, hard) + rows
+    theta, gain = best.theta, best.theta.gain
+    values = {
+        key: getattr(car, key) * math.exp(getattr(theta, name)) for name, key in _OF_CAR.items()
+    }
+    found.car = car.replace(**values, name=f"{car.name}-identified")
+    late = {channel: getattr(theta, name) for name, channel in _DELAYS.items() if name in best.free}
+    found.wires = Wires(1.0 / abs(gain), 1 if gain > 0.0 else -1, theta.offset, late)
+    first = Theta(gain=stated.gain, offset=stated.offset)
+    rates = [float(errors(car, each, w)[0]) for each in (first, theta)]
+    found.rates = (*rates, _held_out(car, w, best)[1])
+    found.remarks.append(
+        f"{len(w.starts)} windows of 4 s, of whose rows 95 % turn with less than {hard:.1f} m/s2; "
+        f"{w.tyres} tyres" + (" err least on held-out stretches" if len(laws) > 1 else "")
+        + (", whose stiffness is that of this drive" if w.tyres == "linear" else "")
+    )  # fmt: skip
+
+
+def _with_latency(car: Vehicle, w: Windows, base: Fit) -> tuple[list[Finding], Fit, Fit]:
+    """Findings of the latencies of steering and accelerometer, the fit with those that pay, and
+    the one in which all are free."""
+    names = tuple(_DELAYS)[: 2 if w.accel else 1]
+    usual, pays, rows = _held_out(car, w, base)[0], [], []
+    free = fit(car, w, base.theta, (*base.free, *names), base.scale)
+    for name in names:
+        half, value = free.half(name), float(getattr(free.theta, name))
+        told, remark = half < LATE_WITHIN, "within its interval of 0"
+        if told and abs(value) > half:
+            alone = fit(car, w, base.theta, (*base.free, name), base.scale)
+            share = _held_out(car, w, alone)[0] / usual
+            pays += [name] if share < PAYS else []
+            remark = f"{'' if name in pays else 'not '}applied: error held out x {share:.3f}"
+        label = f"latency of {_DELAYS[name]}"
+        rows.append(Finding(label, 0.0, value, half, "s", told, remark if told else WIDE))
+    best = fit(car, w, base.theta, (*base.free, *pays), base.scale) if pays else base
+    return rows, best, free
+
+
+def _held_out(car: Vehicle, w: Windows, best: Fit) -> tuple[float, float]:
+    """(weighted RMS, RMS of yaw rate in rad/s) on each fold of stretches, of the fit to others."""
+    squares, labels = [], np.unique(w.stretch)
+    for fold in range(FOLDS):
+        moves = best.without(labels % FOLDS == fold)
+        moved = {n: getattr(best.theta, n) + m for n, m in zip(best.free, moves, strict=True)}
+        mine = w.some(w.stretch % FOLDS == fold)
+        squares.append(np.mean(residual(car, best.theta._replace(**moved), mine) ** 2, axis=2))
+    per = np.concatenate(squares)
+    return float(np.sqrt(np.mean(per / best.scale**2))), float(np.sqrt(np.mean(per[:, 0])))
+
+
+def _car_findings(
+    car: Vehicle, stated: Wires, best: Fit, free: Fit, held: Sequence[str], hard: float
+) -> list[Finding]:
+    """The rows of `_rows` with what was found. An interval also has by how much its number moves
+    where the latencies are free."""
+    found = []
+    for name, label, value, unit in _rows(car, stated):
+        at = float(getattr(best.theta, name))
+        half = math.hypot(best.half(name), float(getattr(free.theta, name)) - at)
+        told = name in best.free
+        remark = "" if told else WIDE
+        if name in _OF_CAR:
+            at, half = value * math.exp(at), value * math.exp(at) * half
+        elif label == "steering sign":
+            told, at, half, remark = True, math.copysign(1.0, at), math.inf, ""
+        elif name == "gain":
+            at, half = 1.0 / abs(at), half / at**2
+            if held:
+                remark = f"at {hard:.0f} m/s2 a saturating axle would look like another ratio"
+        elif unit.startswith("deg"):
+            at, half = math.degrees(at), math.degrees(half)
+        found.append(Finding(label, value, at, half, unit, told, remark))
+    return found
+
+
+def _slips(logs: Sequence[Log], car: Vehicle, wires: Wires) -> list[Array]:
+    """The sideslip angle of each log by the gyro alone, rad."""
+    dt = logs[0].record.dt
+    estimator = make_estimator(GYRO_ONLY, vehicle=car, dt=dt, q_beta=1e-3, q_gamma=0.1)
+    steered = wires._replace(latency={})
+    return [estimator.run(corrected(log, steered))["beta"] for log in logs]
+
+
+def _beside_truth(logs: Sequence[Log], slips: Sequence[Array]) -> float:
+    """RMS of sideslip beside the logs' own, in rad; NaN where they have none."""
+    errors = [np.zeros(0)]
+    for log, slip in zip(logs, slips, strict=True):
+        if "beta" in log.truth:
+            errors.append((slip - log.truth["beta"])[moving(log)])
+    together = np.concatenate(errors)
+    together = together[np.isfinite(together)]
+    return float(np.sqrt(np.mean(together**2))) if len(together) else math.nan
+
+
+def suite_of(found: Identified, name: str) -> Suite:
+    """The findings as a table with a verdict."""
+    suite = Suite("identify", f"The car of a recorded drive: {name}", "; ".join(found.remarks))
+    missing = [each.name for each in found.findings if not each.told]
+    if found.reason:
+        answer = f"This log shows nothing of the car: {found.reason}. It stays as stated."
+    else:
+        rates = "{:.2f} deg/s of the yaw rate, the found one {:.2f} ({:.2f} held out)".format(
+            *map(math.degrees, found.rates)
+        )
+        answer = f"The stated car leaves {rates}."
+    slip = ""
+    if not any(map(math.isnan, found.slips)):
+        slip = "Beside the log's own sideslip, which was not used: {:.2f}, now {:.2f} deg.".format(
+            *map(math.degrees, found.slips)
+        )
+    suite.verdict = verdict(
+        answer,
+        slip,
+        f"Not told by this log: {', '.join(missing) or 'nothing'}.",
+        "Not covered: the mass, which scales all; drives beside the part that was used.",
+    )
+    header = ("number", "stated", "found", "95 %", "unit", "told by this log?")
+    cells = [_cells(each) for each in found.findings]
+    suite.tables = [Table("What the log shows", header, cells, _NOTE, keyed=False)]
+    return suite
+
+
+def _cells(row: Finding) -> list[str]:
+    stated, value = (f"{x:.4g}" if math.isfinite(x) else "-" for x in (row.stated, row.value))
+    ends = "-"
+    if math.isfinite(row.half):
+        ends = f"{row.value - row.half:.4g} .. {row.value + row.half:.4g}"
+    told = ": ".join(filter(None, ["yes" if row.told else "no", row.remark]))
+    return [row.name, stated, value, ends, row.unit or "-", told]

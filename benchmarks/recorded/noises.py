@@ -1,0 +1,132 @@
+"""Noise of each sensor of a recorded drive, and how late its GPS is, with jackknife intervals."""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.stats import t as student
+
+from ...envs.record import FAST, PACKET, Array, Log
+from .emulate import ground_speed, heading
+
+WIDE = "its interval is too wide"
+BLOCKS = 20  # of a log, which the intervals take for independent
+LATE = (-0.2, 1.2)  # s, of the GPS
+LATE_WITHIN = 0.05  # s, half of the widest interval of a latency
+_FAST = {"gyro": "rad/s", "accel_y": "m/s2", "roll_rate": "rad/s", "wheel_left": "m/s"}
+
+
+class Finding(NamedTuple):
+    """A number with half of its 95 % interval; told: whether the log determines it."""
+
+    name: str
+    stated: float
+    value: float = math.nan
+    half: float = math.inf
+    unit: str = ""
+    told: bool = False
+    remark: str = ""
+
+
+def jackknife(blocks: Array, statistic: Callable[[Array], float]) -> tuple[float, float]:
+    """(value, half of the 95 % interval) of a statistic of the sum of blocks, (count, ...)."""
+    total, count = blocks.sum(axis=0), len(blocks)
+    without = np.array([statistic(total - block) for block in blocks])
+    sd = math.sqrt((count - 1) / count * float(np.sum((without - without.mean()) ** 2)))
+    return statistic(total), float(student.ppf(0.975, count - 1)) * sd
+
+
+def _root_mean(sums: Array) -> float:
+    return math.sqrt(float(sums[0]) / max(float(sums[1]), 1.0))
+
+
+def white(parts: Sequence[Array]) -> tuple[float, float]:
+    """(standard deviation, half) of a channel's white noise: third differences of samples that are
+    new (a slower sensor repeats its last one)."""
+    blocks = []
+    for values in parts:
+        new = np.concatenate([[True], np.diff(values) != 0.0])
+        third = np.diff(values if new.mean() > 0.7 else values[new], 3) / math.sqrt(20.0)
+        blocks += [np.array([each @ each, len(each)]) for each in np.array_split(third, BLOCKS)]
+    return jackknife(np.array(blocks), _root_mean)
+
+
+def _fixes(log: Log, value: int, signal: Array, part: Array, times: Array) -> list[Array]:
+    """Blocks of sums over the differences d of two fixes' values less the signal's so much earlier,
+    and p of `part`, whose size is not known: d^2, d p, p^2 and 1, each (times,)."""
+    packets = log.record.packets_of("gps")
+    packets = packets[packets[:, PACKET.quality] > 0.0]
+    rows, place = packets[:, PACKET.captured] - log.record.first, np.arange(float(len(signal)))
+    earlier = rows[:, None] - times / log.record.dt
+    d = np.diff(packets[:, PACKET.value + value, None] - np.interp(earlier, place, signal), axis=0)
+    d = (d + math.pi) % (2.0 * math.pi) - math.pi  # courses are within a turn
+    p = np.diff(np.interp(earlier, place, part), axis=0)
+    usual = np.diff(rows) <= 1.5 * np.median(np.diff(rows))
+    inside = (earlier[1:].min(axis=1) > 0.0) & (earlier[1:].max(axis=1) < place[-1])
+    used = usual & inside & np.isfinite(d).all(axis=1)
+    if np.count_nonzero(used) < BLOCKS:
+        return []
+    d, p = d[used] - np.median(d[used], axis=0), p[used]  # the median is a gyro's bias
+    sums = np.stack([d * d, d * p, p * p, np.ones_like(d)])
+    return [each.sum(axis=1) for each in np.array_split(sums, BLOCKS, axis=1)]
+
+
+def _left(sums: Array, share: float | None = None) -> Array:
+    """(times,): the mean of squares that a share of the part leaves; None: the best one."""
+    square, product, own, count = sums
+    shares = product / np.maximum(own, 1e-12) if share is None else share
+    return np.asarray((square - 2.0 * shares * product + shares**2 * own) / count)
+
+
+def _least(times: Array, sums: Array, share: float | None = None) -> float:
+    """The time of the least that is left, between the samples by a parabola."""
+    lefts = _left(sums, share)
+    i = int(np.clip(np.argmin(lefts), 1, len(times) - 2))
+    left, middle, right = lefts[i - 1 : i + 2]
+    bend = left - 2.0 * middle + right
+    beside = 0.5 * (left - right) / bend if bend > 0.0 else 0.0
+    return float(times[i] + beside * (times[1] - times[0]))
+
+
+def sensor_findings(
+    logs: Sequence[Log], slips: Sequence[Array]
+) -> tuple[list[Finding], dict[str, float], dict[str, float]]:
+    """Findings of the sensors, noise by the estimators' options, and latency by sensor.
+
+    slips: of each log, a sideslip angle in rad, (rows,), by which the course is predicted.
+    """
+    findings: list[Finding] = []
+    noise: dict[str, float] = {}
+    for channel, unit in _FAST.items():
+        if all(channel in log.record.present for log in logs):
+            sd, half = white([log.record.fast[:, getattr(FAST, channel)] for log in logs])
+            told = half < 0.3 * sd
+            remark = "" if told else WIDE if sd > 0.0 else "none is seen"
+            findings.append(Finding(f"noise of {channel}", math.nan, sd, half, unit, told, remark))
+            noise |= {f"{channel.removesuffix('_left')}_noise": sd} if told else {}
+    times = np.arange(*LATE, max(logs[0].record.dt, 0.01))
+    pairs = [pair for pair in zip(logs, slips, strict=True) if "gps" in pair[0].slow]
+    courses = [b for log, slip in pairs for b in _fixes(log, 0, heading(log), slip, times)]
+    speeds = [
+        b for log, _ in pairs for b in _fixes(log, 1, ground_speed(log), 0.0 * log.time, times)
+    ]
+    if not courses:
+        return findings, noise, {}
+    late, half = jackknife(np.array(courses), lambda sums: _least(times, sums))
+    half = math.hypot(
+        half, late - _least(times, np.sum(courses, axis=0), 1.0)
+    )  # had the slip its size
+    told = half < LATE_WITHIN
+    pays = told and late > half
+    remark = ("applied" if pays else "within its interval of 0") if told else WIDE
+    findings.append(Finding("latency of gps", 0.0, late, half, "s", told, remark))
+    at = int(np.argmin(np.abs(times - late)))
+    for name, unit, scale, blocks in (
+        ("course", "deg", math.degrees(1.0), courses), ("gps_speed", "m/s", 1.0, speeds)
+    ):  # fmt: skip
+        if blocks:  # a difference has twice the variance
+            sd, half = jackknife(np.array(blocks), lambda sums: math.sqrt(0.5 * _left(sums)[at]))
+            row = Finding(f"noise of {name}", math.nan, scale * sd, scale * half, unit, True)
+            findings, noise = [*findings, row], noise | {f"{name}_noise": sd}
+    return findings, noise, {"gps": late} if pays else {}

@@ -1,0 +1,96 @@
+"""A file with a recorded drive, replayed: its parts, its wires, its car."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from ...envs.recordings.columns import parse_mapping
+from ...envs.recordings.parts import read_parts
+from ...envs.recordings.sources import is_nmea
+from ...envs.vehicle.vehicles import VehicleSource, vehicle_from
+from ..harness.drives import SETTLED
+from ..harness.results import Suite
+from .checks import warnings_of
+from .identify import identify, suite_of
+from .suite import corners, replay
+from .wires import Wires, corrected
+
+FITTED, NOMINAL = "ferrari-250lm-fitted", "ferrari-250lm-nominal"
+FACTOR = 0.7  # of the fitted tyres, where no vehicle is named
+
+
+def identify_file(
+    log: str | Path,
+    vehicle: VehicleSource,
+    mapping: Sequence[str] = (),
+    wires: Wires | None = None,
+    tyres: str | None = None,
+    until: float | None = None,
+) -> tuple[Any, Suite]:
+    """Read a drive and find its car: (`Identified`, its table).
+
+    until: s of the log that are used, None: all. Raises what `read_parts`, `vehicle_from` and
+    `identify` do.
+    """
+    logs, remarks = read_parts(log, parse_mapping(mapping), end=until)
+    car = vehicle_from(vehicle)
+    found = identify(logs, car, wires, tyres)
+    found.remarks = [*remarks, *warnings_of(logs, car), *found.remarks]
+    return found, suite_of(found, logs[0].name)
+
+
+def replay_file(
+    log: str | Path,
+    vehicle: VehicleSource | None = None,
+    *,
+    mapping: Sequence[str] | None = None,
+    wires: Wires | None = None,
+    nominal: VehicleSource = "passenger-car",
+    until: float | None = None,
+    **settings: Any,
+) -> Suite:
+    """Read a drive and its vehicle, replay it, each part of a log with holes by itself, and where
+    it has truth the vehicle's corners too; a receiver's log (NMEA) is replayed as `replay_nmea`
+    does.
+
+    vehicle: of `vehicle_from`; "identify": found in the log, or in its first `until` s, of which
+    the rest is then replayed, with the mass and arms of `nominal`; None: the Ferrari 250 LM of the
+    Stanford log, with the fitted tyres x 0.7, and the corners of the nominal one. mapping: texts
+    such as "steer_rad=Delta". wires: what is known beside the car; identified ones stand behind
+    it. settings: of `replay`. Raises what `read_parts`, `vehicle_from`, `identify`, `replay` do.
+    """
+    if is_nmea(log):
+        from .receiver_suite import receiver_suite, replay_nmea
+
+        return receiver_suite(replay_nmea(log, vehicle, mapping))
+    if until is not None and vehicle != "identify":
+        raise ValueError("--until is for --vehicle identify")
+    wires, tables = wires or Wires(), []
+    if vehicle == "identify":
+        found, shown = identify_file(log, nominal, mapping or (), wires, until=until)
+        vehicle, tables = found.car, shown.tables
+        latency = {**found.wires.latency, **wires.latency}
+        wires = found.wires._replace(latency=latency, noise=found.wires.noise | dict(wires.noise))
+    logs, remarks = read_parts(log, parse_mapping(mapping or ()), start=until or 0.0)
+    logs = [corrected(part, wires) for part in logs]
+    if vehicle is None:
+        car, design = vehicle_from(NOMINAL), vehicle_from(FITTED)
+        settings = {"stiffness_factor": FACTOR} | settings
+        remarks.append(
+            "No vehicle was named, so the estimators assume the Ferrari 250 LM of the Stanford "
+            f"log, fitted tyres x {FACTOR}. For another car name its file: `--vehicle FILE`."
+        )
+    else:
+        car = design = vehicle_from(vehicle)
+    remarks += [f"WARNING: {text}." for text in warnings_of(logs, design)]
+    settings = {"noise": wires.noise} | settings
+    parts = [part for part in logs if part.time[-1] - part.time[0] >= SETTLED] or logs[:1]
+    suite, *others = [replay(part, design, **settings) for part in parts]
+    others += [corners(part, car, **settings) for part in parts if "beta" in part.truth]
+    for each in others:
+        suite.rows += each.rows
+        suite.tables += each.tables
+        suite.figures += each.figures
+    suite.tables += tables
+    suite.text = "\n\n".join([suite.text, *remarks])
+    return suite

@@ -1,0 +1,100 @@
+"""What is known of a log's wires, steering, latencies and noise: from a vehicle's file, applied."""
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ...envs.arguments import is_finite
+from ...envs.documents import is_document, read_document, write_document
+from ...envs.record import FAST, PACKET, Log
+from ...envs.sensors.slow import SLOW_NAMES
+from ...envs.vehicle.vehicle import Vehicle
+from ...envs.vehicle.vehicles import WIRES, VehicleSource
+
+_FAST = {"steer": ("steer",), "gyro": ("gyro",), "accel_x": ("accel_x",), "accel_y": ("accel_y",),
+         "roll_rate": ("roll_rate",), "wheels": ("wheel_left", "wheel_right")}  # fmt: skip
+CHANNELS = (*_FAST, *SLOW_NAMES)
+"""What may be late."""
+MOST_LATE = 5.0  # s
+
+
+class Wires(NamedTuple):
+    """Road-wheel angle = sign x logged / ratio + offset (rad); s by which each channel is late;
+    standard deviations of the noise by the estimators' options."""
+
+    ratio: float = 1.0
+    sign: int = 1
+    offset: float = 0.0
+    latency: Mapping[str, float] = {}
+    noise: Mapping[str, float] = {}
+
+    @property
+    def gain(self) -> float:
+        """Sign / ratio."""
+        return self.sign / self.ratio
+
+    def check(self) -> "Wires":
+        """Itself; ValueError for numbers that cannot be and for an unknown channel."""
+        if not (0.0 < self.ratio < 1e4 and self.sign in (-1, 1) and abs(self.offset) < 0.5):
+            raise ValueError(
+                "steering has a ratio above 0, a sign of 1 or -1 and an offset below 28 deg, got "
+                f"{self.ratio:g}, {self.sign}, {np.degrees(self.offset):g} deg"
+            )
+        for channel, late in self.latency.items():
+            least = 0.0 if channel in SLOW_NAMES else -MOST_LATE
+            if channel not in CHANNELS or not (is_finite(late) and least <= late <= MOST_LATE):
+                raise ValueError(
+                    f"a latency is CHANNEL=S, {least:g} to {MOST_LATE:g} s, of "
+                    f"{', '.join(CHANNELS)}; got {channel}={late}"
+                )
+        return self
+
+
+def wires_of(source: VehicleSource | None) -> Wires:
+    """The wires in a vehicle's file, with its errors; nothing is known of another source's."""
+    if source is None or source == "identify" or not is_document(source):
+        return Wires()
+    path = Path(str(source))
+    tables: dict[str, Any] = {**{name: {} for name in WIRES}, **read_document(path, "vehicle")}
+    try:
+        steering, latency, noise = (dict(tables[name]) for name in WIRES)
+        return Wires(**steering, latency=latency, noise=noise).check()
+    except (TypeError, ValueError) as error:
+        raise type(error)(f"{path}: {error}") from None
+
+
+def write_vehicle(path: Path, car: Vehicle, wires: Wires) -> None:
+    """A file that `vehicle_from` reads, with the wires in tables of their own."""
+    values = car.to_dict()
+    for axle in ("front", "rear"):
+        values[f"{axle}_stiffness_axle"] = 2.0 * values.pop(f"{axle}_stiffness")
+    steering = {name: getattr(wires, name) for name in ("ratio", "sign", "offset")}
+    tables = (steering, dict(wires.latency), dict(wires.noise))
+    write_document(path, values | dict(zip(WIRES, tables, strict=True)))
+
+
+def corrected(log: Log, wires: Wires) -> Log:
+    """The log with angles of the wheels, fast channels moved to when they were true, and packets
+    stamped with when they were captured; the arrival stays."""
+    record, slow = log.record, dict(log.slow)
+    fast, place = record.fast.copy(), np.arange(len(record.fast), dtype=float)
+    fast[:, FAST.steer] = wires.gain * fast[:, FAST.steer] + wires.offset
+    for channel in wires.latency.keys() & _FAST.keys():
+        for column in (getattr(FAST, name) for name in _FAST[channel]):
+            late = wires.latency[channel] / record.dt
+            fast[:, column] = np.interp(place + late, place, fast[:, column])
+    packets = record.packets.copy()
+    for sensor in slow.keys() & wires.latency.keys():
+        rows, was = round(wires.latency[sensor] / record.dt), slow[sensor]
+        mine = packets[:, PACKET.sensor] == SLOW_NAMES.index(sensor)
+        packets[mine, PACKET.captured] -= rows
+        period = round(was.period / record.dt)
+        phase = (round((was.phase or 0.0) / record.dt) - rows) % period * record.dt
+        slow[sensor] = dataclasses.replace(was, delays=(rows * record.dt,), phase=phase)
+    packets = packets[packets[:, PACKET.captured] >= record.first]
+    return dataclasses.replace(
+        log, record=dataclasses.replace(record, fast=fast, packets=packets), slow=slow
+    )

@@ -1,0 +1,96 @@
+"""A recorded drive with holes as whole drives: short holes are filled, long ones divide it."""
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from ..record import Array, Log
+from .columns import read_quantities
+from .log_file import GAPS, NEEDED, SLOW_QUANTITIES, clock_of, log_of
+
+HOLE = 0.25  # s, the longest hole that is filled by interpolation
+LEAST = 2.0  # s, of a part
+
+
+def read_parts(
+    path: str | Path,
+    mapping: Mapping[str, str] | None = None,
+    start: float = 0.0,
+    end: float | None = None,
+) -> tuple[list[Log], list[str]]:
+    """Read a recorded drive as `read_log` does, but mend its clock: (whole drives, what was done).
+
+    Rows without a value in a column that must be complete, and rows whose time is not after that of
+    those before, are dropped. Holes up to `HOLE` s are filled by interpolation on an even clock;
+    longer ones, and a clock that is set back by more, divide the log, and parts under `LEAST` s are
+    left out. start, end: s after the first row, what is read. Raises what `read_log` does for all
+    else, and ValueError where no part is left.
+    """
+    source = Path(path)
+    values = read_quantities(source, mapping or {}, NEEDED, None)
+    known = np.all([np.isfinite(v) for name, v in values.items() if name not in GAPS], axis=0)
+    since = np.append(0.0, np.cumsum(np.maximum(np.diff(values["time"]), 0.0)))
+    used = known & (since >= start) & (since < (math.inf if end is None else end))
+    try:
+        if np.count_nonzero(used) < 2:
+            raise ValueError("fewer than two rows are complete, or are in the time asked for")
+        pieces, done = _pieces({name: column[used] for name, column in values.items()})
+        logs = [log_of(piece, source) for piece in pieces]
+    except ValueError as error:
+        raise ValueError(f"{source}: {error}") from None
+    if len(logs) > 1:
+        named = enumerate(logs, 1)
+        logs = [dataclasses.replace(log, name=f"{log.name}, part {i}") for i, log in named]
+    done.append((int(np.count_nonzero(~known)), "rows lack a value and were dropped"))
+    return logs, [f"{count} {text}." for count, text in done if count]
+
+
+def _pieces(values: dict[str, Array]) -> tuple[list[dict[str, Array]], list[tuple[int, str]]]:
+    """The log's whole drives on even clocks, and (how often, what) was done to have them."""
+    time, pieces, short, dropped, holes = values["time"], [], 0, 0, 0
+    steps = np.diff(time)
+    if not (steps > 0.0).any():
+        raise ValueError(f"time stands still at row 2: {time[1]:.12g} s after {time[0]:.12g} s")
+    usual = float(np.median(steps[steps > 0.0]))
+    back = steps < -HOLE
+    ends = np.flatnonzero(back | (steps > HOLE + usual)) + 1
+    for rows in np.split(np.arange(len(time)), ends):
+        newest = np.maximum.accumulate(time[rows])
+        later = np.append(True, time[rows][1:] > newest[:-1] + 1e-3 * usual)
+        rows, dropped = rows[later], dropped + int(np.count_nonzero(~later))
+        if (len(ends) and time[rows[-1]] - time[rows[0]] < LEAST) or len(rows) < 2:
+            short += 1
+            continue
+        holes += int(np.count_nonzero(np.diff(time[rows]) > 1.5 * usual))
+        pieces.append(_even({name: column[rows] for name, column in values.items()}, usual))
+    if not pieces:
+        raise ValueError(f"no part of the log lasts {LEAST:g} s without a hole of {HOLE:g} s")
+    return pieces, [
+        (dropped, "rows whose time steps back or stands still were dropped"),
+        (int(np.count_nonzero(back)), "times the clock was set back: the log is divided there"),
+        (holes, f"holes up to {HOLE:g} s were filled by interpolation"),
+        (len(pieces) if len(pieces) > 1 else 0, "parts, between which rows are missing"),
+        (short, f"parts under {LEAST:g} s were left out"),
+    ]
+
+
+def _even(values: dict[str, Array], dt: float) -> dict[str, Array]:
+    """The quantities on an even clock: interpolated, a slow sensor's samples in the nearest row;
+    those whose clock is even already as they are."""
+    time = values["time"]
+    try:
+        clock_of(time)
+        return values
+    except ValueError:
+        even = np.linspace(time[0], time[-1], round((time[-1] - time[0]) / dt) + 1)
+    found = {name: np.interp(even, time, column) for name, column in values.items()}
+    for name in SLOW_QUANTITIES & values.keys():
+        known = np.isfinite(values[name])
+        found[name] = np.full(len(even), np.nan)
+        found[name][np.rint((time[known] - time[0]) / (even[1] - even[0])).astype(int)] = values[
+            name
+        ][known]
+    return found

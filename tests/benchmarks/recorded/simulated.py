@@ -1,0 +1,60 @@
+"""Drives of known cars as logs, with sensors that err as they may."""
+
+import dataclasses
+import functools
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+import sideslip
+from sideslip.agents.rollout import rollout
+from sideslip.envs.record import FAST, PACKET, Log
+from sideslip.envs.vehicle.vehicle import Vehicle
+
+assert sideslip.__version__
+EVERY = 10  # ticks to a row
+PLAIN = {"tyres": "linear", "roll": False, "lags": False}
+TURNS = {
+    "base": "random-steering",
+    "duration": 40.0,
+    "speed": (18.0, 22.0),
+    "amplitude": (0.01, 0.02),
+    "amplitude_2": (0.005, 0.01),
+    "surge": 0.7,
+    "surge_frequency": 0.05,
+    "disturbance_force": 100.0,
+    "disturbance_moment": 60.0,
+    "front_stiffness": (0.7, 1.3),
+    "rear_stiffness": (0.7, 1.3),
+}
+
+
+@functools.cache
+def drive(
+    seed: int,
+    ratio: float = 1.0,
+    offset: float = 0.0,
+    late: float = 0.0,
+    plain: bool = False,
+    **changes: float,
+) -> tuple[Log, Vehicle]:
+    """(log, true car) of a passenger car at 100 Hz; ratio: with the sign, of the logged steering;
+    offset: rad at the wheels; late: s, of the GPS, whose packets bear the time of their arrival."""
+    scenario: dict[str, Any] = TURNS | (PLAIN if plain else {}) | {"gps_latency": late} | changes
+    env: Any = gym.make("sideslip/YawFusion-v0", scenario=scenario, vehicle="passenger-car")
+    log = rollout(env, seed=seed).log
+    whole = log.record.fast[1:]
+    fast = whole[EVERY - 1 :: EVERY].copy()
+    steer = whole[:, FAST.steer][: len(fast) * EVERY].reshape(-1, EVERY).mean(axis=1)
+    fast[:, FAST.steer] = (steer - offset) * ratio
+    packets = log.record.packets_of("gps").copy()
+    arrived = np.ceil(packets[:, PACKET.arrived] / EVERY)
+    packets[:, PACKET.captured] = packets[:, PACKET.arrived] = arrived
+    packets = packets[(arrived >= 1) & (arrived <= len(fast))]
+    record = dataclasses.replace(
+        log.record, fast=fast, packets=packets, first=1, dt=EVERY * log.record.dt
+    )
+    return dataclasses.replace(
+        log, record=record, slow={"gps": log.slow["gps"]}, truth={}
+    ), env.unwrapped.vehicle

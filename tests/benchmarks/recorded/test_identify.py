@@ -1,0 +1,172 @@
+"""A known car is found from its log, within its intervals; what the log cannot show is said."""
+
+import dataclasses
+import math
+import re
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from sideslip.benchmarks.recorded.bicycle_fit import Theta, errors, fit, windows_of
+from sideslip.benchmarks.recorded.checks import saturated, swapped, warnings_of
+from sideslip.benchmarks.recorded.identify import Identified, identify, suite_of
+from sideslip.benchmarks.recorded.noises import Finding, jackknife, white
+from sideslip.benchmarks.recorded.wires import Wires
+from sideslip.envs.record import FAST, Array, Log
+from sideslip.envs.vehicle.vehicle import PASSENGER_CAR
+
+from .simulated import drive
+
+
+def row(found: Identified, name: str) -> Finding:
+    return next(each for each in found.findings if each.name == name)
+
+
+def changed(log: Log, **columns: Array) -> Log:
+    fast = log.record.fast.copy()
+    for name, values in columns.items():
+        fast[:, getattr(FAST, name)] = values
+    return dataclasses.replace(log, record=dataclasses.replace(log.record, fast=fast))
+
+
+@pytest.mark.parametrize("plain", [True, False])
+def test_a_known_car_is_found_within_its_intervals(plain: bool) -> None:
+    """Steering wheel angles of the other sign, 0.4 deg beside, a GPS 0.2 s late."""
+    offset = math.radians(0.4)
+    log, car = drive(1, -15.0, offset, 0.2, plain)
+    found = identify([log], PASSENGER_CAR)
+    assert ("linear" if plain else "fiala") in found.remarks[-1]
+    for name, true, within in (
+        ("front_stiffness_axle", 2.0 * car.front_stiffness, 0.1),
+        ("rear_stiffness_axle", 2.0 * car.rear_stiffness, 0.1),
+        ("yaw_inertia", car.yaw_inertia, 0.15),
+        ("steering ratio", 15.0, 0.1),
+        ("steering offset", 0.4, 0.3),
+        ("latency of gps", 0.2, 0.2),
+        ("noise of gyro", 0.005, 0.1),
+        ("noise of accel_y", 0.1, 0.1),
+    ):
+        finding = row(found, name)
+        assert finding.told, finding
+        assert abs(finding.value - true) < within * true, finding
+        assert abs(finding.value - true) < 2.0 * finding.half, finding
+    assert found.wires.sign == -1 and found.wires.ratio == row(found, "steering ratio").value
+    assert found.rates[1] < 0.05 * found.rates[0]
+    assert found.rates[2] < 1.3 * found.rates[1]
+
+
+def test_the_start_does_not_matter_where_the_log_tells() -> None:
+    log, _ = drive(1)
+    ends = [
+        identify([log], PASSENGER_CAR.scaled(*at), tyres="fiala") for at in ((0.7, 1.3), (1.3, 0.7))
+    ]
+    one, two = (
+        np.array([e.car.front_stiffness, e.car.rear_stiffness, e.car.yaw_inertia]) for e in ends
+    )
+    np.testing.assert_allclose(one, two, rtol=0.02)
+
+
+def test_the_fit_is_exact_on_the_plant_itself() -> None:
+    """What is left of the true car is the sensors' noise and the disturbances."""
+    log, car = drive(2, disturbance_force=0.0, disturbance_moment=0.0)
+    w = dataclasses.replace(windows_of([log], [saturated(log)]), tyres="fiala")
+    found = fit(car, w, Theta(), ("front", "rear", "inertia"))
+    assert np.abs(np.array(found.theta[:3])).max() < 0.02
+    rate, accel = errors(car, Theta(), w)
+    assert rate < 0.005 and accel < 0.11
+
+
+def test_the_jackknife_of_a_mean_is_its_standard_error() -> None:
+    values = np.random.default_rng(0).normal(size=50)
+    blocks = np.stack([values, np.ones(50)], axis=1)
+    value, half = jackknife(blocks, lambda sums: float(sums[0] / sums[1]))
+    assert value == pytest.approx(values.mean())
+    assert half == pytest.approx(2.0096 * values.std(ddof=1) / math.sqrt(50), rel=1e-4)
+
+
+def test_white_noise_under_a_smooth_signal_and_of_a_slower_sensor() -> None:
+    noise = np.random.default_rng(1).normal(0.0, 0.01, 20000)
+    smooth = np.sin(np.arange(20000) / 500.0)
+    assert white([smooth + noise])[0] == pytest.approx(0.01, rel=0.05)
+    slower = (smooth + noise)[::4].repeat(4)
+    assert white([slower])[0] == pytest.approx(0.01, rel=0.1)
+
+
+def straight(log: Log) -> Log:
+    quiet = np.random.default_rng(0).normal(0.0, 1.0, (2, len(log.record.fast)))
+    return changed(log, gyro=0.005 * quiet[0], steer=1e-4 * quiet[1], accel_y=0.1 * quiet[0])
+
+
+def unrelated(log: Log) -> Log:
+    return changed(log, steer=log.record.fast[::-1, FAST.steer])
+
+
+def slow(log: Log) -> Log:
+    speed = np.full(len(log.record.fast), 2.0)
+    return changed(log, wheel_left=speed, wheel_right=speed)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "reason"),
+    [
+        (straight, "no excitation"),
+        (unrelated, "steering and yaw rate are unrelated"),
+        (slow, "0 of 6 windows"),
+    ],
+)
+def test_what_is_not_there_is_not_told(spoil: Callable[[Log], Log], reason: str) -> None:
+    found = identify([spoil(drive(1)[0])], PASSENGER_CAR)
+    assert reason in found.reason and found.car == PASSENGER_CAR and found.wires.gain == 1.0
+    assert not any(each.told for each in found.findings[:8])
+    assert "shows nothing of the car" in suite_of(found, "x").verdict
+
+
+def test_a_stated_ratio_stays_where_hard_turns_hide_it() -> None:
+    log, _ = drive(1, amplitude=0.03, amplitude_2=0.02)
+    found = identify([log], PASSENGER_CAR, Wires(ratio=1.1))
+    assert found.wires.ratio == 1.1 and not row(found, "steering ratio").told
+    assert "a saturating axle" in row(found, "steering ratio").remark
+
+
+def test_swapped_columns_are_refused() -> None:
+    log, _ = drive(1)
+    fast = log.record.fast
+    for spoilt, message in (
+        (changed(log, steer=fast[:, FAST.gyro], gyro=fast[:, FAST.steer]), "steering and yaw rate"),
+        (changed(log, accel_x=fast[:, FAST.accel_y], accel_y=fast[:, FAST.accel_x]), "accel_x and"),
+    ):
+        with pytest.raises(ValueError, match=f"columns are swapped, {message}"):
+            identify([spoilt], PASSENGER_CAR)
+        assert any("swapped" in text for text in warnings_of([spoilt], PASSENGER_CAR))
+    assert swapped([log]) == ""
+
+
+def test_a_gyro_at_its_limit_is_counted_and_left_out() -> None:
+    log, car = drive(1)
+    gyro = log.record.fast[:, FAST.gyro]
+    clipped = changed(log, gyro=np.clip(gyro, -0.3, 0.9 * gyro.max()))
+    out = saturated(clipped)
+    assert (
+        out.any() and (gyro[out] >= 0.9 * gyro.max() - 1e-12).sum() + (gyro[out] <= -0.3).sum() > 0
+    )
+    assert not saturated(log).any()
+    assert any(f"limit in {out.sum()} rows" in t for t in warnings_of([clipped], car))
+    whole, less = (len(windows_of([each], [saturated(each)]).starts) for each in (log, clipped))
+    assert less < whole
+
+
+@pytest.mark.parametrize(
+    ("ratio", "message"),
+    [
+        (-1.0, r"differ in sign \(--steering-sign -1"),
+        (15.0, r"is 1\d\.?\d* times .* the angle of the steering wheel\?"),
+        (180.0 / math.pi, "degrees in a column of radians"),
+        (15.0 * 180.0 / math.pi, "degrees of the steering wheel in a column of radians"),
+        (0.018, "radians in a column of degrees"),
+    ],
+)
+def test_steering_of_another_sign_or_size_is_warned_of(ratio: float, message: str) -> None:
+    (text,) = warnings_of([drive(1, ratio)[0]], PASSENGER_CAR)
+    assert re.search(message, text), text
+    assert warnings_of([drive(1)[0]], PASSENGER_CAR) == []
