@@ -17,7 +17,7 @@ class Registry:
     kind: what they make, for messages. ours: the package's own. Iterates over all names.
     """
 
-    def __init__(self, kind: str, ours: Mapping[str, Factory]) -> None:
+    def __init__(self, kind: str, ours: Mapping[str, Factory | str]) -> None:
         self._kind = kind
         self._factories: dict[str, Factory | str] = dict(ours)
 

@@ -5,8 +5,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..learned.memory import Cell
-from ..learned.network import Network
+from ...estimators.learned.memory import Cell
+from ...estimators.learned.network import Network
 
 _PRIOR = 1e-4  # samples that a VecNormalize starts with, of mean 0 and variance 1
 

@@ -13,7 +13,7 @@ from ..harness.results import check_writable
 from .output import command_line, options_of, wrote
 
 if TYPE_CHECKING:
-    from ...agents.learned.network import Network
+    from ...estimators.learned.network import Network
 
 ENV = "sideslip/YawVision-v0"
 Trust = Annotated[

@@ -25,6 +25,7 @@ from .names import KINDS, complete
 from .output import check_files, options_of, show_episode, write_output, wrote
 from .recorded import Mapping, identify_command, replay_command
 from .train import train_command
+from .train_estimator import train_estimator_command
 from .tune import tune_app
 
 app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False)
@@ -37,6 +38,7 @@ app.command("lane")(lane_command)
 app.command("live")(live_command)
 app.command("replay")(replay_command)
 app.command("train")(train_command)
+app.command("train-estimator")(train_estimator_command)
 console = Console()
 
 Quick = Annotated[bool, typer.Option("--quick", help="Few seeds: a first look in seconds.")]

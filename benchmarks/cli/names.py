@@ -94,6 +94,8 @@ def estimators() -> dict[str, str]:
     from ...estimators.make import ESTIMATORS
 
     found = {name: "registered" for name in ESTIMATORS}
+    behind = "a network behind the filter of its file, which corrects the sideslip angle"
+    found |= {name: behind for name in found if name.startswith("learned")}
     for name, each in FILTERS.items():
         slow = " or ".join(each.slow) if len(each.slow) < 2 else "camera, GPS or both"
         found[name] = f"{slow.replace('gps', 'GPS') or 'fast sensors alone'}; {each.source}"

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from ...agents.rollout import Rollout
 
 _ENDINGS = {
+    "correction": (".safetensors",),
     "film": (".mp4", ".avi"),
     "html": (".html", ".htm"),
     "image": (".png", ".jpg", ".jpeg"),

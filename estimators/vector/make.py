@@ -11,10 +11,12 @@ from ...envs.ticks import TICK
 from ...envs.vehicle.vehicle import COMS, Vehicle
 from ...envs.vehicle.vehicles import VehicleSource, vehicle_from
 from ..filters import FILTERS
+from ..learned.correction import Learned
 from ..protocol import EstimatorFactory, ForeignEstimator, label_of
 from ..wrappers.arguments import Setup, build
 from .batch import BatchEstimator, Sensors
 from .foreign import ForeignBatch
+from .learned import LearnedBatch
 
 
 def batch_of(
@@ -28,7 +30,8 @@ def batch_of(
     if not (isinstance(source, str) and source in FILTERS):
         first = each(setups[0])
         if isinstance(first, ForeignEstimator):
-            return ForeignBatch(first, setups, dt, each)
+            kind = LearnedBatch if isinstance(first.inner, Learned) else ForeignBatch
+            return kind(first, setups, dt, each)
     return BatchEstimator(label_of(source), setups, dt, each)
 
 

@@ -14,7 +14,6 @@ from sideslip.agents import make_agent
 from sideslip.agents.design.gain_schedule import gain_table
 from sideslip.agents.learned.card import Card
 from sideslip.agents.learned.files import load_policy, save_policy, shipped
-from sideslip.agents.learned.network import Network
 from sideslip.benchmarks.control import seeds
 from sideslip.benchmarks.control import suite as control
 from sideslip.benchmarks.control.build import estimate_options, make_cars
@@ -24,6 +23,7 @@ from sideslip.benchmarks.control.episodes import Chunk
 from sideslip.benchmarks.control.run import CachedDrive
 from sideslip.benchmarks.control.seeds import salt_of, salted_seeds
 from sideslip.benchmarks.policies import enjoy, evaluate, evaluation, suite_of
+from sideslip.estimators.learned.network import Network
 from tests.benchmarks.conftest import Run
 
 SHORT = {"base": "random-steering", "duration": 1.5}

@@ -18,7 +18,7 @@ from safetensors.numpy import save_file
 
 from sideslip.agents.learned.card import Card
 from sideslip.agents.learned.files import FORMAT, load_policy, save_policy, shipped
-from sideslip.agents.learned.network import Network
+from sideslip.estimators.learned.network import Network
 
 pytestmark = pytest.mark.plain
 CARD = Card(
@@ -223,7 +223,7 @@ def test_a_file_of_the_first_format_is_a_network_without_memory(file: Path) -> N
 
 
 def test_a_file_too_large_is_not_opened(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sideslip.agents.learned.files.MOST_BYTES", 1000)
+    monkeypatch.setattr("sideslip.estimators.learned.network_file.MOST_BYTES", 1000)
     with pytest.raises(ValueError, match=r"bytes, a policy has at most 1000"):
         load_policy(file)
 

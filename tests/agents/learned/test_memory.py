@@ -11,8 +11,8 @@ import pytest
 from sideslip.agents import Learned
 from sideslip.agents.learned.card import Card
 from sideslip.agents.learned.files import Policy, load_policy, save_policy
-from sideslip.agents.learned.memory import GATES, PARTS, Cell
-from sideslip.agents.learned.network import ACTIVATIONS, Network
+from sideslip.estimators.learned.memory import GATES, PARTS, Cell
+from sideslip.estimators.learned.network import ACTIVATIONS, Network
 
 torch = pytest.importorskip("torch")
 torch.set_num_threads(1)

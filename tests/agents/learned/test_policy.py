@@ -14,8 +14,8 @@ import pytest
 from sideslip.agents import Learned, make_agent
 from sideslip.agents.learned.card import Card
 from sideslip.agents.learned.files import Policy, save_policy
-from sideslip.agents.learned.network import Network
 from sideslip.estimators import EstimateObservation
+from sideslip.estimators.learned.network import Network
 
 VISION, FUSION, STEERING = (
     f"sideslip/{name}-v0" for name in ("YawVision", "YawFusion", "AfsYawFusion")

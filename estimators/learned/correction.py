@@ -1,0 +1,110 @@
+"""The learned estimator: a filter, and a network that corrects its sideslip angle."""
+
+import functools
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ...envs.record import PACKET_WIDTH
+from ...envs.sensors.link import SlowSensor
+from ...envs.ticks import TICK
+from ...envs.vehicle.vehicle import Vehicle
+from ..core.memory import FILTER
+from ..entry import entry
+from ..estimator import Estimator
+from ..make import make_estimator
+from .files import Correction, load_correction
+from .kernel import EXAMPLE, MASS, begin, filter_and_correct, lend, memory_size, net_of, take_back
+
+Array = npt.NDArray[np.float64]
+
+
+class Learned:
+    """A filter whose beta and its deviation a network corrects, as an `EstimatorLike`.
+
+    Every 10 ticks the network reads what the filter and the fast sensors gave in the last 0.4 s,
+    its memory, and gives what is added to beta until the next time, and the standard deviation of
+    the sum; the other states are the filter's. Where a number that it reads is not finite, beta is
+    the filter's own.
+
+    base: the filter. `net`, `memory`: the correction as compiled code takes it. Raises ValueError
+    where the correction was made for another filter, other states or another tick.
+    """
+
+    def __init__(self, base: Estimator, correction: Correction, vehicle: Vehicle) -> None:
+        card, there = correction.card, base.names[: int(base.filters[0].n)]
+        if base.name != card.base or not set(card.states) <= set(there) or base.dt != TICK:
+            raise ValueError(
+                f"the correction was trained on {card.base} with {', '.join(card.states)} and "
+                f"ticks of {TICK:g} s; this is {base.name} with {', '.join(there)} and ticks of "
+                f"{base.dt:g} s"
+            )
+        self.base, self.names, self.correction = base, base.names, correction
+        self.net = net_of(correction, base.names)
+        self.memory = np.zeros(memory_size(self.net))
+        self.memory[MASS] = vehicle.mass
+        self.reset(base.sensors, 0)
+
+    def reset(self, sensors: Mapping[str, SlowSensor] | None, first: int) -> None:
+        """Forget everything; as `EstimatorLike.reset`, None for the clocks of the last time."""
+        self.base.reset(sensors, first)
+        begin(self.memory, first)
+
+    def step(self, rows: Array, packets: Array) -> None:
+        """Take fast rows and packets; as `EstimatorLike.step`."""
+        record = rows, len(rows), packets.reshape(-1, PACKET_WIDTH), len(packets)
+        _step_entry()(self.base.filters, self.base.gains, *record, self.memory, self.net)
+
+    @property
+    def x(self) -> Array:
+        """The states now, (n,)."""
+        return self._corrected()[0]
+
+    @property
+    def P(self) -> Array:
+        """Their covariance now, (n, n)."""
+        return self._corrected()[1]
+
+    def _corrected(self) -> tuple[Array, Array]:
+        f, row = self.base.filters[0], np.empty(len(self.names) + 1)
+        lend(f, self.memory, self.net, row)
+        found = self.base.x, self.base.P
+        take_back(f, self.net, row)
+        return found
+
+
+@functools.cache
+def _step_entry() -> Any:
+    """`filter_and_correct` as a plain call."""
+    record = np.zeros((1, 1)), 0, np.zeros((1, 1)), 0
+    layers = np.zeros(1, FILTER), np.zeros((1, 1, 1))
+    return entry(filter_and_correct, *layers, *record, np.zeros(1), EXAMPLE)
+
+
+def learned(
+    *,
+    vehicle: Vehicle,
+    sensors: Mapping[str, SlowSensor],
+    dt: float = TICK,
+    speed: float | None = None,
+    file: str | Path | Correction = "joint",
+    **options: Any,
+) -> Learned:
+    """An `EstimatorFactory`: the filter that a correction was trained on, with that correction.
+
+    file: a shipped correction's name, a file's path, or a `Correction`. The filter takes all slow
+    sensors, as in the training. options: of the filter, over those of the training. Raises what
+    `load_correction` and `make_estimator` raise.
+    """
+    correction = file if isinstance(file, Correction) else load_correction(file)
+    settings = {"slow": list(sensors)} | correction.card.base_options | options
+    facts: dict[str, Any] = {"vehicle": vehicle, "sensors": sensors, "dt": dt, "speed": speed}
+    base = make_estimator(correction.card.base, **facts, **settings)
+    return Learned(base, correction, vehicle)
+
+
+learned_exact_kf = functools.partial(learned, file="exact-kf")
+learned_joint = functools.partial(learned, file="joint")

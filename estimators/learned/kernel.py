@@ -1,0 +1,199 @@
+"""A correction at every tick, compiled: frames are gathered, and at each pace the network runs.
+
+A car's memory is one vector: some numbers, sums of the fast columns since the last pace, a ring
+of frames, and what the layers work on. Paces are counted from tick 0 of the episode, so that
+the estimate of a tick is the same for every control period. A frame that is not finite is no
+frame: the correction is dropped, and its history begins anew.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ...envs.backend.decorators import apart, copied, jit
+from ...envs.backend.elementary import clip, exp
+from ...envs.backend.primitives import maximum
+from ...envs.record import FAST, PACKET
+from ..core.run import advance, deviation
+from .files import FAST_INPUTS, LAGS, Correction
+
+PACE = 10  # ticks
+RING = max(LAGS) + 1  # frames
+COLUMNS = tuple(getattr(FAST, name) for name in FAST_INPUTS)
+LEAST = -8.0  # log of the least deviation, 0.02 degrees
+SLOWEST = 1.0  # m/s, below which a_y / v is a_y
+
+TICK, COUNT, FRAMES, SHIFT, DEVIATION, MASS, SLIP_RATE = range(7)
+"""Places in a memory: of the last fast row, rows in the sums, frames since the history began, what
+is added to beta (rad), the deviation of the sum (rad, 0: there is no correction), the filter's car
+(kg), the sum of a_y / v - gyro (rad/s), behind which those of COLUMNS and the ring follow."""
+HISTORY = SLIP_RATE + 1 + len(COLUMNS)
+
+
+class Net(NamedTuple):
+    """A correction as compiled code takes it.
+
+    states: places of the filter's that are read, beta's among them. sizes: of the layers, inputs
+    first. numbers: each layer's weights, (inputs, outputs) row by row, then its biases.
+    """
+
+    states: Any
+    beta: int
+    mean: Any
+    scale: Any
+    clip: float
+    sizes: Any
+    numbers: Any
+
+
+_WHOLE, _REAL = np.zeros(1, np.int64), np.zeros(1)
+EXAMPLE = Net(_WHOLE, 0, _REAL, _REAL, 1.0, _WHOLE, _REAL)
+"""For `entry`: all nets have these types."""
+
+
+def net_of(correction: Correction, states: tuple[str, ...]) -> Net:
+    """The net for a filter with these states, all of the card's among them."""
+    network = correction.network
+    layers = zip(network.weights, network.biases, strict=True)
+    return Net(
+        np.array([states.index(name) for name in correction.card.states], np.int64),
+        states.index("beta"),
+        np.array(network.mean),
+        np.array(network.scale),
+        float(network.clip or 0.0),
+        np.array([network.inputs, *(len(b) for b in network.biases)], np.int64),
+        np.concatenate([part for W, b in layers for part in (W.T.ravel(), b)]),
+    )
+
+
+@jit
+def stack_at(net: Any) -> Any:
+    """Where the stack of frames, which is the network's input, begins in a memory."""
+    return HISTORY + net.sizes[0] // len(LAGS) * RING
+
+
+def memory_size(net: Net) -> int:
+    """Numbers of a car's memory."""
+    return int(stack_at(net) + net.sizes.sum())
+
+
+@jit
+def begin(m: Any, first: int) -> None:
+    """A fresh memory of the same car, whose first row is the tick `first`."""
+    for i in range(len(m)):
+        m[i] *= 1.0 if i == MASS else 0.0
+    m[TICK] = first - 1.0
+
+
+@jit
+def _gather(m: Any, row: Any) -> None:
+    """Add a fast row to the sums of this pace."""
+    m[TICK] += 1.0
+    m[COUNT] += 1.0
+    for i in range(len(COLUMNS)):
+        m[SLIP_RATE + 1 + i] += row[COLUMNS[i]]
+    v = 0.5 * (row[FAST.wheel_left] + row[FAST.wheel_right])
+    m[SLIP_RATE] += row[FAST.accel_y] / maximum(v, SLOWEST) - row[FAST.gyro]
+
+
+@jit
+def _frame(f: Any, gains: Any, m: Any, net: Any, at: int) -> int:
+    """Write the frame of this pace at a place; how many of its numbers are not finite."""
+    k, n = len(COLUMNS) + 1, len(net.states)
+    for i in range(k):  # the slip rate stands before the columns
+        m[at + i] = m[SLIP_RATE + i] / m[COUNT]
+        m[SLIP_RATE + i] = 0.0
+    for i in range(n):
+        m[at + k + i] = f.x[net.states[i]]
+    m[at + k + n], m[at + k + n + 1] = deviation(f, gains, net.beta), m[MASS]
+    m[COUNT], strange = 0.0, 0
+    for i in range(k + n + 2):
+        strange += 0 if m[at + i] - m[at + i] == 0.0 else 1
+    return strange
+
+
+@jit
+def _layers(m: Any, net: Any, at: int) -> int:
+    """Run the network on the stack at a place, which it normalises; where its outputs are."""
+    inputs, number = net.sizes[0], 0
+    for i in range(inputs):
+        m[at + i] = clip((m[at + i] - net.mean[i]) * net.scale[i], 0.0 - net.clip, net.clip)
+    for layer in range(len(net.sizes) - 1):
+        outputs = net.sizes[layer + 1]
+        z, sums = m[at : at + inputs], m[at + inputs : at + inputs + outputs]
+        copied(net.numbers[number + inputs * outputs :][:outputs], sums)
+        for i in range(0, inputs, 4):  # four at once: sums are loaded and stored less often
+            a, b, c, d = z[i], z[i + 1], z[i + 2], z[i + 3]
+            if layer > 0:
+                a, b, c, d = maximum(a, 0.0), maximum(b, 0.0), maximum(c, 0.0), maximum(d, 0.0)
+            first = net.numbers[number + i * outputs :]
+            second, third, fourth = first[outputs:], first[2 * outputs :], first[3 * outputs :]
+            for o in range(outputs):
+                sums[o] = sums[o] + a * first[o] + b * second[o] + c * third[o] + d * fourth[o]
+        number, at, inputs = number + (inputs + 1) * outputs, at + inputs, outputs
+    return at
+
+
+@jit
+def _renew(f: Any, gains: Any, m: Any, net: Any) -> None:
+    """The correction of this pace."""
+    width, at, newest = net.sizes[0] // len(LAGS), stack_at(net), int(m[FRAMES])
+    if _frame(f, gains, m, net, HISTORY + width * (newest % RING)) > 0:
+        m[FRAMES], m[SHIFT], m[DEVIATION] = 0.0, 0.0, 0.0
+        return
+    m[FRAMES] += 1.0
+    for lag in range(len(LAGS)):  # before the first frame there were more like it
+        source = HISTORY + width * (maximum(newest - LAGS[lag], 0) % RING)
+        copied(m[source : source + width], m[at + lag * width :])
+    out = _layers(m, net, at)
+    m[SHIFT] = m[out]
+    m[DEVIATION] = exp(clip(m[out + 1], LEAST, 0.0))
+
+
+@apart
+def filter_and_correct(
+    filters: Any, gains: Any, fast: Any, rows: int, packets: Any, count: int, m: Any, net: Any
+) -> None:
+    """`advance` of a filter whose gains follow P, pace by pace, and its correction.
+
+    m: the memory, (memory_size(net),).
+    """
+    start, begun, nothing, last = 0, 0, fast[:0], m[TICK] + rows
+    for j in range(rows):
+        _gather(m, fast[j])
+        due, ends, end = int(m[TICK]) % PACE == 0, j == rows - 1, begun
+        if due or ends:
+            while end < count and (ends or not m[TICK] < packets[end, PACKET.arrived] <= last):
+                end += 1
+            ours, own, some = fast[start : j + 1], packets[begun:end], end - begun
+            advance(filters, gains, ours, len(ours), own, some, 0, nothing, nothing, m[:0])
+            start, begun = j + 1, end
+        if due:
+            _renew(filters[0], gains, m, net)
+    if rows == 0:
+        advance(filters, gains, fast, 0, packets, count, 0, nothing, nothing, m[:0])
+
+
+@jit
+def lend(f: Any, m: Any, net: Any, row: Any) -> None:
+    """Put the correction into a filter's record, whose own numbers go to `row` (n + 1,).
+
+    How the sum's error depends on those of the other states is not known: covariances are zero.
+    """
+    b, n = net.beta, f.n
+    copied(f.P[b, :n], row)
+    row[n] = f.x[b]
+    if m[DEVIATION] > 0.0:
+        f.x[b] += m[SHIFT]
+        for i in range(n):
+            f.P[b, i], f.P[i, b] = 0.0, 0.0
+        f.P[b, b] = m[DEVIATION] * m[DEVIATION]
+
+
+@jit
+def take_back(f: Any, net: Any, row: Any) -> None:
+    """Give a filter's record its own numbers back."""
+    b, n = net.beta, f.n
+    copied(row[:n], f.P[b])
+    copied(row[:n], f.P[:, b])
+    f.x[b] = row[n]

@@ -1,0 +1,150 @@
+"""Networks in safetensors files: tensors of the shapes that a card in the metadata has.
+
+Reading runs no code: safetensors are numbers, the card is JSON. Policies (`agents.learned.files`)
+and corrections of estimators (`files`) are such files, each with a card of its own.
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from safetensors import SafetensorError, safe_open
+
+from .memory import GATES, PARTS, Cell, cell_shapes
+from .network import Network
+
+MOST_BYTES = 2**26
+"""A larger file is not opened; tensors lie in it as they are, so that it bounds their sizes too."""
+ENDING = ".safetensors"
+MEMORY: dict[str, Any] = {"history": 1, "cells": []}
+"""What the card says of a network without memory."""
+_DENSE = ("hidden", "activation", "output", "clip", "action_width")
+Tensors = dict[str, npt.NDArray[Any]]
+
+
+def read_tensors(path: Path, what: str) -> tuple[Tensors, dict[str, str]]:
+    """The tensors and the metadata of a file of `what`; ValueError where it is none, is cut short
+    or is larger than `MOST_BYTES`."""
+    size = path.stat().st_size
+    if size > MOST_BYTES:
+        raise ValueError(f"{path} has {size} bytes, a {what} has at most {MOST_BYTES}")
+    try:
+        with safe_open(path, "numpy") as file:
+            metadata = file.metadata() or {}
+            return {name: file.get_tensor(name) for name in file.keys()}, metadata  # noqa: SIM118
+    except (SafetensorError, OSError, TypeError) as error:
+        raise ValueError(f"{path} is no safetensors file, or is cut short: {error}") from None
+
+
+def json_object(text: str) -> dict[str, Any]:
+    """A card's JSON object; ValueError for anything else."""
+    try:
+        fields = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"the card is no JSON: {error}") from None
+    if not isinstance(fields, dict):
+        raise ValueError(f"a card is a JSON object, got {type(fields).__name__}")
+    return fields
+
+
+def architecture_of(network: Network) -> dict[str, Any]:
+    """What a card holds of a network."""
+    return dict(
+        hidden=list(network.hidden),
+        activation=network.activation,
+        output=network.output,
+        clip=network.clip,
+        action_width=network.width,
+        history=network.history,
+        cells=[[cell.kind, cell.size] for cell in network.cells],
+    )
+
+
+def network_of(fields: Any, inputs: int, tensors: Tensors) -> Network:
+    """The network of so many inputs that a card describes, from tensors of the shapes it has.
+
+    Raises ValueError where they do not fit together.
+    """
+    if not isinstance(fields, dict) or set(fields) != {*_DENSE, *MEMORY}:
+        names = ", ".join((*_DENSE, *MEMORY))
+        raise ValueError(f"the card's network holds {names}, got {fields!r}")
+    hidden, cells, clip = fields["hidden"], fields["cells"], fields["clip"]
+    sizes = [*hidden, fields["action_width"]] if isinstance(hidden, list) else []
+    history = fields["history"]
+    if not sizes or not all(type(size) is int and size > 0 for size in (*sizes, history)):
+        raise ValueError(f"the card's layer sizes are positive integers, got {fields!r}")
+    if not (isinstance(cells, list) and all(map(_is_cell, cells))):
+        raise ValueError(f"the card's cells are pairs of {', '.join(GATES)} and a size: {cells!r}")
+    if not (clip is None or type(clip) in (int, float)):
+        raise ValueError(f"clip is above zero or None, got {clip!r}")
+    _check_tensors(tensors, _shapes(inputs, history, cells, sizes))
+    return Network(
+        tensors["mean"],
+        tensors["scale"],
+        [tensors[f"weight_{i}"] for i in range(len(sizes))],
+        [tensors[f"bias_{i}"] for i in range(len(sizes))],
+        str(fields["activation"]),
+        str(fields["output"]),
+        clip,
+        history,
+        [
+            Cell(kind, *(tensors[f"cell_{i}_{part}"] for part in PARTS))
+            for i, (kind, _) in enumerate(cells)
+        ],
+    )
+
+
+def _is_cell(pair: Any) -> bool:
+    return (
+        isinstance(pair, list)
+        and len(pair) == 2
+        and pair[0] in tuple(GATES)
+        and type(pair[1]) is int
+        and pair[1] > 0
+    )
+
+
+_Shapes = dict[str, tuple[tuple[int, ...], ...]]
+
+
+def _shapes(inputs: int, history: int, cells: list[tuple[str, int]], sizes: list[int]) -> _Shapes:
+    """The shapes that each tensor may have."""
+    wide = inputs * history
+    shapes: _Shapes = dict.fromkeys(("mean", "scale"), ((inputs,), (wide,)))
+    for i, (kind, size) in enumerate(cells):
+        own = cell_shapes(kind, size, wide)
+        shapes |= {f"cell_{i}_{part}": (shape,) for part, shape in own.items()}
+        wide = size
+    for i, size in enumerate(sizes):
+        shapes |= {f"weight_{i}": ((size, wide),), f"bias_{i}": ((size,),)}
+        wide = size
+    return shapes
+
+
+def _check_tensors(tensors: Tensors, shapes: _Shapes) -> None:
+    """ValueError for tensors of other names, shapes or types."""
+    if shapes.keys() != tensors.keys():
+        missing, more = shapes.keys() - tensors.keys(), tensors.keys() - shapes.keys()
+        raise ValueError(f"missing tensors: {sorted(missing)}; unexpected ones: {sorted(more)}")
+    for name, allowed in shapes.items():
+        kind = np.dtype(np.float64 if name in ("mean", "scale") else np.float32)
+        found = tensors[name]
+        if found.shape not in allowed or found.dtype != kind:
+            raise ValueError(
+                f"tensor {name} has shape {found.shape} of {found.dtype}, "
+                f"the card has {' or '.join(map(str, dict.fromkeys(allowed)))} of {kind}"
+            )
+
+
+def tensors_of(network: Network) -> Tensors:
+    """What a file holds of a network."""
+    tensors: Tensors = {"mean": network.mean, "scale": network.scale}
+    for i, cell in enumerate(network.cells):
+        for part in PARTS:
+            tensors[f"cell_{i}_{part}"] = np.ascontiguousarray(getattr(cell, part), np.float32)
+    for i, (W, b) in enumerate(zip(network.weights, network.biases, strict=True)):
+        tensors[f"weight_{i}"] = np.ascontiguousarray(W, np.float32)
+        tensors[f"bias_{i}"] = np.ascontiguousarray(b, np.float32)
+    return tensors
