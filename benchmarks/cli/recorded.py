@@ -35,7 +35,7 @@ def _wires(vehicle: str | None, latency: Texts, **steering: float | None) -> Any
 
 
 def estimator_options(texts: Texts) -> dict[str, dict[str, Any]]:
-    """{"joint": {"bank": 4}} from texts such as "joint.bank=4"; ValueError for another form."""
+    """{"joint": {"members": 4}} from texts such as "joint.members=4"; ValueError for others."""
     found: dict[str, dict[str, Any]] = {}
     for text in texts or ():
         key, value = option_of(text)
@@ -65,7 +65,7 @@ def replay_command(
         Texts, typer.Option(help="A name; repeatable; default: all that the log serves.")
     ] = None,
     estimator_option: Annotated[
-        Texts, typer.Option(help="ESTIMATOR.NAME=VALUE (joint.bank=4); repeatable.")
+        Texts, typer.Option(help="ESTIMATOR.NAME=VALUE (joint.gate=0.99); repeatable.")
     ] = None,
     steering_ratio: Ratio = None,
     steering_sign: Sign = None,

@@ -57,7 +57,7 @@ def steering_gain(logs: Sequence[Log], car: Vehicle) -> tuple[float, float]:
     if len(speed) < 2:
         return 1.0, 0.0
     bend = car.rear_arm / car.front_stiffness - car.front_arm / car.rear_stiffness
-    under = max(car.mass * bend / (2.0 * car.wheelbase), -0.5 * car.wheelbase / speed.max() ** 2)
+    under = max(car.mass * bend / (2.0 * car.wheelbase), 0.0)
     return _related(steer, gyro * (car.wheelbase / speed + under * speed))
 
 

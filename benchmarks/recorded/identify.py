@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from ...envs.record import Array, Log
-from ...envs.vehicle.vehicle import Vehicle
+from ...envs.vehicle.vehicle import GRAVITY, Vehicle
 from ...estimators.make import make_estimator
 from ..harness.results import Suite, Table
 from ..harness.verdict import verdict
@@ -21,7 +21,8 @@ TYRES = ("linear", "fiala")
 LEAST_WINDOWS = 6
 LEAST_TURNING = 0.3  # m/s2, RMS of speed x yaw rate
 MILD = 5.0  # m/s2; beyond, a saturating axle looks like another steering ratio
-NEAR = 1.6  # within this factor of the stated ratio, that one may be right
+GRIPS = 0.8  # of the stated friction's acceleration, beyond which that is in doubt
+NEAR = 2.5  # within this factor of the stated ratio, that one may be right
 PAYS = 0.98  # of the error on held-out stretches, at most, where a latency is applied
 FOLDS = 4
 _MOST = Theta(0.3, 0.3, 0.4, 0.2, 0.0175, 0.0087, 0.5, 0.2, LATE_WITHIN, LATE_WITHIN)
@@ -147,6 +148,8 @@ def _fit_car(found: Identified, w: Windows, start: Theta, near: bool, laws: Sequ
         name for name in Theta._fields[:8]
         if name not in held and (w.accel or not name.startswith("accel"))
     ]  # fmt: skip
+    if len(laws) > 1 and hard > GRIPS * car.friction * GRAVITY:
+        laws = TYRES[:1]  # the stated friction is not this log's, and Fiala's law lives by it
     tried = []
     for law in laws:
         windows = replace(w, tyres=law)
@@ -213,7 +216,8 @@ def _car_findings(
     for name, label, value, unit in _rows(car, stated):
         at = float(getattr(best.theta, name))
         half = math.hypot(best.half(name), float(getattr(free.theta, name)) - at)
-        told = name in best.free
+        share = abs(best.theta.gain) if name == "gain" else 1.0
+        told = name in best.free and half <= 2.0 * share * float(getattr(_MOST, name))
         remark = "" if told else WIDE
         if name in _OF_CAR:
             at, half = value * math.exp(at), value * math.exp(at) * half

@@ -26,9 +26,11 @@ ESTIMATORS: dict[str, tuple[str, ...]] = {
     "dakf": ("gps",),
     "exact-kf": ("gps", "camera"),
     "joint": ("gps", "camera"),
+    "joint-robust": ("gps", "camera"),
 }
 """The estimators of a replay and the slow sensors that serve them, the better one first."""
 
+OWN_NOISE = "joint-robust"  # brings its levels along and finds the accelerometer's as it drives
 LEAST_NOISE = 0.01  # deg, of the course, the least that estimators assume
 LEAST_GYRO = 0.002  # rad/s; below, what the model lacks weighs more than the sensor's noise
 _MOTION = ("beta", "gamma", "psi", "y_l", "course", "phi", "phi_rate", "F_d", "N_d")
@@ -173,10 +175,12 @@ def _estimator(name: str, slow: str | None, log: Log, vehicle: Vehicle, how: Set
     options: dict[str, Any] = {"q_beta": how.q_beta, "q_gamma": how.q_gamma}
     if slow is not None:
         options |= {"slow": slow, "q_psi": how.q_psi}
+    if name == OWN_NOISE:
+        options = {"slow": slow}
     if slow == "gps":
         options["course_noise"] = math.radians(max(how.course_noise_deg, LEAST_NOISE))
         options |= {key: how.noise[key] for key in ("course_noise",) if key in how.noise}
-    if "gyro_noise" in how.noise:
+    if "gyro_noise" in how.noise and name != OWN_NOISE:
         options["gyro_noise"] = max(how.noise["gyro_noise"], LEAST_GYRO)
     options |= how.options.get(name, {})
     facts = {"vehicle": vehicle, "sensors": sensors, "dt": log.record.dt}

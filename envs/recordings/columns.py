@@ -1,4 +1,4 @@
-"""A table on disk as named quantities in SI units: CSV or Parquet (needs the extra `report`)."""
+"""A table on disk as named quantities in SI units (needs the extra `report`)."""
 
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
@@ -9,6 +9,7 @@ import numpy as np
 from ..arguments import brief, listed
 from ..record import Array
 from ..vehicle.vehicle import GRAVITY
+from .tables import read_table
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -88,48 +89,6 @@ def parse_mapping(texts: Sequence[str]) -> dict[str, str]:
         quantity_of(ours)
         mapping[ours] = theirs
     return mapping
-
-
-def read_table(path: Path) -> "pd.DataFrame":
-    """The file's columns as they stand there.
-
-    CSV (comma, semicolon or tab) or Parquet, recognised by content. Raises ModuleNotFoundError
-    without the extra, FileNotFoundError, and ValueError where the file is no table.
-    """
-    try:
-        import pandas as pd
-    except ModuleNotFoundError:
-        raise ModuleNotFoundError(
-            "reading a log needs pandas: pip install 'sideslip[report]'"
-        ) from None
-    if not path.exists():
-        raise FileNotFoundError(f"{path}: there is no such file")
-    if not path.is_file():
-        raise ValueError(f"{path}: expected a file, found a folder")
-    with path.open("rb") as stream:
-        head = stream.read(65536)
-    if not head.strip():
-        raise ValueError(f"{path}: the file is empty")
-    try:
-        if head.startswith(b"PAR1"):
-            table = pd.read_parquet(path)
-        elif b"\0" in head:
-            raise ValueError("it is a binary file")
-        else:
-            title = head.splitlines()[0].decode("utf-8-sig")
-            table = pd.read_csv(
-                path,
-                sep=max(",;\t", key=title.count),
-                encoding="utf-8-sig",
-                index_col=False,
-                skipinitialspace=True,
-                low_memory=False,
-                compression=None,
-            )
-    except (ValueError, OSError) as error:  # what pandas' and pyarrow's own errors derive from
-        reason = "it is not text" if isinstance(error, UnicodeDecodeError) else str(error).strip()
-        raise ValueError(f"{path}: expected CSV or Parquet, but {reason:.300}") from None
-    return table.rename(columns=lambda name: str(name).strip())
 
 
 def read_quantities(

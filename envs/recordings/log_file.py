@@ -40,7 +40,7 @@ _STANDING = 0.5  # m/s; below it the sideslip angle is 0
 
 
 def read_log(path: str | Path, mapping: Mapping[str, str] | None = None) -> Log:
-    """Read a recorded drive from CSV or Parquet (needs the extra `report`).
+    """Read a recorded drive from a table of `read_table` (needs the extra `report`).
 
     path: columns are named as in `COLUMNS`; those of `NEEDED` must be there, unknown ones are
     ignored. mapping: our column name, unit included, to the log's ({"yaw_rate_degps": "GyroZ"});

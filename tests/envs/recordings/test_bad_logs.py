@@ -117,8 +117,8 @@ def test_a_bad_table_gets_one_clear_error(tmp_path: Path, spoil: Spoiler, messag
         (b" \n\n", "the file is empty"),
         (bytes(range(256)) * 8, "it is a binary file"),
         (b"\x89PNG\r\n\x1a\n" + b"\xfe\xfd" * 99, "it is not text"),
-        (b"PAR1 but not for long", "expected CSV or Parquet"),
-        (b"time_s,steer_rad\n1,2\n1,2,3,4\n", "expected CSV or Parquet"),
+        (b"PAR1 but not for long", "expected CSV, Parquet, MATLAB or MDF"),
+        (b"time_s,steer_rad\n1,2\n1,2,3,4\n", "expected CSV, Parquet, MATLAB or MDF"),
     ],
 )
 def test_a_file_that_is_no_table(tmp_path: Path, content: bytes, message: str) -> None:

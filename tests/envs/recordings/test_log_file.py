@@ -1,5 +1,8 @@
 """A log read from disk is the record that the car would have written."""
 
+import contextlib
+import sys
+import types
 from pathlib import Path
 
 import numpy as np
@@ -185,3 +188,41 @@ def test_roll_rate_hdop_and_satellites_are_read(tmp_path: Path) -> None:
     np.testing.assert_array_equal(packets[:, PACKET.value + 4], table["gps_hdop_count"][5::20])
     np.testing.assert_array_equal(packets[:, PACKET.value + 5], [0, 2, 4, 6, 8])
     np.testing.assert_array_equal(packets[:, PACKET.quality], 1.0)  # few satellites or not
+
+
+def test_matlab_is_read_and_another_kind_named(tmp_path: Path) -> None:
+    from scipy.io import savemat
+
+    table = drive()
+    path = tmp_path / "drive.mat"
+    savemat(path, {name: table[name].to_numpy() for name in table} | {"note": "x", "k": 3.0})
+    log, csv = read_log(path), read_log(saved(table, tmp_path))
+    np.testing.assert_array_equal(log.record.fast, csv.record.fast)
+    path.write_bytes(b"MATLAB 7.3 MAT-file, Platform: GLNXA64" + bytes(200))
+    with pytest.raises(ValueError, match=r"MATLAB 7\.3 \(HDF5\); save it with -v7"):
+        read_log(path)
+
+
+def test_mdf_is_read_by_asammdf_which_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    table, path = drive(), tmp_path / "drive.mf4"
+    path.write_bytes(b"MDF     4.10" + bytes(200))
+    monkeypatch.setitem(sys.modules, "asammdf", None)
+    with pytest.raises(ModuleNotFoundError, match=r"pip install 'sideslip\[mdf\]'"):
+        read_log(path)
+
+    class MDF(contextlib.nullcontext[None]):
+        def __init__(self, path: Path) -> None:
+            super().__init__()
+
+        def __enter__(self) -> "MDF":  # type: ignore[override]
+            return self
+
+        def to_dataframe(self) -> pd.DataFrame:
+            return table.set_index("time_s").rename_axis("timestamps")
+
+    monkeypatch.setitem(sys.modules, "asammdf", types.SimpleNamespace(MDF=MDF))
+    np.testing.assert_array_equal(
+        read_log(path).record.fast, read_log(saved(table, tmp_path)).record.fast
+    )

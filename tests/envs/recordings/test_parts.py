@@ -33,7 +33,7 @@ def test_a_short_hole_is_filled(tmp_path: Path) -> None:
     np.testing.assert_allclose(log.record.fast[:, FAST.gyro], whole["yaw_rate_radps"], atol=3e-4)
     np.testing.assert_allclose(log.truth["beta"], whole["sideslip_rad"], atol=3e-4)
     captured = log.record.packets[:, PACKET.captured] - log.record.first
-    assert captured.tolist() == [k for k in range(0, 600, 10) if k != 400]
+    assert captured.tolist() == list(range(0, 600, 10))
 
 
 def test_a_long_hole_divides_and_a_short_part_is_left_out(tmp_path: Path) -> None:
