@@ -149,6 +149,10 @@ def run_estimators(drives: Sequence[Log], vehicle: Vehicle, how: Settings) -> Re
                 raise
             result.remarks[name] = f"left out: {str(error).removeprefix(f'{name}: ')}"
             continue
+        missing = [each for each in estimator.needs if each not in log.record.present]
+        if missing and name != GYRO_ONLY:
+            result.remarks[name] = f"left out: needs the column {', '.join(missing)}"
+            continue
         if estimator.unobservable:
             result.remarks[name] = f"cannot see {'; '.join(estimator.unobservable)}"
         squares = []
