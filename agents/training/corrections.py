@@ -59,16 +59,16 @@ class Samples(NamedTuple):
 class _Shaken(Lqr):
     """LQR whose action is disturbed by coloured noise."""
 
-    noise: Any = 0.0
+    def __init__(self, env: Any) -> None:
+        super().__init__(env)
+        self._rng, self._noise = np.random.default_rng(0), np.zeros(())
 
-    def predict(self, observation: Any, state: Any = None, *rest: Any, **options: Any) -> Any:
+    def predict(self, *arguments: Any, **options: Any) -> Any:
         """LQR's action and the noise, clipped."""
-        action, state = super().predict(observation, state, *rest, **options)
-        if state is None or np.ndim(self.noise) == 0:
-            self.rng = np.random.default_rng(0)
-        fresh = self.rng.standard_normal(action.shape) * (1.0 - _MEMORY**2) ** 0.5
-        self.noise = _MEMORY * self.noise + _SHAKEN * fresh
-        return np.clip(action + self.noise, -1.0, 1.0).astype(np.float32), state
+        action, state = super().predict(*arguments, **options)
+        fresh = self._rng.standard_normal(action.shape) * (1.0 - _MEMORY**2) ** 0.5
+        self._noise = _MEMORY * self._noise + _SHAKEN * fresh
+        return np.clip(action + self._noise, -1.0, 1.0).astype(np.float32), state
 
 
 AGENTS: dict[str, Any] = {"none": NoControl, "lqr": Lqr, "shaken": _Shaken}
@@ -189,9 +189,10 @@ def quality_of(correction: Correction, seen: Samples) -> dict[str, float]:
     """RMSE of the filter and of the sum (rad), coverage of 95 % intervals, mean squared error over
     variance, of samples driven on a correction."""
     errors, deviations = judged(correction, seen)
-    away = np.abs(errors / deviations)
-    roots = (float(np.sqrt(np.mean(each**2))) for each in (seen.errors, errors))
-    return dict(zip(("filter_rmse", "rmse"), roots, strict=True)) | {
-        "coverage": float(np.mean(away < NORMAL_95)),
-        "nees": float(np.mean(away**2)),
+    squares = (errors / deviations) ** 2
+    return {
+        "filter_rmse": float(np.mean(seen.errors**2) ** 0.5),
+        "rmse": float(np.mean(errors**2) ** 0.5),
+        "coverage": float(np.mean(squares < NORMAL_95**2)),
+        "nees": float(np.mean(squares)),
     }

@@ -40,7 +40,8 @@ def train_estimator_command(
     check_files(correction=target)
     wanted = dict.fromkeys(scenarios or [each.scenario for each in contests()])
     drives = [(c.env_id, c.env_options) for c in contests() if c.scenario in wanted]
-    drives += [(YAW, {"scenario": each}) for each in wanted if each not in str(drives)]
+    known = {c.scenario for c in contests()}
+    drives += [(YAW, {"scenario": each}) for each in wanted if each not in known]
     both, options = SENSOR_SETS["fusion"], options_of(option)
     there = make_estimator(base, sensors=both, slow=list(both), **options).names
     card = CorrectionCard(
