@@ -94,6 +94,7 @@ _MODEL = [  # dx = A x + B u on the first `dense` states; those behind them deca
     ("load", _FLOAT, (2,)),  # N, on the axles
     ("per_tyre", _FLOAT, (2, 2)),  # N, of each axle by its factor, by the grip's state
     ("rest", _FLOAT, (2,)),  # N, of each axle where all that is linear is zero
+    ("q_tyres", _FLOAT, (3,)),  # variances of a step of the factors and the grip, while it moves
     ("model_error", _FLOAT),  # share of the axles' forces by which the tyres' law errs
     ("q_known", _FLOAT, (2,)),  # variances of a step of F_d, N_d without it
     ("q_share", _FLOAT),  # share of a disturbance's variance that comes in a step

@@ -39,6 +39,15 @@ def axle_force(stiffness: Any, load: Any, alpha: Any, factor: Any, grip: Any) ->
 
 
 @jit
+def _walk(f: Memory, moves: bool) -> None:
+    """Tyres walk while the car moves, and no further than they were unknown at the start."""
+    for i in range(3 if f.grip > 0 else 2):
+        at = f.tyres + i if i < 2 else f.grip
+        walks = moves and f.P[at, at] < f.prior[at, at]
+        f.Q[at, at] = f.q_tyres[i] if walks else 0.0
+
+
+@jit
 def linearise(f: Memory, steer: Any) -> None:
     """Expand both axles' forces at the present state; steer: rad, of the front wheels."""
     x, V = f.x, maximum(f.model_speed, SLOWEST)
@@ -49,7 +58,8 @@ def linearise(f: Memory, steer: Any) -> None:
         grip = minimum(maximum(x[f.grip], 0.0), MOST)
         x[f.grip] = grip
     beta, gamma = x[0], x[1]
-    push = 0.0
+    push, moves = 0.0, f.speed > SLOWEST
+    _walk(f, moves)
     for i in range(2):
         arm = f.car[CAR.front_arm] if i == 0 else 0.0 - f.car[CAR.rear_arm]
         alpha = (steer if i == 0 else 0.0) - beta - arm * gamma / V
@@ -58,6 +68,8 @@ def linearise(f: Memory, steer: Any) -> None:
             f.stiffness[i], f.load[i], alpha, factor, grip
         )
         f.car[CAR.front_stiffness + i] = 0.5 * slope
+        if not moves:  # nothing of the tyres is seen
+            per_factor, per_grip = 0.0, 0.0
         f.per_tyre[i, 0], f.per_tyre[i, 1] = per_factor, per_grip
         f.rest[i] = force - slope * alpha - per_factor * factor - per_grip * grip
         push += absolute(force)

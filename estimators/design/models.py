@@ -216,7 +216,9 @@ def _write_tyres(f: Memory, model: Model, vehicle: Vehicle) -> None:
     arms = np.array([vehicle.rear_arm, vehicle.front_arm])
     f.load[:] = vehicle.mass * GRAVITY * arms / wheelbase
     f.first[f.tyres : f.tyres + 2] = 1.0
+    f.q_tyres[:2] = np.diag(f.Q)[f.tyres : f.tyres + 2]
     if f.grip:
+        f.q_tyres[2] = f.Q[f.grip, f.grip]
         f.first[f.grip] = 1.0 / vehicle.friction
 
 

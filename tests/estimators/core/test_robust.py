@@ -12,7 +12,7 @@ import pytest
 import sideslip
 from sideslip.agents.rollout import rollout
 from sideslip.envs import Log
-from sideslip.envs.record import FAST
+from sideslip.envs.record import FAST, PACKET
 from sideslip.envs.vehicle.vehicle import GRAVITY
 from sideslip.estimators import Estimator, make_estimator
 
@@ -107,3 +107,37 @@ def test_on_a_strange_car_its_intervals_mean_something() -> None:
         run = make_estimator(name, vehicle=car, **known).run(log)
         nees.append(np.mean(((run.x[:, 0] - beta) / run.std[:, 0])[2000:] ** 2))
     assert nees[0] < 3.0 and nees[1] > 10.0
+
+
+@pytest.mark.parametrize("name", ["joint", "joint-robust"])
+def test_ten_minutes_at_a_standstill_change_nothing_that_is_not_seen(name: str) -> None:
+    """Gyro and accelerometer are off, the wheels' noise is all that moves; then it drives again."""
+    scenario = {
+        "base": "random-steering",
+        "duration": 12.0,
+        "noise": {"gyro_bias": 0.0087, "accel_y_bias": 0.1},
+    }
+    env: Any = gym.make("sideslip/YawFusion-v0", scenario=scenario)
+    log = rollout(env, seed=0).log
+    first, packets, rng = log.record.fast, log.record.packets, np.random.default_rng(0)
+    rows = 90 * 6600 - len(first)  # whole periods of both slow sensors
+    still = np.zeros((rows, first.shape[1]))
+    still[:, FAST.gyro] = 0.0087 + 0.005 * rng.standard_normal(rows)
+    still[:, FAST.accel_y] = 0.1 + 0.1 * rng.standard_normal(rows)
+    still[:, FAST.wheel_left] = still[:, FAST.wheel_right] = 0.02 * np.abs(rng.normal(size=rows))
+    still[:1000] += np.linspace(1.0, 0.0, 1000)[:, None] * first[-1]
+    later = packets.copy()
+    later[:, [PACKET.captured, PACKET.arrived]] += 90 * 6600
+    record = dataclasses.replace(
+        log.record, fast=np.vstack([first, still, first]), packets=np.vstack([packets, later])
+    )
+    filter_ = built(name, log, bias_sd=0.01)
+    run = filter_.run(dataclasses.replace(log, record=record, truth={}))
+    tyres = [filter_.names.index(f"{axle}_tyres") for axle in ("front", "rear")]
+    stop, go = len(first) + 1200, len(first) + rows - 1
+    assert (np.abs(run.x[go] - run.x[stop])[tyres] < 2.0 * run.std[stop, tyres]).all()
+    assert (run.std[go, tyres] < 0.25).all() and np.isfinite(run.x).all()
+    assert np.abs(run["beta"][stop : go + 1]).max() < 0.05
+    truth = log.truth["beta"][2000:]
+    errors = [run["beta"][start + 2000 :][: len(truth)] - truth for start in (0, go + 1)]
+    assert np.std(errors[1]) < 1.3 * np.std(errors[0])
