@@ -150,7 +150,7 @@ def test_a_logged_course_is_used_as_it_is(tmp_path: Path) -> None:
     unscored = replay(
         read_log(saved(tmp_path, course_rad=course, sideslip_rad=None)), PASSENGER_CAR
     )
-    assert set(values(unscored, "us_per_tick")) == set(ESTIMATORS)
+    assert set(values(unscored, "us_per_tick")) == set(rmse)
     assert values(unscored, "rmse") == {}
 
 
