@@ -1,1 +1,1 @@
-"""Replay of recorded drives: estimators on a log, scored where the log knows the truth."""
+"""Recorded drives: estimators on a log, scored where it knows the truth, and the car behind it."""

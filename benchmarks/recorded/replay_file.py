@@ -11,7 +11,7 @@ from ...envs.vehicle.vehicles import VehicleSource, vehicle_from
 from ..harness.drives import SETTLED
 from ..harness.results import Suite
 from .checks import warnings_of
-from .identify import identify, suite_of
+from .identify import Identified, identify, suite_of
 from .suite import corners, replay
 from .wires import Wires, corrected
 
@@ -26,8 +26,8 @@ def identify_file(
     wires: Wires | None = None,
     tyres: str | None = None,
     until: float | None = None,
-) -> tuple[Any, Suite]:
-    """Read a drive and find its car: (`Identified`, its table).
+) -> tuple[Identified, Suite]:
+    """Read a drive and find its car: (what the log shows, its table).
 
     until: s of the log that are used, None: all. Raises what `read_parts`, `vehicle_from` and
     `identify` do.
