@@ -70,7 +70,7 @@ def replay_file(
         found, shown = identify_file(log, nominal, mapping or (), wires, until=until)
         vehicle, tables = found.car, shown.tables
         latency = {**found.wires.latency, **wires.latency}
-        wires = found.wires._replace(latency=latency, noise=found.wires.noise | dict(wires.noise))
+        wires = found.wires._replace(latency=latency, noise={**found.wires.noise, **wires.noise})
     logs, remarks = read_parts(log, parse_mapping(mapping or ()), start=until or 0.0)
     logs = [corrected(part, wires) for part in logs]
     if vehicle is None:
