@@ -6,6 +6,7 @@ from typing import Any, Protocol, overload
 
 from ..envs.arguments import check_options
 from ..estimators.registry import Registry
+from .controllers.adaptive import AdaptiveLqr, AdaptiveNmpc
 from .controllers.base import Controller, NoControl
 from .controllers.esc import Esc
 from .controllers.lane_keeping import LaneKeeping
@@ -29,6 +30,8 @@ AGENTS = Registry(
         "esc": Esc,
         "sliding-mode": SlidingMode,
         "lqr": Lqr,
+        "adaptive-lqr": AdaptiveLqr,
+        "adaptive-nmpc": AdaptiveNmpc,
         "mpc": Mpc,
         "nmpc": Nmpc,
         "lane-keeping": LaneKeeping,
@@ -39,6 +42,8 @@ AGENTS = Registry(
 
 __all__ = [
     "AGENTS",
+    "AdaptiveLqr",
+    "AdaptiveNmpc",
     "Agent",
     "Controller",
     "Esc",

@@ -22,13 +22,17 @@ from .controllers.base import FRICTION, Controller
 from .controllers.lqr import Lqr
 from .controllers.nmpc import Nmpc
 
-NOMINAL, PARAMETERS = "nominal", "oracle-parameters"
-STATE_LQR, STATE_NMPC = "oracle-state-lqr", "oracle-state-nmpc"
-RUNGS = (NOMINAL, PARAMETERS, STATE_LQR, STATE_NMPC)
-"""From the bottom up: `oracle-parameters` knows car, friction, noise and biases, the last two also
-the state and what pushes the car; neither of these is always the better one."""
+NOMINAL = "nominal"
+PARAMETERS = ("oracle-parameters-lqr", "oracle-parameters-nmpc")
+STATE = ("oracle-state-lqr", "oracle-state-nmpc")
+RUNGS = (NOMINAL, *PARAMETERS, *STATE)
+"""From the bottom up: those of `PARAMETERS` know car, friction, noise and biases, those of `STATE`
+also the state and what pushes the car; neither controller is always the better one."""
 
 FILTER = "exact-kf"
+CURVED = "joint"
+KNOWN = dict.fromkeys(("front_tyres_sd", "rear_tyres_sd", "inverse_friction_sd"), 1e-3)
+"""The filter of tyres that have a limit, which it knows but for a thousandth."""
 OUTPUTS = ("beta", "gamma", "F_d", "N_d")
 STATES = (*OUTPUTS, "phi", "phi_rate")
 GRIP = 0.7  # share of the rear tyres' grip for the yaw moment; 0.71 of it is left across
@@ -98,7 +102,7 @@ def make_rung(
     if len(chosen) != 2:
         raise TypeError(f"options of a rung are 'filter' and 'controller', got {sorted(chosen)}")
     alone: Any = gym.make(env_id, **env_kwargs)
-    if name == PARAMETERS:
+    if name in PARAMETERS:
         unbiased = without_biases(alone.unwrapped.scenario)
         env_kwargs |= {"scenario": unbiased.to_dict()}
         alone = gym.make(env_id, **env_kwargs)
@@ -106,28 +110,37 @@ def make_rung(
     env = alone
     if num_envs is not None:
         env = gym.make_vec(env_id, num_envs=num_envs, **dict(vector_kwargs or {}), **env_kwargs)
-    if name in (NOMINAL, PARAMETERS):
-        vehicle = TRUTH if name == PARAMETERS else None
-        env = _filtered(env, base, vehicle, chosen["filter"])
+    if name not in STATE:
+        env = _filtered(env, base, name in PARAMETERS, chosen["filter"])
     if name != NOMINAL:
         told = VectorTruthObservation if num_envs is not None else TruthObservation
-        states = () if name == PARAMETERS else STATES
+        states = () if name in PARAMETERS else STATES
         parameters = (*STIFFNESSES, FRICTION.removeprefix("true_"))
         env = told(env, parameters, states)
     settings: dict[str, Any] = {"disturbance_time": base.scenario.disturbance_time, "grip": GRIP}
-    if name != STATE_NMPC:  # which foresees the steering's rate
+    plans = name in (PARAMETERS[1], STATE[1])
+    if not plans:  # a plan foresees the steering's rate
         settings["steer_weight"] = STEER_WEIGHT
     if name != NOMINAL:
         settings |= {"vehicle": base.vehicle, "stiffness": [f"true_{each}" for each in STIFFNESSES]}
-    kind = Nmpc if name == STATE_NMPC else Lqr
+    kind = Nmpc if plans else Lqr
     return env, kind(env, **settings | dict(chosen["controller"]))
 
 
-def _filtered(env: Any, base: Any, vehicle: str | None, options: Mapping[str, Any]) -> Any:
-    """The env with `exact-kf` on all of its slow sensors."""
+def _filtered(env: Any, base: Any, told: bool, options: Mapping[str, Any]) -> Any:
+    """The env with a filter on all of its slow sensors, that of the true tyres where it is told."""
     levels = levels_of(base.scenario) | {"slow": list(base.slow_sensors)}
     if "gps" not in base.slow_sensors:
         del levels["hdop_table"]
+    curved = told and base.scenario.tyres == "fiala"
+    if curved:
+        levels |= KNOWN
     wrapper = EstimateObservation if isinstance(env, gym.Env) else vector.EstimateObservation
-    settings = levels | dict(options)
-    return wrapper(env, FILTER, outputs=OUTPUTS, std=False, vehicle=vehicle, options=settings)
+    return wrapper(
+        env,
+        CURVED if curved else FILTER,
+        outputs=OUTPUTS,
+        std=False,
+        vehicle=TRUTH if told else None,
+        options=levels | dict(options),
+    )

@@ -21,7 +21,7 @@ from ..envs.task.failures import FAILURES
 from ..estimators.wrappers.estimate import EstimateObservation
 from .control.build import agent_options, estimate_options
 from .control.cells import REFERENCE_FILTER, Cell
-from .control.contests import STATES, Contest
+from .control.contests import ORACLES, STATE, Contest
 from .harness.drives import make_env, quietly
 from .harness.parallel import chunked, run_cases
 from .harness.results import Row, Suite, Table
@@ -30,7 +30,7 @@ from .harness.verdict import percent, verdict
 
 NAME, ID = "highway", "sideslip/Highway-v0"
 CONTEST = Contest("", ID, "passenger-car", "lagged", "wet-evasion")
-ORACLE = STATES[0]
+ORACLE = ORACLES[STATE][0]
 READS = {"none": "", "ppo-yaw-vision": "", ORACLE: ""}
 CONTROLLERS = ("none", "ppo-yaw-vision", "two-dof", "lqr", "nmpc", ORACLE)
 SEEDS, QUICK_SEEDS, CHUNK = 64, 16, 8

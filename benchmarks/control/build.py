@@ -14,11 +14,12 @@ from gymnasium.vector.utils import batch_space
 from ...agents import make_agent
 from ...agents.learned.files import is_policy, load_policy
 from ...agents.rollout import steps_of
-from ...agents.rungs import FILTER, GRIP, STEER_WEIGHT, levels_of, make_rung
+from ...agents.rungs import CURVED, FILTER, GRIP, STEER_WEIGHT, levels_of, make_rung
 from ...envs.arguments import brief
 from ...envs.scenarios.manoeuvres import scenario_from
 from ...envs.sensors.slow import SENSOR_SETS
 from ...envs.task.observation import Entry
+from ...estimators.design.models import TYRES
 from ...estimators.filters import FILTERS
 from ...estimators.vector.estimate import EstimateObservation
 from ..harness.drives import quietly
@@ -63,7 +64,9 @@ class TrueState(VectorWrapper[Any, Any, Any, Any, Any]):
 def outputs_for(estimator: str) -> tuple[str, ...]:
     """The estimates that controllers read: beta, gamma, and disturbances if there are any."""
     row = FILTERS.get(name_of(estimator))  # a user's own has none
-    return ("beta", "gamma", *_DISTURBANCES.get(row.disturbances if row else "", ()))
+    options = SETUPS.get(estimator, ("", {}))[1] | dict(row.options if row else ())
+    tyres = tuple(name for name in TYRES if f"{name}_sd" in options)
+    return ("beta", "gamma", *_DISTURBANCES.get(row.disturbances if row else "", ()), *tyres)
 
 
 def name_of(estimator: str) -> str:
@@ -82,9 +85,9 @@ def estimate_options(cell: Cell) -> dict[str, Any]:
         name, options = SETUPS[cell.estimator]
         if cell.estimator == REFERENCE_FILTER:
             options = options | {"slow": slow_sensors(cell.contest.env_id)}
-        if name == FILTER:
+        if name in (FILTER, CURVED):
             levels = levels_of(scenario_from(cell.env_options["scenario"]))
-            options = levels | cell.best["filter"] | options
+            options = levels | (cell.best["filter"] if name == FILTER else {}) | options
             unused = set() if "gps" in options["slow"] else {"hdop_table"}
             if "accel_y" not in options["fast"]:
                 unused |= {"accel_y_noise", "accel_bias_sd"}

@@ -7,7 +7,7 @@ from typing import Any
 from ...agents import AGENTS
 from ...agents.learned.files import is_policy
 from ...agents.tuned import Options, tuned
-from .contests import NOMINAL, PARAMETERS, STATE, STATES, STEERING, TIERS, YAW, Contest, oracle_of
+from .contests import NOMINAL, ORACLES, PARAMETERS, STATE, STEERING, TIERS, YAW, Contest, oracle_of
 
 TRUTH, REFERENCE_CONTROLLER = "truth", "lqr"
 REFERENCE_FILTER = "exact-kf, all sensors"
@@ -21,9 +21,13 @@ SETUPS: dict[str, tuple[str, dict[str, Any]]] = {
     "exact-kf, camera": ("exact-kf", {"slow": ["camera"]}),
     "exact-kf, gps": ("exact-kf", {"slow": ["gps"]}),
     "multirate-kf, camera and gps": ("multirate-kf", {"slow": ["camera", "gps"]}),
+    "joint": ("joint", {"slow": ["camera", "gps"]}),
+    "joint, friction": ("joint", {"slow": ["camera", "gps"], "inverse_friction_sd": 0.3}),
 }
 """Filters by what they are called in the tables: a name of `make_estimator` and its options, over
 the contestant's tuned ones where the filter is `exact-kf`."""
+ADAPTIVE = {"joint": "adaptive-lqr", "joint, friction": "adaptive-nmpc"}
+"""By the filter whose tyres they follow."""
 ESTIMATORS = (*SETUPS, "single-rate-kf", "uneven-delay-kf", "dakf", "bicycle-kf", TRUTH)
 CONTROLLERS: dict[str, tuple[str, ...]] = {
     YAW: ("two-dof", "esc", "sliding-mode", "mpc", "nmpc"),
@@ -31,17 +35,21 @@ CONTROLLERS: dict[str, tuple[str, ...]] = {
 }
 """Besides the reference controller, on the reference filter."""
 RUNGS = (NOMINAL, PARAMETERS, STATE)
+_CANDIDATES = tuple(name for those in ORACLES.values() for name in those)
 LEARNED: tuple[tuple[str, str], ...] = (("", "ppo-yaw-vision"),)
 """(estimator, policy), a policy by its shipped name or path; in tier 1, whose car it knows. One
 that was trained on fewer sensors reads what it knows by name."""
 SHARED = {
     "mpc": {"grip", "disturbance_time"},
     "nmpc": {"grip", "disturbance_time"},
-    PARAMETERS: {"grip", "steer_weight"},
+    "adaptive-lqr": {"grip", "disturbance_time", "steer_weight"},
+    "adaptive-nmpc": {"grip", "disturbance_time"},
+    ORACLES[PARAMETERS][0]: {"grip", "steer_weight"},
+    ORACLES[PARAMETERS][1]: {"grip"},
 }
 """What contestants too slow to be tuned take over from `nominal`'s controller; of its filter all,
 where they do not know the truth."""
-SLOW_CONTROLLERS = ("mpc", "nmpc", STATES[1], PARAMETERS)
+SLOW_CONTROLLERS = ("mpc", "nmpc", "adaptive-nmpc", ORACLES[STATE][1], ORACLES[PARAMETERS][1])
 
 EPISODES, QUICK_EPISODES, SLOW_EPISODES = 1000, 8, 128
 QUICK_CONTESTS = 2
@@ -81,7 +89,7 @@ class Cell:
     def is_users(self) -> bool:
         """Whether its controller is a user's own."""
         name = self.controller
-        known = name in AGENTS or name in (*RUNGS, *STATES) or is_policy(name)
+        known = name in AGENTS or name in (*RUNGS, *_CANDIDATES) or is_policy(name)
         return "controller" in self.objects or not known
 
     @property
@@ -93,13 +101,13 @@ class Cell:
             return self.tuned
         if self.is_users:
             return tuned(self.contest.kind, NOMINAL) | {"controller": {}}
-        kind, name = self.contest.kind, self.controller
+        kind, name = self.contest.kind, self.rung or self.controller
         if name in SHARED and not any(tuned(kind, name).values()):
             best = tuned(kind, NOMINAL)
             shared = {
                 key: best["controller"][key] for key in SHARED[name] & best["controller"].keys()
             }
-            return {"filter": {} if name == PARAMETERS else best["filter"], "controller": shared}
+            return {"filter": {} if self.rung else best["filter"], "controller": shared}
         return tuned(kind, NOMINAL if name == REFERENCE_CONTROLLER else name)
 
     @property
@@ -117,9 +125,9 @@ class Cell:
         """The rung of the ladder that drives, "" where a contestant does."""
         if self.is_users:
             return ""
-        if self.controller == STATE:
-            return oracle_of(self.contest)
-        return self.controller if self.controller in (*RUNGS, *STATES) else ""
+        if self.controller in ORACLES:
+            return oracle_of(self.contest, self.controller)
+        return self.controller if self.controller in (NOMINAL, *_CANDIDATES) else ""
 
     @property
     def slow(self) -> bool:
@@ -138,6 +146,7 @@ def cells(contests: Sequence[Contest], quick: bool = False) -> Iterator[Cell]:
         filters = ESTIMATORS if first else (REFERENCE_FILTER, TRUTH)
         made += [Cell(contest, name, REFERENCE_CONTROLLER) for name in filters]
         made += [Cell(contest, REFERENCE_FILTER, who) for who in CONTROLLERS[contest.env_id]]
+        made += [Cell(contest, name, who) for name, who in ADAPTIVE.items()]
         if contest.tier == "1":
             made += [Cell(contest, estimator, policy) for estimator, policy in LEARNED]
         yield from (cell for cell in made if not (quick and cell.slow and not cell.rung))

@@ -18,13 +18,15 @@ from .cells import Cell
 from .contests import (
     LIMIT,
     NOMINAL,
-    STATES,
+    ORACLES,
+    PARAMETERS,
+    STATE,
     Contest,
     Measured,
     candidates,
     write_contests,
 )
-from .episodes import Array
+from .episodes import Array, Driven
 from .run import Results, measure
 from .scores import Yardstick, survived
 from .seeds import tuning_seeds
@@ -36,8 +38,8 @@ nominal fails in less than this share (at the limit in any, but never always).""
 
 
 def rungs_of(contest: Contest) -> list[Cell]:
-    """Nominal and both candidates for `oracle-state`."""
-    return [Cell(contest, "", name) for name in (NOMINAL, *STATES)]
+    """Nominal and the candidates for the oracles."""
+    return [Cell(contest, "", name) for name in (NOMINAL, *ORACLES[PARAMETERS], *ORACLES[STATE])]
 
 
 def judged(results: Results, contest: Contest) -> Measured:
@@ -46,33 +48,45 @@ def judged(results: Results, contest: Contest) -> Measured:
     A rung that could not be computed, and cars that all fail, leave a gap of 0 and the reason.
     """
     nominal = results.of(contest, NOMINAL)
-    found: list[tuple[float, float, str, Estimate, int]] = []
     errors = [f"{NOMINAL}: {nominal.error}"] if nominal.error else []
-    for name in STATES:
-        oracle = results.of(contest, name)
-        if oracle.error:
-            errors.append(f"{name}: {oracle.error}")
-            continue
-        if nominal.error:
-            continue
-        own = Yardstick(nominal, oracle).paired(oracle)[1]
-        gap, failing = _gap(own), float(np.mean(~survived(oracle)))
-        found.append((failing > FAILING, -gap.value, name, gap, len(own)))
     failing = 1.0 if nominal.error else float(np.mean(~survived(nominal)))
-    nothing = (True, 0.0, STATES[0], Estimate(0.0, 0.0, 0.0), 0)
-    _, _, name, gap, kept = min(found) if found else nothing
+    knowing, _, _, _ = _better(results, contest, PARAMETERS, nominal)
+    name, gap, kept, more = _better(results, contest, STATE, nominal)
+    errors += more
     return Measured(
         **asdict(contest),
         env_version=__version__,
         oracle=name,
+        knowing=knowing,
         gap=round(gap.value, 4),
         low=round(gap.low, 4),
         high=round(gap.high, 4),
         failing=round(failing, 4),
         judged=kept,
         n=len(nominal.costs),
-        verdict=_verdict(contest, gap, failing, kept) if found else "; ".join(errors),
+        verdict="; ".join(errors)
+        if nominal.error or len(more) == len(ORACLES[STATE])
+        else _verdict(contest, gap, failing, kept),
     )
+
+
+def _better(
+    results: Results, contest: Contest, rung: str, nominal: Driven
+) -> tuple[str, Estimate, int, list[str]]:
+    """(name, gap to nominal, episodes judged) of the better candidate, and what went wrong."""
+    found: list[tuple[bool, float, str, Estimate, int]] = []
+    errors = []
+    for name in ORACLES[rung]:
+        oracle = results.of(contest, name)
+        if oracle.error:
+            errors.append(f"{name}: {oracle.error}")
+        elif not nominal.error:
+            own = Yardstick(nominal, oracle).paired(oracle)[1]
+            gap, failing = _gap(own), float(np.mean(~survived(oracle)))
+            found.append((failing > FAILING, -gap.value, name, gap, len(own)))
+    nothing = (True, 0.0, ORACLES[rung][0], Estimate(0.0, 0.0, 0.0), 0)
+    _, _, name, gap, kept = min(found) if found else nothing
+    return name, gap, kept, errors
 
 
 def _gap(own: Array) -> Estimate:
@@ -114,11 +128,21 @@ def main() -> None:
     arguments = parser.parse_args()
     console = Console()
     found = choose(None, arguments.episodes, arguments.jobs, console)
-    table = Table("tier", "contest", "oracle-state", "gap", "nominal fails / %", "verdict")
+    table = Table(
+        "tier",
+        "contest",
+        "oracle-parameters",
+        "oracle-state",
+        "gap",
+        "nominal fails / %",
+        "verdict",
+    )
     for each in found:
         gap = f"{each.gap:.2f} [{each.low:.2f}, {each.high:.2f}]"
         failing = f"{100.0 * each.failing:.1f}"
-        table.add_row(each.tier, each.contest.name, each.oracle, gap, failing, each.verdict)
+        table.add_row(
+            each.tier, each.contest.name, each.knowing, each.oracle, gap, failing, each.verdict
+        )
     console.print(table)
     if arguments.write:
         write_contests(found)

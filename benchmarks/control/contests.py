@@ -22,8 +22,11 @@ FILE = Path(__file__).with_name("contests.json")
 COMMAND = "python -m sideslip.benchmarks.control.choice --write"
 
 NOMINAL, PARAMETERS, STATE = "nominal", "oracle-parameters", "oracle-state"
-STATES = ("oracle-state-lqr", "oracle-state-nmpc")
-"""The rungs of which a contest's better one is its `oracle-state`."""
+ORACLES = {
+    PARAMETERS: ("oracle-parameters-lqr", "oracle-parameters-nmpc"),
+    STATE: ("oracle-state-lqr", "oracle-state-nmpc"),
+}
+"""The rungs of which a contest's better one has the name."""
 
 TIERS: dict[str, tuple[tuple[str, str, str], ...]] = {
     "1": ((STEERING, "coms", "model"), (YAW, "coms", "zero-slip")),
@@ -77,7 +80,8 @@ class Contest:
 class Measured:
     """A candidate with what was measured on tuning seeds: an entry of the file.
 
-    oracle: the better of `STATES`. gap: mean log(J_nominal / J_oracle) of the episodes that both
+    oracle, knowing: the better of `ORACLES` for state and for parameters. gap: mean
+    log(J_nominal / J_oracle) of the episodes that both
     survive, `judged` of n, with its 95 % interval; failing: the share in which nominal fails.
     verdict: "scored", or why not.
     """
@@ -89,6 +93,7 @@ class Measured:
     scenario: str
     env_version: str
     oracle: str
+    knowing: str
     gap: float
     low: float
     high: float
@@ -128,7 +133,8 @@ def read_contests(path: Path = FILE) -> tuple[Measured, ...]:
                 f"{where} was measured with version {entry.env_version}, this is {__version__}; "
                 f"measure the contests anew: {COMMAND}"
             )
-        check_choice(f"{where}: oracle", entry.oracle, STATES)
+        check_choice(f"{where}: oracle", entry.oracle, ORACLES[STATE])
+        check_choice(f"{where}: knowing", entry.knowing, ORACLES[PARAMETERS])
         if entry.contest not in candidates():
             raise ValueError(f"{where}: {entry.contest} is no contest of this version; {COMMAND}")
         found.append(entry)
@@ -147,10 +153,13 @@ def contests() -> tuple[Contest, ...]:
 
 
 @cache
-def _oracles() -> dict[Contest, str]:
-    return {each.contest: each.oracle for each in read_contests()} if FILE.is_file() else {}
+def _measured() -> dict[Contest, Measured]:
+    return {each.contest: each for each in read_contests()} if FILE.is_file() else {}
 
 
-def oracle_of(contest: Contest) -> str:
-    """The better of `STATES` in a contest; LQR where none was measured."""
-    return _oracles().get(contest, STATES[0])
+def oracle_of(contest: Contest, name: str = STATE) -> str:
+    """The better of `ORACLES` of a name in a contest; LQR where none was measured."""
+    found = _measured().get(contest)
+    if found is None:
+        return ORACLES[name][0]
+    return found.oracle if name == STATE else found.knowing

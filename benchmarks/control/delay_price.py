@@ -10,7 +10,7 @@ from rich.console import Console
 from ...envs.record import Array
 from ..harness.stats import Estimate, geometric_mean
 from .cells import REFERENCE_CONTROLLER, REFERENCE_FILTER, Cell
-from .contests import NOMINAL, PARAMETERS, STATES, YAW, Contest
+from .contests import NOMINAL, ORACLES, PARAMETERS, STATE, YAW, Contest
 from .run import Results, measure
 from .scores import gains, survived
 
@@ -18,7 +18,7 @@ DELAYS = (0.0, 0.05, 0.1, 0.2, 0.3)  # s, of camera and GPS alike, beside what t
 FRAME = 0.05  # s: so slow that a camera's frames 0.3 s late find room under way
 PRICE_CONTEST = Contest("1", YAW, "coms", "zero-slip", "coms-random")
 CONTESTANTS = (
-    *((NOMINAL, ""), (PARAMETERS, ""), (STATES[0], "")),
+    *((NOMINAL, ""), (ORACLES[PARAMETERS][0], ""), (ORACLES[STATE][0], "")),
     *((REFERENCE_CONTROLLER, each) for each in (REFERENCE_FILTER, "multirate-kf", "bicycle-kf")),
 )
 

@@ -76,11 +76,11 @@ SPACES: dict[str, tuple[Number, ...]] = {
         *_MPC,
     ),
     "nominal": _LQG,
-    "oracle-parameters": tuple(each for each in _LQG if each.name != "bias_sd"),  # it knows it
+    "oracle-parameters-lqr": tuple(each for each in _LQG if each.name != "bias_sd"),  # it knows it
 }
 """By contestant; all but the rungs, which bring their own, drive on `exact-kf` with all sensors.
 In the matrix `lqr` has what was found for `nominal`, which is the same design."""
-SLOW = ("mpc", "nmpc", "oracle-parameters")
+SLOW = ("mpc", "nmpc", "oracle-parameters-lqr")
 """Contestants whose worse trials end after a few seeds."""
 
 

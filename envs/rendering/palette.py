@@ -45,6 +45,8 @@ CONTROLLERS = {
     "lqr": "#D85A00",
     "mpc": "#127EE1",
     "nmpc": "#3F3FFC",
+    "adaptive-lqr": "#A84300",
+    "adaptive-nmpc": "#1F1FA0",
     "lane-keeping": "#486C3F",
     "learned": "#D8636C",
     "ppo-yaw-vision": "#AB6387",

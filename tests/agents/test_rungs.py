@@ -55,7 +55,7 @@ def test_rows_of_a_vector_env_have_the_bits_of_single_ones(rung: str, env_id: st
 
 def test_gains_between_the_knots_are_those_of_the_true_car() -> None:
     """Interpolated over speed and both stiffnesses, against a design for the car at hand."""
-    _, agent = make_rung("oracle-parameters", FUSION)
+    _, agent = make_rung("oracle-parameters-lqr", FUSION)
     assert isinstance(agent, Lqr)
     rng = np.random.default_rng(0)
     for _ in range(20):
@@ -98,7 +98,7 @@ def test_levels_are_the_scenarios() -> None:
 def test_biases_are_taken_away_for_the_oracle_alone() -> None:
     biased = {"base": "straight", "noise": {"gyro_bias": 0.2, "gyro": 1e-9}, "speed": 7.0}
     biased |= {"gyro_bias": 0.1, "accel_y_bias": (0.1, 0.2)}
-    for rung, wanted in (("nominal", 0.3), ("oracle-parameters", 0.0)):
+    for rung, wanted in (("nominal", 0.3), ("oracle-parameters-lqr", 0.0)):
         env, _ = make_rung(rung, FUSION, scenario=biased)
         obs, _ = env.reset(seed=0)
         assert obs[0] == pytest.approx(wanted, abs=1e-3)
@@ -107,7 +107,9 @@ def test_biases_are_taken_away_for_the_oracle_alone() -> None:
 
 def test_one_table_serves_all_who_ask_for_it() -> None:
     """The design takes a second."""
-    rungs = [make_rung("oracle-parameters", FUSION, scenario=name)[1] for name in ("sine", "gust")]
+    rungs = [
+        make_rung("oracle-parameters-lqr", FUSION, scenario=name)[1] for name in ("sine", "gust")
+    ]
     assert all(isinstance(each, Lqr) for each in rungs)
     assert rungs[0].table is rungs[1].table  # type: ignore[attr-defined]
 

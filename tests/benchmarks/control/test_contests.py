@@ -12,8 +12,9 @@ from sideslip.benchmarks.control.cells import RUNGS, Cell
 from sideslip.benchmarks.control.choice import judged, rungs_of
 from sideslip.benchmarks.control.contests import (
     NOMINAL,
+    ORACLES,
+    PARAMETERS,
     STATE,
-    STATES,
     TIERS,
     Contest,
     Measured,
@@ -30,6 +31,7 @@ from sideslip.benchmarks.harness.stats import average
 from sideslip.envs import FAILURES, SCENARIOS
 
 ONE = candidates()[0]
+STATES = ORACLES[STATE]
 LIMIT = next(contest for contest in candidates() if contest.tier == "2c")
 
 
@@ -75,6 +77,10 @@ def test_an_oracle_that_fails_more_often_is_not_the_better_one() -> None:
     levels = {NOMINAL: 2.0, STATES[0]: 0.5, STATES[1]: 1.0}
     assert found(ONE, levels).oracle == STATES[0]
     assert found(ONE, levels, oracle_state_lqr=20).oracle == STATES[1]
+    who = ORACLES[PARAMETERS]
+    knowing = levels | {who[0]: 1.5, who[1]: 1.2}
+    assert found(ONE, knowing).knowing == who[1]
+    assert found(ONE, knowing, oracle_parameters_nmpc=20).knowing == who[0]
 
 
 def test_a_rung_that_cannot_be_computed_leaves_the_other_or_the_reason() -> None:
@@ -102,6 +108,7 @@ def test_the_file_holds_every_number_and_is_refused_where_it_is_another_versions
         ({"scenario": "moon"}, "is no contest of this version"),
         ({"tier": "2a"}, "is no contest of this version"),
         ({"oracle": "nobody"}, "nobody"),
+        ({"knowing": "oracle-state-lqr"}, "oracle-state-lqr"),
         ({"gap": "wide"}, "gap is 'wide', not float"),
     ):
         path.write_text(json.dumps([dataclasses.asdict(entry) | change]))
