@@ -9,7 +9,7 @@ from ...envs.task.failures import FAILURES
 from ..harness.results import Table
 from ..harness.stats import Estimate, average, chance_of_no_less, geometric_mean, holm
 from ..harness.verdict import leader, some, verdict
-from .cells import REFERENCE_CONTROLLER, REFERENCE_FILTER, RUNGS, TRUTH, Cell
+from .cells import ADAPTIVE, REFERENCE_CONTROLLER, REFERENCE_FILTER, RUNGS, TRUTH, Cell
 from .contests import NOMINAL, PARAMETERS, STATE, TITLES, Contest, oracle_of
 from .delay_price import DELAYS, Price
 from .episodes import Array
@@ -185,9 +185,11 @@ def _estimators(found: Mapping[str, Sequence[Standing]]) -> dict[str, Gains]:
 
 
 def _controllers(found: Mapping[str, Sequence[Standing]]) -> dict[str, Gains]:
-    """What each controller on the reference filter, or on none, gains, the rungs left out."""
-    return _gains(found, "controller", lambda cell: (
-        cell.controller not in RUNGS and cell.estimator in ("", REFERENCE_FILTER)))  # fmt: skip
+    """What each controller on the reference filter, on none, or on that whose tyres it follows,
+    gains, the rungs left out."""
+    return _gains(found, "controller", lambda cell: cell.controller not in RUNGS and (
+        cell.estimator in ("", REFERENCE_FILTER) or cell.controller in ADAPTIVE.values()
+    ))  # fmt: skip
 
 
 def _gains(
