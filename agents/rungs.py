@@ -32,8 +32,8 @@ also the state and what pushes the car; neither controller is always the better 
 FILTER = "exact-kf"
 CURVED = "joint"
 KNOWN = dict.fromkeys(("front_tyres_sd", "rear_tyres_sd", "inverse_friction_sd"), 0.1)
-"""The filter of tyres that have a limit, which it knows to a tenth: so much does its law lack of the
-plant's. To a thousandth it believes itself, and costs 10 to 20 % more on tuning seeds."""
+"""The filter of tyres that have a limit, which it knows to a tenth: so much does its law lack of
+the plant's. To a thousandth it believes itself, and costs 1.1 to 4 times as much."""
 OUTPUTS = ("beta", "gamma", "F_d", "N_d")
 STATES = (*OUTPUTS, "phi", "phi_rate")
 GRIP = 0.7  # share of the rear tyres' grip for the yaw moment; 0.71 of it is left across

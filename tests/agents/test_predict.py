@@ -30,7 +30,8 @@ def steered() -> gym.Env[Any, Any]:
     """An env with all that any agent needs, whose action steers."""
     env = gym.make("sideslip/AfsYawFusion-v0", scenario="lane-change")
     camera = EstimateObservation(env, "multirate-kf", outputs=["psi", "y_l"])
-    return TruthObservation(EstimateObservation(camera, "dakf", outputs=STATES), PARAMETERS)
+    tyres = EstimateObservation(camera, "joint", outputs=["front_tyres", "rear_tyres"])
+    return TruthObservation(EstimateObservation(tyres, "dakf", outputs=STATES), PARAMETERS)
 
 
 @pytest.mark.parametrize("name", AGENTS)

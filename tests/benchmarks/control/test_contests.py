@@ -136,7 +136,7 @@ FIRST = {contest.tier: contest for contest in SCORED[::-1]}
 @pytest.mark.parametrize("contest", FIRST.values(), ids=FIRST)
 def test_the_ladder_falls_in_a_sample(contest: Contest) -> None:
     """Nominal costs more than oracle-state, paired, in the first scored contest of each tier."""
-    falls(contest, 16)
+    falls(contest, 24)
 
 
 @pytest.mark.long
