@@ -136,11 +136,15 @@ def answer(found: Array, lanes: Sequence[Array]) -> str:
         f"{100.0 * over[best]:.0f} % of no control's."
     )
     lost = [f"{K:.0f}" for i, K in enumerate(BANDWIDTHS) if i not in sure]
-    offset = {_keeper(i): each[:, 0] for i, each in enumerate(lanes) if KEEPERS[i][2] is not None}
+    offset = {
+        _keeper(i).replace(" alone", ""): each[:, 0]
+        for i, each in enumerate(lanes)
+        if KEEPERS[i][2] is not None
+    }
     first, *rest = sorted(offset, key=lambda name: offset[name].mean())
     ratio = {name: interval(offset[first], ratio_of_means, offset[name]) for name in rest}
     reads = first.partition(" on ")[2]
-    both, alone = (offset[f"{what} on {reads}"].mean() for what in ("both", "steering alone"))
+    both, alone = (offset[f"{what} on {reads}"].mean() for what in ("both", "steering"))
     change = f"{100.0 * (both / alone - 1.0):+.0f} %"
     return verdict(
         "Steering and the motors' yaw moment, by one controller; bandwidth: how fast it corrects.",

@@ -6,8 +6,8 @@ from typing import Any
 
 from ..envs.backend.files import whole
 from ..envs.rendering.palette import INK, colour
-from .control.cells import REFERENCE_FILTER
 from .control.contests import TITLES
+from .control.ladder import on_its_own
 from .harness.metrics import METRICS
 from .harness.results import Row, ShareMap, Suite
 from .report.colours import SHARE_SCALE
@@ -69,8 +69,8 @@ def write_picture(path: str | Path, suites: Sequence[Suite]) -> None:
 
 
 def _shown(row: Row) -> bool:
-    """Whether a row stands in the picture: of the scores those on the reference filter."""
-    return row.metric != "score" or row.estimator in ("", REFERENCE_FILTER)
+    """Whether a row stands in the picture: of the scores those on the controller's own filter."""
+    return row.metric != "score" or on_its_own(row.controller, row.estimator)
 
 
 def _maps(strip: Any, shown: ShareMap) -> None:

@@ -16,11 +16,11 @@ from ..harness.results import Suite
 from ..harness.stats import Estimate, geometric_mean
 from ..report.kml import track_kml
 from .build import agent_options, estimate_options, name_of
-from .cells import REFERENCE_CONTROLLER, REFERENCE_FILTER, RUNGS, TRUTH, Cell
+from .cells import REFERENCE_CONTROLLER, RUNGS, TRUTH, Cell
 from .contests import NOMINAL, TITLES, Contest
 from .delay_price import DELAYS, PRICE_CONTEST, Price, lines
 from .episodes import SIGNALS
-from .ladder import best_controller
+from .ladder import best_controller, on_its_own
 from .run import Results
 from .tables import Standing
 
@@ -99,7 +99,7 @@ def _estimators(found: Mapping[str, Sequence[Standing]]) -> dict[str, dict[str, 
 
 def _controllers(found: Mapping[str, Sequence[Standing]]) -> dict[str, dict[str, Estimate]]:
     def name(cell: Cell) -> str:
-        own = cell.estimator in ("", REFERENCE_FILTER) and cell.controller != NOMINAL
+        own = on_its_own(cell.controller, cell.estimator) and cell.controller != NOMINAL
         return cell.controller if own and cell.estimator != TRUTH else ""
 
     return _groups(found, name)
@@ -153,7 +153,7 @@ def _tracks(series: Mapping[Cell, Array], best: str) -> list[tuple[str, str, str
             cell.label: (each[:, 1 + SIGNALS.index("X")], each[:, 1 + SIGNALS.index("Y")])
             for cell, each in series.items()
             if cell.contest == contest and cell.controller in ("none", best)
-            if cell.estimator in ("", REFERENCE_FILTER)
+            if on_its_own(cell.controller, cell.estimator)
         }
         text = track_kml(contest.name, places, {name: colour(name) for name in places})
         name = f"{contest.name.replace(', ', '-')}.kml"
@@ -163,9 +163,7 @@ def _tracks(series: Mapping[Cell, Array], best: str) -> list[tuple[str, str, str
 
 def _two_cells(series: Mapping[Cell, Array], best: str) -> Explorer:
     """Every cell's first test seed; at first no control and the best controller."""
-    own = (
-        c.label for c in series if c.controller == best and c.estimator in ("", REFERENCE_FILTER)
-    )
+    own = (c.label for c in series if c.controller == best and on_its_own(best, c.estimator))
     keyed: dict[tuple[str, ...], Array] = {
         (c.contest.tier, c.contest.name, c.label): each for c, each in series.items()
     }

@@ -173,6 +173,12 @@ def answer(
     )
 
 
+def on_its_own(controller: str, estimator: str) -> bool:
+    """Whether that is the filter on which a controller is compared with others: the reference,
+    none, or the one whose tyres it follows."""
+    return estimator in ("", REFERENCE_FILTER) or ADAPTIVE.get(estimator) == controller
+
+
 def best_controller(found: Mapping[str, Sequence[Standing]]) -> str:
     """Who leads over all tiers, "" where nobody has a score."""
     return next(iter(_ranked(_controllers(found))), "")
@@ -185,11 +191,9 @@ def _estimators(found: Mapping[str, Sequence[Standing]]) -> dict[str, Gains]:
 
 
 def _controllers(found: Mapping[str, Sequence[Standing]]) -> dict[str, Gains]:
-    """What each controller on the reference filter, on none, or on that whose tyres it follows,
-    gains, the rungs left out."""
-    return _gains(found, "controller", lambda cell: cell.controller not in RUNGS and (
-        cell.estimator in ("", REFERENCE_FILTER) or cell.controller in ADAPTIVE.values()
-    ))  # fmt: skip
+    """What each controller gains on its own filter, the rungs left out."""
+    return _gains(found, "controller", lambda cell: (
+        cell.controller not in RUNGS and on_its_own(cell.controller, cell.estimator)))  # fmt: skip
 
 
 def _gains(

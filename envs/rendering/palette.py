@@ -33,7 +33,10 @@ FILTERS = {
     "lateral-force-observer": "#EA9048",
     "exact-kf": "#0075B4",
     "joint": "#1B9E1B",
-    "joint-robust": "#0B5D0B",
+    "joint-robust": "#127F12",
+    "learned": "#7A9E1B",
+    "learned-exact-kf": "#3F9E90",
+    "learned-joint": "#9AA536",
 }
 CONTROLLERS = {
     "none": GREY,
@@ -46,7 +49,7 @@ CONTROLLERS = {
     "mpc": "#127EE1",
     "nmpc": "#3F3FFC",
     "adaptive-lqr": "#A84300",
-    "adaptive-nmpc": "#1F1FA0",
+    "adaptive-nmpc": "#5A36FC",
     "lane-keeping": "#486C3F",
     "learned": "#D8636C",
     "ppo-yaw-vision": "#AB6387",
@@ -54,6 +57,8 @@ CONTROLLERS = {
 RUNGS = {
     "nominal": "#CF00B4",
     "oracle-parameters": "#63905A",
+    "oracle-parameters-lqr": "#48905A",
+    "oracle-parameters-nmpc": "#6CA290",
     "oracle-state": "#00ABFC",
     "oracle-state-lqr": "#9090CF",
     "oracle-state-nmpc": "#5A5ACF",

@@ -12,6 +12,7 @@ from sideslip.benchmarks.control.episodes import NUMBERS, Driven
 from sideslip.benchmarks.control.ladder import (
     answer,
     below_the_clairvoyant,
+    best_controller,
     findings,
     knowledge_table,
     ladder_table,
@@ -82,6 +83,16 @@ def test_failures_are_of_all_episodes_and_rank_where_nominal_fails_often() -> No
     found = main_table("", table(often))
     assert found.header[1] == "fails / %"
     assert [float(line[1]) for line in found.cells] == sorted(float(x[1]) for x in found.cells)
+
+
+@pytest.mark.parametrize("filter_, best", [("joint", "adaptive-lqr"), ("dakf", "lqr")])
+def test_an_adaptive_controller_is_compared_on_the_filter_it_follows(
+    filter_: str, best: str
+) -> None:
+    found = results()
+    for contest in (ONE, TWO):
+        found.found[Cell(contest, filter_, "adaptive-lqr")] = episodes(1.5)
+    assert best_controller({"1": table(found)}) == best
 
 
 def test_a_cell_that_was_not_driven_says_so_and_the_rest_goes_on() -> None:
