@@ -63,7 +63,7 @@ class TrueState(VectorWrapper[Any, Any, Any, Any, Any]):
 
 def outputs_for(estimator: str) -> tuple[str, ...]:
     """The estimates that controllers read: beta, gamma, and disturbances if there are any."""
-    row = FILTERS.get(name_of(estimator))  # a user's own has none
+    row = FILTERS.get(name_of(estimator).removeprefix("learned-"))  # a user's own has none
     options = SETUPS.get(estimator, ("", {}))[1] | dict(row.options if row else ())
     tyres = tuple(name for name in TYRES if f"{name}_sd" in options)
     return ("beta", "gamma", *_DISTURBANCES.get(row.disturbances if row else "", ()), *tyres)

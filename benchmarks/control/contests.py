@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from ... import __version__
+from ...agents import rungs
 from ...envs.arguments import check_choice
 from ...envs.scenarios.manoeuvres import SCENARIOS
 from ..harness.results import made_of, read_objects, write_text
@@ -22,10 +23,7 @@ FILE = Path(__file__).with_name("contests.json")
 COMMAND = "python -m sideslip.benchmarks.control.choice --write"
 
 NOMINAL, PARAMETERS, STATE = "nominal", "oracle-parameters", "oracle-state"
-ORACLES = {
-    PARAMETERS: ("oracle-parameters-lqr", "oracle-parameters-nmpc"),
-    STATE: ("oracle-state-lqr", "oracle-state-nmpc"),
-}
+ORACLES = {PARAMETERS: rungs.PARAMETERS, STATE: rungs.STATE}
 """The rungs of which a contest's better one has the name."""
 
 TIERS: dict[str, tuple[tuple[str, str, str], ...]] = {

@@ -10,7 +10,7 @@ from ... import __version__
 from ...agents.learned.files import ENDING
 
 _PACKAGE = Path(__file__).resolve().parents[2]
-_CONTESTANTS = {"estimators": (".py", ".toml"), "agents": (".py", ".toml", ENDING)}
+_CONTESTANTS = dict.fromkeys(("estimators", "agents"), (".py", ".toml", ENDING))
 _LENGTH = 16
 _TUNING = 2**29  # the clairvoyant's are beyond 2^30
 

@@ -30,6 +30,12 @@ PAIRS = (
 )
 
 
+def test_a_correction_gives_controllers_what_its_filter_gives() -> None:
+    for name in ("exact-kf", "joint"):
+        assert build.outputs_for(f"learned-{name}") == build.outputs_for(name)
+    assert build.outputs_for("joint")[-2:] == ("front_tyres", "rear_tyres")
+
+
 @pytest.mark.parametrize(("estimator", "controller"), PAIRS)
 def test_a_cell_is_its_single_episodes(estimator: str, controller: str) -> None:
     cell = Cell(DWELL, estimator, controller, tuned={"filter": {}, "controller": {}})

@@ -79,6 +79,7 @@ def test_the_salt_follows_every_file_of_the_contestants(
         "estimators/b.toml",
         "agents/c/d.py",
         f"agents/e{ENDING}",
+        f"estimators/learned/h{ENDING}",
     )
     others = ("envs/f.py", "benchmarks/g.py", "agents/notes.md")
     for name in contestants + others:
