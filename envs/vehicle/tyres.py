@@ -1,7 +1,8 @@
 """Tyres: normal load, friction circle, slip and lateral force.
 
 Scalar functions over tuples, without branches on values, as in `dynamics`. A law of the lateral
-force has its name in `TYRE_LAWS` and its equation in `lateral_forces`, and is written nowhere else.
+force has its name in `TYRE_LAWS` and its equation in `lateral_forces`. A filter that needs slopes
+has Fiala's once more, in `estimators.core.tyres`; a test holds both equal.
 """
 
 from typing import Any, NamedTuple
