@@ -20,6 +20,7 @@ from ..harness.parallel import run_cases
 from .cells import SLOW_EPISODES, Cell
 from .contests import Contest
 from .episodes import NUMBERS, SIGNALS, Chunk, Driven, drive
+from .seeds import Seeds
 
 CHUNK = 250
 _LENGTH = 24
@@ -38,7 +39,7 @@ class Results:
 
 def measure(
     cells: Sequence[Cell],
-    seeds: Sequence[int],
+    seeds: Seeds,
     *,
     jobs: int | None = None,
     console: Console | None = None,
@@ -46,7 +47,7 @@ def measure(
     by: Callable[[Chunk], Driven] | None = None,
     title: str = "control",
 ) -> Results:
-    """Drive every cell on the seeds, slow ones on the first of them.
+    """Drive every cell on its contest's seeds, slow ones on the first of them.
 
     keep: a folder in which finished cases stay, so that a run that was stopped goes on. by: what
     drives a chunk instead of `drive`, without that folder. title: of the progress bar.
@@ -55,7 +56,8 @@ def measure(
         return Results()
     chunks = []
     for cell in cells:
-        mine = seeds[:SLOW_EPISODES] if cell.slow else seeds
+        mine = seeds(cell.contest) if callable(seeds) else seeds
+        mine = mine[:SLOW_EPISODES] if cell.slow else mine
         chunks += [
             Chunk(cell, tuple(mine[first : first + CHUNK]), keep=first == 0)
             for first in range(0, len(mine), CHUNK)

@@ -1,13 +1,20 @@
 """Test seeds that nobody can have tuned on: they change with the contestants and the env."""
 
 import hashlib
+import json
 import re
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 
 from ... import __version__
 from ...agents.learned.files import ENDING
+from .contests import Contest
+
+Seeds = Sequence[int] | Callable[[Contest], Sequence[int]]
+"""The same in every contest, or of each."""
 
 _PACKAGE = Path(__file__).resolve().parents[2]
 _CONTESTANTS = dict.fromkeys(("estimators", "agents"), (".py", ".toml", ENDING))
@@ -28,16 +35,26 @@ def salt_of(*more: str) -> str:
     return digest.hexdigest()[:_LENGTH]
 
 
-def salted_seeds(salt: str, n: int) -> list[int]:
+def salted_seeds(salt: str, n: int, more: str = "") -> list[int]:
     """The first n test seeds of a salt (hexadecimal), each below 2^32; more seeds keep the first.
 
-    Raises ValueError for a salt that is not hexadecimal.
+    more: a text that makes them others. Raises ValueError for a salt that is not hexadecimal.
     """
     if not re.fullmatch("[0-9a-f]+", salt):
         raise ValueError(f"a salt is hexadecimal digits, got {salt!r}")
     words = [int(salt[i : i + 8], 16) for i in range(0, len(salt), 8)]
+    words += list(hashlib.sha256(more.encode()).digest()) if more else []
     children = np.random.SeedSequence(words).spawn(n)
     return [int(child.generate_state(1)[0]) for child in children]
+
+
+def seeds_of_contests(salt: str, n: int) -> Callable[[Contest], list[int]]:
+    """The first n test seeds of each contest.
+
+    Other ones in each: a seed draws the car as well, and contests that share their cars would not
+    be independent strata of an interval.
+    """
+    return lambda contest: salted_seeds(salt, n, json.dumps(asdict(contest)))
 
 
 def tuning_seeds(n: int) -> list[int]:

@@ -27,18 +27,17 @@ from .ladder import (
     yardsticks,
 )
 from .run import Results, measure
-from .seeds import salt_of, salted_seeds
+from .seeds import salt_of, seeds_of_contests
 from .tables import Standing, contest_table, main_table, motion_table, rows_of, standings
 
-PRICE_SHARE = 0.1  # of the matrix's episodes
 _TEXT = """\
-Everybody drives the same salted seeds, and everything is paired by episode. `nominal` is the LQG \
-that knows the nominal car, `oracle-parameters` knows car, friction and biases, `oracle-state` the \
-state too. score: 0 is nominal, 1 oracle-state, a ratio of sums over the contests. Only episodes \
-that both rungs survive are compared, a contestant's failure there counts as 20 times the cost; \
-failure rates are of all episodes, and rank where nominal fails in more than 10 %. Intervals \
-are 95 %. What is not won: a contest without the verdict "scored" in contests.json leaves too \
-little between the rungs to tell methods apart."""
+In a contest everybody drives the same salted seeds, and everything is paired by episode. \
+`nominal` is the LQG that knows the nominal car, `oracle-parameters` knows car, friction and \
+biases, `oracle-state` the state too. score: 0 is nominal, 1 oracle-state, a ratio of sums over \
+the contests. Only episodes that both rungs survive are compared, a contestant's failure there \
+counts as 20 times the cost; failure rates are of all episodes, and rank where nominal fails in \
+more than 10 %. Intervals are 95 %. What is not won: a contest without the verdict "scored" in \
+contests.json leaves too little between the rungs to tell methods apart."""
 
 
 def run(
@@ -60,7 +59,7 @@ def run(
     played = some_of(contests()) if quick else list(contests())
     asked = list(cells(played, quick))
     entries = _calibrated(clairvoyant, played)
-    seeds = salted_seeds(salt, episodes)
+    seeds = seeds_of_contests(salt, episodes)
     results = measure(asked, seeds, jobs=jobs, console=console, keep=keep)
     there = driven_there(entries, asked, jobs=jobs, console=console, keep=keep)
     suite = Suite("control", "Which controller and estimator hold the car", "")
@@ -82,12 +81,11 @@ def run(
     ladder = ladder_table(results, played, foreseen)
     ladder.note += _beaten(entries, there)
     suite.tables += [ladder, *more]
-    share = max(4, round(PRICE_SHARE * episodes))
     late: list[Results] = []
     prices: list[Price] = []
     if not quick:
-        prices, late = price_of_delay(seeds[:share], jobs=jobs, console=console, keep=keep)
-    suite.rows += _price_rows(prices, share, salt)
+        prices, late = price_of_delay(seeds(PRICE_CONTEST), jobs=jobs, console=console, keep=keep)
+    suite.rows += _price_rows(prices, episodes, salt)
     suite.tables += _refusals(results, late)
     suite.verdict = answer(found, prices, foreseen)
     illustrate(suite, found, results, prices, foreseen)

@@ -18,7 +18,7 @@ from ..control.cells import REFERENCE_CONTROLLER, REFERENCE_FILTER, TRUTH, Cell,
 from ..control.contests import NOMINAL, STATE, Contest, contests
 from ..control.episodes import NUMBERS, Driven
 from ..control.run import Results, measure
-from ..control.seeds import salt_of, salted_seeds
+from ..control.seeds import salt_of, seeds_of_contests
 from ..harness.results import made_of, read_objects, write_text
 from .challenge import EPISODES
 
@@ -89,7 +89,7 @@ def on_file(cells: Sequence[Cell], n: int, **options: Any) -> tuple[str, Results
     (salt,) = salts
     slow = [cell for cell in cells if cell.slow]
     sample = [cell for cell in cells if cell not in slow[1:]]
-    again = measure(sample, salted_seeds(salt, SAMPLE), title="baselines, a sample", **options)
+    again = measure(sample, seeds_of_contests(salt, SAMPLE), title="baselines, a sample", **options)
     for cell, driven in again.found.items():
         if driven.error or not np.allclose(
             driven.costs, entries[cell].costs[:SAMPLE], rtol=_SAME, atol=0.0
@@ -102,7 +102,7 @@ def write_baselines(path: Path = FILE, jobs: int | None = None) -> None:
     """Drive all baselines of the usual contests, and write the file; ValueError where one fails."""
     salt = salt_of()
     cells = cells_of(some_of(contests()))
-    found = measure(cells, salted_seeds(salt, EPISODES), jobs=jobs, console=Console()).found
+    found = measure(cells, seeds_of_contests(salt, EPISODES), jobs=jobs, console=Console()).found
     lines = []
     for cell, driven in found.items():
         if driven.error:

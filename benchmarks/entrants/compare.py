@@ -14,7 +14,7 @@ from ..control.cells import REFERENCE_CONTROLLER, Cell
 from ..control.contests import Contest
 from ..control.ladder import yardsticks
 from ..control.run import Results, measure
-from ..control.seeds import salt_of, salted_seeds
+from ..control.seeds import salt_of, seeds_of_contests
 from ..control.tables import Standing, standings
 from .baselines import cells_of, on_file
 from .challenge import Challenge, Pair
@@ -70,7 +70,7 @@ def compare(
     ]
     found = on_file(rivals, challenge.episodes, **shared) if challenge.is_as_shipped else None
     salt = found[0] if found else _salt(challenge)
-    seeds = list(challenge.seeds or salted_seeds(salt, challenge.episodes))
+    seeds = challenge.seeds or seeds_of_contests(salt, challenge.episodes)
     results = found[1] if found else measure(rivals, seeds, title="baselines", **shared)
     own = [pair.cell(contest, options) for contest, options in played.items() for pair in pairs]
     apart = [cell for cell in own if not cell.objects]

@@ -12,10 +12,15 @@ from sideslip.agents.learned.files import ENDING
 from sideslip.agents.rollout import rollout
 from sideslip.benchmarks.control import delay_price, run, seeds
 from sideslip.benchmarks.control.cells import Cell
-from sideslip.benchmarks.control.contests import Contest
+from sideslip.benchmarks.control.contests import Contest, contests
 from sideslip.benchmarks.control.episodes import NUMBERS, Driven
 from sideslip.benchmarks.control.run import measure
-from sideslip.benchmarks.control.seeds import salt_of, salted_seeds
+from sideslip.benchmarks.control.seeds import (
+    salt_of,
+    salted_seeds,
+    seeds_of_contests,
+    tuning_seeds,
+)
 
 ONE, OTHER = "0123456789abcdef", "fedcba9876543210"
 SHORT = {"base": "gust", "duration": 0.5}
@@ -56,12 +61,27 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 def test_everybody_drives_the_same_seeds(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Slow controllers the first ones."""
     cases = asked(monkeypatch)
-    measure([NONE, SLOW], salted_seeds(ONE, 300), keep=tmp_path)
+    first = salted_seeds(ONE, 300)
+    measure([NONE, SLOW], first, keep=tmp_path)
     driven: dict[Cell, list[int]] = {}
     for kept, chunk in cases:
         driven.setdefault(chunk.cell, []).extend(chunk.seeds)
         assert kept.folder == tmp_path
-    assert driven == {NONE: salted_seeds(ONE, 300), SLOW: salted_seeds(ONE, 128)}
+    assert driven == {NONE: first, SLOW: first[:128]}
+
+
+def test_contests_share_no_car(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An interval over contests takes them for independent, and a seed draws the car."""
+    cases = asked(monkeypatch)
+    scored = contests()[:6]
+    cells = [Cell(each, "", who) for each in scored for who in ("none", "nominal")]
+    measure(cells, seeds_of_contests(ONE, 50))
+    driven: dict[Contest, set[tuple[int, ...]]] = {}
+    for _, chunk in cases:
+        driven.setdefault(chunk.cell.contest, set()).add(chunk.seeds)
+    assert all(len(mine) == 1 for mine in driven.values())  # in a contest everybody the same
+    every = [seed for mine in driven.values() for own in mine for seed in own]
+    assert len(set(every)) == len(every) == 6 * 50
 
 
 def test_the_price_of_delay_is_taken_on_the_salts_seeds(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -117,4 +137,4 @@ def test_seeds_follow_the_salt_and_only_grow() -> None:
     assert salted_seeds(salt, 10) == salted_seeds(salt, 30)[:10]
     assert salted_seeds(salt_of("more"), 10) != salted_seeds(salt, 10)
     assert len(set(salted_seeds(salt, 1000))) == 1000
-    assert not set(salted_seeds(salt, 1000)) & set(seeds.tuning_seeds(64))
+    assert not set(salted_seeds(salt, 1000)) & set(tuning_seeds(64))

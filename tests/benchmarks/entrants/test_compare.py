@@ -16,7 +16,7 @@ from sideslip.benchmarks.control.cells import REFERENCE_FILTER, Cell, some_of
 from sideslip.benchmarks.control.contests import NOMINAL, STEERING, YAW, Contest, contests
 from sideslip.benchmarks.control.episodes import NUMBERS, Chunk, Driven, drive
 from sideslip.benchmarks.control.run import Results
-from sideslip.benchmarks.control.seeds import salt_of, salted_seeds
+from sideslip.benchmarks.control.seeds import Seeds, salt_of, seeds_of_contests
 from sideslip.benchmarks.entrants import baselines, compare
 from sideslip.benchmarks.entrants.challenge import EPISODES, Challenge, Pair, pairs_of
 from sideslip.benchmarks.entrants.verdict import sentence, table, verdict
@@ -56,7 +56,7 @@ def test_a_wrapped_controller_has_the_shipped_ones_row(tmp_path: Path, run: Run)
         for row in json.loads(rows.read_text())
         if row["controller"] == mine and row["scenario"] == contest.name
     }
-    seeds = tuple(salted_seeds(salt_of(), 4))
+    seeds = tuple(seeds_of_contests(salt_of(), 4)(contest))
     costs = drive(Chunk(shipped, seeds)).costs
     assert number["cost"] == np.mean(costs)
     assert number["score"] == 0.0 and number["cost_vs_nominal"] == 1.0
@@ -77,9 +77,10 @@ def driven(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Cell, tuple[int, ...]]
     """Every cell that is to be driven with its seeds; none is. Whom the user brings costs half."""
     asked: list[tuple[Cell, tuple[int, ...]]] = []
 
-    def stand_in(cells: Sequence[Cell], seeds: Sequence[int], **_: Any) -> Results:
-        asked.extend((cell, tuple(seeds)) for cell in cells)
-        return Results({cell: episodes(cell, len(seeds)) for cell in cells})
+    def stand_in(cells: Sequence[Cell], seeds: Seeds, **_: Any) -> Results:
+        mine = [(c, tuple(seeds(c.contest) if callable(seeds) else seeds)) for c in cells]
+        asked.extend(mine)
+        return Results({cell: episodes(cell, len(each)) for cell, each in mine})
 
     monkeypatch.setattr(compare, "measure", stand_in)
     monkeypatch.setattr(baselines, "measure", stand_in)
@@ -112,6 +113,11 @@ def on_file(folder: Path, monkeypatch: pytest.MonkeyPatch, change: float = 1.0) 
     (folder / "baselines.json").write_text(json.dumps(text))
 
 
+def salted(salt: str, n: int, cell: Cell) -> tuple[int, ...]:
+    """A contest's test seeds."""
+    return tuple(seeds_of_contests(salt, n)(cell.contest))
+
+
 def test_committed_baselines_serve_where_a_sample_costs_the_same(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, driven: list[tuple[Cell, tuple[int, ...]]]
 ) -> None:
@@ -119,10 +125,10 @@ def test_committed_baselines_serve_where_a_sample_costs_the_same(
     del driven[:]
     found = compare.compare(challenge(tmp_path, episodes=8))
     assert found.on_file and found.salt == "abcd"
-    seeds = {seeds for cell, seeds in driven if cell.is_users}
-    assert seeds == {tuple(salted_seeds("abcd", 8))}
+    mine = [(cell, seeds) for cell, seeds in driven if cell.is_users]
+    assert mine and all(seeds == salted("abcd", 8, cell) for cell, seeds in mine)
     again = [(cell, seeds) for cell, seeds in driven if not cell.is_users]
-    assert {seeds for _, seeds in again} == {tuple(salted_seeds("abcd", 2))}
+    assert again and all(seeds == salted("abcd", 2, cell) for cell, seeds in again)
     assert {cell.controller for cell, _ in again} == {NOMINAL, "oracle-state", "none", "esc"}
     assert "on file, a sample driven again" in verdict(found)[-1]
 
@@ -148,12 +154,12 @@ def test_otherwise_they_drive_anew_on_everybodys_seeds(
     assert not found.on_file
     everyone = {cell: seeds for cell, seeds in driven}  # the last time
     assert set(everyone) == set(found.results.found)
-    assert len(set(everyone.values())) == 1
-    (seeds,) = set(everyone.values())
+    contests = {cell.contest for cell in everyone}
+    assert len(set(everyone.values())) == (1 if why == "seeds" else len(contests))
     if why in ("costs", "episodes", "vehicle", "scenario"):
-        assert seeds == tuple(salted_seeds(salt_of(), len(seeds)))
+        assert all(seeds == salted(salt_of(), len(seeds), cell) for cell, seeds in everyone.items())
     if why == "seeds":
-        assert seeds == (5, 6, 7) and found.salt == ""
+        assert set(everyone.values()) == {(5, 6, 7)} and found.salt == ""
     if why == "vehicle":
         masses = {
             cell.env_options[car]["mass"] for cell in everyone for car in ("vehicle", "nominal")
