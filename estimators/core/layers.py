@@ -4,7 +4,8 @@ The second layer has velocities and roll, measured by the GPS and the first laye
 
 A bank: a filter that has settled on its tyres takes seconds to believe that they changed. Every
 half second the least likely member becomes a copy of the likeliest that has forgotten the tyres, at
-the odds of such a change; what is measured makes one or the other likelier. Layer 0 of an estimator
+the odds of such a change; what is measured makes one or the other likelier. Where members differ in
+the level of their disturbances, a place in the bank stays at its own. Layer 0 of an estimator
 with a bank is the mixture's mean and covariance, which nothing measures; its members follow.
 """
 
@@ -75,6 +76,15 @@ def _likeliest(layers: Filters) -> int:
     return best
 
 
+@jit
+def _set_level(f: Memory, i: int, level: Any) -> None:
+    """Disturbance i comes with `level` of its configured variance."""
+    at, more = f.dense + i, level / f.level[i]
+    f.level[i] = level
+    f.q_known[i] *= more
+    f.Q[at, at] *= more
+
+
 @apart
 def respawn(layers: Filters) -> None:
     """The least likely member becomes the likeliest, but for tyres that may be others now."""
@@ -84,8 +94,12 @@ def respawn(layers: Filters) -> None:
         layers[m].weight = maximum(layers[m].weight - top, LEAST)
         if layers[m].weight <= layers[worst].weight and m != best:
             worst = m
-    layers[worst] = layers[best]
     f = layers[worst]
+    force, moment = f.level[0], f.level[1]
+    layers[worst] = layers[best]
+    if f.forces == 1:
+        _set_level(f, 0, force)
+        _set_level(f, 1, moment)
     for i in range(2):
         f.P[f.tyres + i, f.tyres + i] += f.spread
     f.weight = f.hazard

@@ -117,6 +117,7 @@ _BANK = [  # several filters beside each other, of which the first record is the
     ("weight", _FLOAT),  # of a member: the logarithm of its likelihood
     ("respawn", _INT),  # ticks after which the least likely member begins anew
     ("hazard", _FLOAT),  # log of the probability of a change within them
+    ("level", _FLOAT, (2,)),  # of a member: its force's and moment's variance over that configured
     ("spread", _FLOAT),  # variance by which a new member forgets the tyres
 ]
 _FAST = [  # inputs and fast measurements: sums of two columns of the fast row

@@ -81,8 +81,16 @@ def _members(layers: Any, config: FilterConfig, dt: float) -> Any:
         return layers
     f = layers[0]
     f.members, f.respawn, f.spread = config.members, round(RESPAWN / dt), FORGOTTEN
-    f.hazard = math.log(HAZARD * RESPAWN)
-    return np.repeat(layers, 1 + config.members).view(np.recarray)
+    f.hazard, f.level[:] = math.log(HAZARD * RESPAWN), 1.0
+    bank = np.repeat(layers, 1 + config.members).view(np.recarray)
+    for m, f in enumerate(bank[1:]):
+        f.level[:] = np.square(config.levels[m % len(config.levels)])
+        if f.forces:
+            both = range(f.dense, f.dense + 2)
+            f.q_known *= f.level
+            f.Q[both, both] *= f.level
+            f.prior[both, both] *= f.level
+    return bank
 
 
 def alone(config: FilterConfig) -> FilterConfig:

@@ -13,7 +13,7 @@ from ..core.delay import RULES
 from ..filters import Filter
 from . import dual_rate
 from .kalman import INVERSES
-from .levels import hdop_table, noise_levels, prior_of, process_noise
+from .levels import bank_of, hdop_table, noise_levels, prior_of, process_noise
 from .models import (
     BIASES,
     DISTURBANCES,
@@ -82,7 +82,9 @@ class FilterConfig:
     accel_time: s; above 0 the accelerometer's noise is found while driving, over so long; then
         `accel_y_noise` is the least.
     members: of joint, so many filters side by side, of which the least likely forgets the tyres
-        twice a second (default 1).
+        twice a second (default: one for each of `levels`).
+    levels: of joint, factors on force_sd and moment_sd, or pairs of one for each, which its members
+        take in turn; the likeliest counts most (default (1,)).
     gate: a probability; a sample whose innovation is less likely than 1 - gate is skipped.
     adapt: share of a new innovation in an R that follows them (0: R as configured).
     force_sd (N), moment_sd (N m), disturbance_time (s): of disturbances that are forces.
@@ -109,6 +111,7 @@ class FilterConfig:
     satellites: float
     gate: float | None
     members: int
+    levels: Array  # (count, 2), of force_sd, moment_sd
     robust: float
     model_error: float
     accel_time: float
@@ -155,7 +158,7 @@ def configure(
         hdop_table=hdop_table(row, read),
         satellites=read.number("satellites", SATELLITES),
         gate=_gate(read),
-        members=_members(states, read),
+        **bank_of(states, models[0].forces, read),
         robust=read.not_negative("robust", "standard deviations"),
         model_error=read.not_negative("model_error", "shares of a force"),
         accel_time=read.not_negative("accel_time", "s"),
@@ -258,17 +261,6 @@ def _models(
     late, rolls = delay in ("literal", "lag"), fast != row.fast
     first = bicycle_model(used, fast, disturbances, late, rolls, biases)
     return (first, MODELS[row.second]) if row.second else (first,)
-
-
-def _members(states: Sequence[str], read: Options) -> int:
-    count = round(read.number("members", 1.0, "is a number of filters from 1 to 8", _is_count))
-    if count > 1 and TYRES[0] not in states:
-        raise read.wrong("members", "is 1 where tyres are known", count)
-    return count
-
-
-def _is_count(value: float) -> bool:
-    return 1.0 <= value <= 8.0 and value == round(value)
 
 
 def _gate(read: Options) -> float | None:

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -10,7 +11,7 @@ from ..core.memory import KNOTS
 from ..filters import Filter
 from ..matrices import check_covariance
 from .measurements import COURSE_SPEED, MEASUREMENTS
-from .models import STATES
+from .models import STATES, TYRES
 from .options import Options
 
 Array = npt.NDArray[np.float64]
@@ -23,6 +24,7 @@ MORE_NOISE = {
     "roll_rate_noise": 0.005,  # rad/s
     "wheel_noise": 0.015,  # m/s, of the mean of both front wheels
 } | {f"{row.noise}_noise": row.sd for row in _VELOCITIES}
+MOST_MEMBERS = 8
 DISTURBANCE = {"force_sd": 50.0, "moment_sd": 20.0, "disturbance_time": 0.3}  # N, N m, s
 
 
@@ -48,6 +50,23 @@ def hdop_table(row: Filter, read: Options) -> tuple[tuple[float, float], ...]:
         expected = f"is 2 to {KNOTS} pairs (HDOP, factor) with rising HDOP and positive factors"
         raise read.wrong("hdop_table", expected, table)
     return tuple((float(hdop), float(factor)) for hdop, factor in knots)
+
+
+def bank_of(states: Sequence[str], forces: bool, read: Options) -> dict[str, Any]:
+    """`members` and `levels` of a `FilterConfig`; forces: whether its disturbances are."""
+    value = read.value("levels", (1.0,))
+    levels = read.numbers("levels", value)
+    pairs = levels.reshape(-1, 1).repeat(2, 1) if levels.ndim < 2 else levels
+    fits = pairs.shape[1:] == (2,) and 1 <= len(pairs) <= MOST_MEMBERS
+    if not (fits and (pairs > 0.0).all() and np.isfinite(pairs).all()):
+        raise read.wrong("levels", f"are 1 to {MOST_MEMBERS} positive factors or pairs", value)
+    expected = f"is a number of filters from 1 to {MOST_MEMBERS}"
+    count = read.number("members", len(pairs), expected, lambda v: v in range(1, MOST_MEMBERS + 1))
+    if count > 1 and TYRES[0] not in states:
+        raise read.wrong("members", "is 1 where tyres are known", count)
+    if (pairs != 1.0).any() and not (forces and 1 < count >= len(pairs)):
+        raise read.wrong("levels", "need disturbances='forces' and a member each", value)
+    return {"members": int(count), "levels": pairs}
 
 
 def process_noise(states: Sequence[str], tuning: Mapping[str, float], read: Options) -> Array:

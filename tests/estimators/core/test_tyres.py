@@ -34,9 +34,9 @@ SETTLED = 2000  # ticks
 
 
 @functools.cache
-def drives(count: int, changed: bool = False) -> tuple[Any, list[tuple[Log, Any]]]:
-    """The env, and (log, true vehicle) of some seeds."""
-    env: Any = gym.make("sideslip/YawFusion-v0", scenario=LINEAR | (CHANGED if changed else {}))
+def drives(count: int, **more: float) -> tuple[Any, list[tuple[Log, Any]]]:
+    """The env, and (log, true vehicle) of some seeds; more: of the scenario."""
+    env: Any = gym.make("sideslip/YawFusion-v0", scenario=LINEAR | more)
     made = []
     for seed in range(count):
         log = rollout(env, seed=seed).log
@@ -118,7 +118,7 @@ def test_the_factors_are_found() -> None:
 
 
 def test_a_bank_believes_a_change_sooner_and_costs_nothing_without_one() -> None:
-    base, made = drives(6, True)
+    base, made = drives(6, **CHANGED)
     late = 4000 + 500
     single, bank = (
         [squares(built(base, log, members=count), log, late)[0] for log, _ in made]
@@ -132,8 +132,37 @@ def test_a_bank_believes_a_change_sooner_and_costs_nothing_without_one() -> None
     assert np.sqrt(np.mean(bank) / np.mean(single)) < 1.05
 
 
+@pytest.mark.parametrize("factor", [0.5, 1.0, 2.0])
+def test_a_bank_finds_the_level_of_the_disturbances(factor: float) -> None:
+    """Beside the filter that knows it; alone and at another level its deviation is wrong."""
+    force, moment = 50.0 * factor, 20.0 * factor
+    base, made = drives(8, disturbance_force=force, disturbance_moment=moment)
+    found = np.array([
+        [squares(built(base, log, **options), log)
+         for options in ({}, {"levels": (0.5, 1.0, 2.0)}, {"force_sd": force, "moment_sd": moment})]
+        for log, _ in made
+    ]).mean(axis=0)  # fmt: skip
+    assert np.sqrt(found[1, 0] / found[2, 0]) < 1.05
+    assert 0.7 < found[1, 1] < 1.5
+    assert factor == 1.0 or not 0.5 < found[0, 1] < 2.0
+
+
+def test_a_member_that_begins_anew_stays_at_its_level() -> None:
+    base, ((log, _), *_) = drives(1, **CHANGED)
+    filter_ = built(base, log, levels=[[0.5, 2.0], [1.0, 1.0]], members=3, bias_sd=0.01)
+    alone = built(base, log, bias_sd=0.01).filters[0]
+    filter_.run(log)
+    for f, (force, moment) in zip(
+        filter_.filters[1:], ((0.5, 2.0), (1.0, 1.0), (0.5, 2.0)), strict=True
+    ):
+        d = f.dense
+        np.testing.assert_allclose(np.diag(f.Q)[d : d + 2], f.q_known, rtol=1e-12)
+        ratio = np.diag(f.Q)[d : d + 2] / np.diag(alone.Q)[d : d + 2]
+        np.testing.assert_allclose(ratio, [force**2, moment**2], rtol=1e-12)
+
+
 def test_a_bank_step_by_step_and_from_a_snapshot_is_the_same() -> None:
-    base, ((log, _), *_) = drives(1, True)
+    base, ((log, _), *_) = drives(1, **CHANGED)
     whole, parts = built(base, log, members=3), built(base, log, members=3)
     expected = whole.run(log).x
     record = parts.accept(log)
@@ -160,6 +189,11 @@ def test_a_bank_step_by_step_and_from_a_snapshot_is_the_same() -> None:
         ({"members": 0}, "from 1 to 8"),
         ({"members": 2.5}, "from 1 to 8"),
         ({"rear_tyres_sd": -1.0}, "not negative"),
+        ({"levels": (0.5, -1.0)}, "positive factors or pairs"),
+        ({"levels": [[0.5, 1.0, 2.0]]}, "positive factors or pairs"),
+        ({"levels": 2.0}, "a member each"),
+        ({"levels": (0.5, 1.0), "disturbances": "walk"}, "a member each"),
+        ({"levels": (0.5, 1.0, 2.0), "members": 2}, "a member each"),
     ],
 )
 def test_bad_options(options: dict[str, Any], message: str) -> None:
