@@ -2,25 +2,49 @@
 
 Defined where the plant is linear (small-angle plant, linear tyres, speed held): then no estimator
 has a smaller mean squared error than the filter that knows the vehicle, the noise and the
-disturbances' statistics. Deterministic wind and biases do not change it: it knows them. A vehicle
-that changes on the way does, and the filter has one vehicle: for a scenario with a tyre_change_time
-it is no bound.
+disturbances' statistics. Deterministic wind and biases do not change it: it knows them. Tyres that
+change on the way, and a gust whose strength it does not know, make the model vary with time: the
+filter then knows when, which no real one does.
 """
 
-from collections.abc import Mapping
-from typing import Any
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from ...envs.record import Record
+from ...envs.record import PACKET, Record
 from ...envs.sensors.link import SlowSensor
 from ...envs.ticks import TICK
 from ...envs.vehicle.vehicle import Vehicle
 from ..design.models import states_for
+from ..estimates import UnobservableWarning
 from ..make import make_estimator
 
 Array = npt.NDArray[np.float64]
+
+_MODEL = ("car", "A", "B", "G", "H", "C_fast", "D_fast")  # of a filter's memory, at a held speed
+
+
+class Change(NamedTuple):
+    """Another vehicle from a time on, in s since the first row."""
+
+    time: float
+    vehicle: Vehicle
+
+
+class Gust(NamedTuple):
+    """A side force that is constant from start to end (s since the first row), of unknown strength.
+
+    force_sd: N, the root of the mean square of what it can be. arm: m ahead of the centre of
+    gravity.
+    """
+
+    force_sd: float
+    arm: float
+    start: float
+    end: float
 
 
 def bound(
@@ -30,24 +54,72 @@ def bound(
     sensors: Mapping[str, SlowSensor],
     speed: float,
     dt: float = TICK,
+    change: Change | None = None,
+    gust: Gust | None = None,
     **options: Any,
 ) -> Array:
     """Standard deviation of the optimal estimate of beta at every row of a record, (K,) in rad.
 
     vehicle: the true one. sensors: all slow sensors that are there; the packets' captured and
-    arrived ticks are those of the record. speed: held, m/s. options: those of `exact-kf` that say
+    arrived ticks are those of the record. speed: held, m/s. change: to the vehicle that it is
+    later. gust: one that the filter feels and does not know. options: those of `exact-kf` that say
     the true noise and disturbances. The start is known exactly, as it is in the environment.
 
     The lowest possible RMSE over a stretch of time is the root of the mean square of this.
     """
-    options.setdefault("prior", dict.fromkeys(states_for(tuple(sensors)), 0.0))
-    filter_ = make_estimator(
-        "exact-kf",
-        vehicle=vehicle,
-        sensors=sensors,
-        dt=dt,
-        speed=speed,
-        slow=list(sensors),
-        **options,
-    )
-    return filter_.run(record).std[:, 0]
+    prior = dict.fromkeys(states_for(tuple(sensors)), 0.0)
+    if gust is not None:  # a state that is a constant, as the road's bank is, but pushes as a force
+        options |= {"bank_sd": gust.force_sd}
+        prior |= {"bank": 0.0}
+    options.setdefault("prior", prior)
+    common = {"sensors": sensors, "dt": dt, "speed": speed, "slow": list(sensors)} | options
+    cars = [vehicle] if change is None else [vehicle, change.vehicle]
+    with warnings.catch_warnings():  # the gust's state is seen only where it blows
+        warnings.simplefilter("ignore" if gust is not None else "default", UnobservableWarning)
+        first, *later = (make_estimator("exact-kf", vehicle=car, **common) for car in cars)
+    record = first.accept(record)
+    events = list[tuple[float, Callable[[], None]]]()
+    if gust is not None:
+        for filter_ in (first, *later):
+            _push(filter_, gust.arm)
+        events += [(gust.start, lambda: _begin(first, gust.force_sd**2))]
+        events += [(gust.end, lambda: _begin(first, 0.0))]
+    if change is not None:
+        events.append((change.time, lambda: _become(first, later[0])))
+    return _run(first, record, sorted(events, key=lambda event: event[0]))
+
+
+def _push(filter_: Any, arm: float) -> None:
+    """The state `bank` pushes as F_d does, and as N_d by an arm in m."""
+    f, names = filter_.filters[0], filter_.names
+    gust, force, moment = (names.index(name) for name in ("bank", "F_d", "N_d"))
+    for matrix in (f.G, f.C_fast):
+        matrix[:, gust] = matrix[:, force] + arm * matrix[:, moment]
+
+
+def _become(filter_: Any, later: Any) -> None:
+    for name in _MODEL:
+        filter_.filters[0][name] = later.filters[0][name]
+
+
+def _begin(filter_: Any, variance: float) -> None:
+    """What the gust is from now on has nothing to do with what was known before."""
+    f, at = filter_.filters[0], filter_.names.index("bank")
+    f.P[at], f.P[:, at] = 0.0, 0.0
+    f.P[at, at] = variance
+
+
+def _run(filter_: Any, record: Record, events: Sequence[tuple[float, Callable[[], None]]]) -> Array:
+    """The deviations of beta of a run that goes on; each event is behind the row at its time."""
+    fast, packets = np.ascontiguousarray(record.fast), np.ascontiguousarray(record.packets)
+    X, S = (np.empty((len(fast), len(filter_.names))) for _ in range(2))
+    ends = [min(round(time / record.dt) + 1, len(fast)) for time, _ in events]
+    row = came = 0
+    for i, end in enumerate([*ends, len(fast)]):
+        due = int(np.searchsorted(packets[:, PACKET.arrived], record.first + end))
+        span, late = slice(row, end), packets[came:due]
+        filter_.take(fast[span], end - row, late, len(late), X[span], S[span])
+        if i < len(events):
+            events[i][1]()
+        row, came = end, due
+    return S[:, 0]

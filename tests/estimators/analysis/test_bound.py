@@ -1,13 +1,18 @@
 """The bound: Riccati, Monte Carlo and the exact filter tell the same story."""
 
+import dataclasses
+import math
 from typing import Any
 
 import numpy as np
 import pytest
+from scipy.linalg import expm
 
+from sideslip.envs.record import PACKET
 from sideslip.envs.sensors.link import SlowSensor
+from sideslip.envs.vehicle.linear import vision
 from sideslip.estimators import make_estimator
-from sideslip.estimators.analysis.bound import bound
+from sideslip.estimators.analysis.bound import Change, Gust, bound
 from tests.estimators.riccati import riccati
 from tests.estimators.simulation import CAMERA, FIG7, GPS, error, simulate
 
@@ -51,3 +56,71 @@ def test_lost_frames_raise_the_bound() -> None:
     full = bound(FIG7.truth, record=log.record, **common)
     log.record.packets = log.record.packets[::3]
     assert (bound(FIG7.truth, record=log.record, **common)[100:] >= full[100:]).all()
+
+
+CHANGED = 0.1  # s
+
+
+def dense(what: str, log: Any, gust: Gust, later: Any) -> float:
+    """The deviation of beta at the last row: all noises and the gust as one Gaussian vector,
+    conditioned on every sample that came."""
+    record, V, rows = log.record, FIG7.speed, len(log.record.fast)
+    steps = {car.name: _step(car, V) for car in (FIG7.truth, later)}
+    keep = math.exp(-1e-3 / 0.3)
+    fresh = np.array([50.0, 20.0]) * math.sqrt(1.0 - keep * keep)
+    T = np.zeros((rows, 6, 2 * rows + 1))  # states by (F_d, N_d at each row, the gust)
+    T[0, 4, 0], T[0, 5, 1] = 50.0, 20.0
+    for k in range(1, rows):
+        car = later if what == "change" and k > round(1e3 * CHANGED) else FIG7.truth
+        F = steps[car.name]
+        T[k] = F @ T[k - 1]
+        if what == "gust" and gust.start < 1e-3 * k <= gust.end + 1e-9:
+            T[k, :4, -1] += gust.force_sd * (F[:4, 4] + gust.arm * F[:4, 5])
+        T[k, 4, 2 * k], T[k, 5, 2 * k + 1] = fresh
+    seen = [T[:, 1] / 0.005]
+    for packet in record.packets:
+        k = int(packet[PACKET.captured])
+        seen += [T[k, 2][None] / 3.5e-3, T[k, 3][None] / 0.02]
+    M = np.concatenate(seen)
+    P = np.linalg.inv(np.eye(M.shape[1]) + M.T @ M)
+    return float(np.sqrt(T[-1, 0] @ P @ T[-1, 0]))
+
+
+def _step(car: Any, V: float) -> Any:
+    """beta, gamma, psi, y_l, F_d, N_d a tick later."""
+    whole = np.zeros((6, 6))
+    whole[:4, :4] = vision(car, V).A
+    whole[0, 4], whole[1, 5] = 1.0 / (car.mass * V), 1.0 / car.yaw_inertia
+    F = expm(1e-3 * whole)
+    F[4:, 4:] = math.exp(-1e-3 / 0.3) * np.eye(2)
+    return F
+
+
+@pytest.mark.parametrize("what", ["nothing", "change", "gust"])
+def test_what_changes_on_the_way_is_dense_conditioning(what: str) -> None:
+    """0.25 s of late frames: tyres that are others from 0.1 s on, a gust from 0.04 to 0.14 s."""
+    log = simulate(FIG7, {"camera": CAMERA}, 0)
+    record = log.record
+    came = record.packets[record.packets[:, PACKET.arrived] < 250]
+    record = dataclasses.replace(record, fast=record.fast[:250], packets=came)
+    log = dataclasses.replace(log, record=record, truth={})
+    later = FIG7.truth.scaled(0.6, 1.3).replace(name="later")
+    gust = Gust(400.0, 0.3, 0.04, 0.14)
+    extra: dict[str, Any] = {"change": {"change": Change(CHANGED, later)}, "gust": {"gust": gust}}
+    common: dict[str, Any] = {"record": record, "sensors": log.slow, "speed": FIG7.speed}
+    plain = bound(FIG7.truth, **common)
+    found = bound(FIG7.truth, **common, **extra.get(what, {}))
+    assert found[-1] == pytest.approx(dense(what, log, gust, later), rel=1e-8)
+    np.testing.assert_array_equal(found[:40], plain[:40])
+    assert what == "nothing" or abs(found[-1] / plain[-1] - 1.0) > 0.01
+
+
+def test_a_bound_without_a_change_is_the_bound() -> None:
+    """A car that becomes itself, a gust that is over before the first row."""
+    log = simulate(FIG7, {"camera": CAMERA}, 0)
+    common: dict[str, Any] = {"record": log.record, "sensors": log.slow, "speed": FIG7.speed}
+    plain = bound(FIG7.truth, **common)
+    same = bound(FIG7.truth, **common, change=Change(1.0, FIG7.truth))
+    np.testing.assert_array_equal(same, plain)
+    over = bound(FIG7.truth, **common, gust=Gust(400.0, 0.0, 0.0, 0.0))
+    np.testing.assert_allclose(over, plain, rtol=1e-12)
