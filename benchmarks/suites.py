@@ -64,7 +64,7 @@ def _highway(suite: Any, r: Request) -> Any:
 
 SUITES: dict[str, tuple[str, _Run]] = {
     "estimation": (".estimation", _seeds),
-    "unknown": (".unknown", _seeds),
+    "unknown": (".unknown.suite", _seeds),
     "control": (".control.suite", _control),
     "papers": (".papers.suite", _seeds),
     "following": (".following", _following),

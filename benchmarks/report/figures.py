@@ -11,16 +11,20 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...envs.backend.extras import extra
 from ...envs.rendering.palette import FACTS, GREY, INK, base, colour
 from ..harness.stats import Estimate
 from .colours import line_styles
 
-with extra("report", "figures need plotly"):
+try:
     from plotly import graph_objects as go
+except ModuleNotFoundError as error:
+    raise ModuleNotFoundError(
+        "figures need plotly: pip install 'sideslip[report]'", name=error.name
+    ) from error
 
 Array = npt.NDArray[np.floating[Any]]
 
+_LOG = {"type": "log", "dtick": "D2", "tickformat": "~g"}  # 1, 2, 5, 10, ...
 POINTS = 1000
 """The most points a line is drawn with: a figure is no wider in pixels."""
 
@@ -107,8 +111,8 @@ def curves(
             ends = {"array": bounds[1] - value, "arrayminus": value - bounds[0], "symmetric": False}
             trace.error_y = {"type": "data", "color": pen[0], "thickness": 1, "width": 3, **ends}
         figure.add_trace(trace)
-    figure.update_xaxes(**{"type": "log", "dtick": 1} if "x" in log else {})
-    figure.update_yaxes(**{"type": "log", "dtick": 1} if "y" in log else {})
+    figure.update_xaxes(**_LOG if "x" in log else {})
+    figure.update_yaxes(**_LOG if "y" in log else {})
     return _finish(figure, x_label, y_label, 400, hovermode="x unified")
 
 
@@ -222,7 +226,7 @@ def groups_with_interval(
         margin={"t": 28, "b": 12, "l": 12, "r": 12},
     )
     figure.update_layout(showlegend=False)
-    figure.update_xaxes(type="log", tickformat="~g", dtick="D2")
+    figure.update_xaxes(**_LOG)
     names = {"tickvals": list(ticks), "ticktext": list(ticks.values())}
     figure.update_yaxes(range=[row - 0.4, -0.6], showgrid=True, ticks="", **names)
     return figure

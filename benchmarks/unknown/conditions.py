@@ -1,0 +1,204 @@
+"""Which drives: conditions, curves of one quantity each, and what a filter can do without."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ..harness.drives import SETTLED
+
+CAMERA, GPS, FUSION = (f"sideslip/Yaw{each}-v0" for each in ("Vision", "Gps", "Fusion"))
+KMH = 1.0 / 3.6
+STIFF = {"front_stiffness": (0.6, 1.4), "rear_stiffness": (0.6, 1.4)}
+LINEAR = {"base": "random-steering", "small_angle": True, "tyres": "linear", "roll": False}
+LINEAR |= {"lags": False, "speed": 25.0 * KMH, "hdop_law": "constant"} | STIFF
+MIX = {"amplitude": (0.03, 0.08), "amplitude_2": (0.02, 0.05)}
+CHANGED = 5.0  # s
+CHANGE = {"tyre_change_time": CHANGED, "front_change": (0.7, 1.3), "rear_change": (0.7, 1.3)}
+GUST = {"wind_force": (300.0, 500.0), "wind_arm": 0.1, "wind_start": 4.0, "wind_length": 3.0}
+TRUE = "exact-kf, true model"
+"""The label of a filter that knows the true car and noise."""
+
+Filters = Mapping[str, tuple[str, Mapping[str, Any]]]
+
+
+@dataclass(frozen=True)
+class Condition:
+    """A kind of drive. scenario: over `LINEAR`. options: of `joint`. since: s, from which errors
+    count. bounded: whether the bound is one there: a linear car that does not roll. foreseen:
+    whether `joint` has a state or a level for all that happens. filters: more of them, or others of
+    a name, as (estimator, options) by label.
+    """
+
+    name: str
+    env_id: str = CAMERA
+    scenario: Mapping[str, Any] = field(default_factory=dict)
+    options: Mapping[str, Any] = field(default_factory=dict)
+    since: float = SETTLED
+    bounded: bool = True
+    foreseen: bool = True
+    filters: Filters = field(default_factory=dict)
+
+    @property
+    def all_filters(self) -> Filters:
+        """Every filter that drives along."""
+        return {"joint": ("joint", self.options), "exact-kf": ("exact-kf", {})} | dict(self.filters)
+
+
+FOUR = {"members": 4}
+THREE = {"levels": (0.5, 1.0, 2.0)}
+LIMITED = {"inverse_friction_sd": 0.5}
+BIASED = {"bias_sd": 0.01}
+
+
+def pushed(factor: float) -> dict[str, Any]:
+    """Disturbances of a factor times the levels that filters assume."""
+    return MIX | {"disturbance_force": 50.0 * factor, "disturbance_moment": 20.0 * factor}
+
+
+def biased(degrees: float) -> dict[str, Any]:
+    """A gyro that is off by so many deg/s."""
+    return MIX | {"noise": {"gyro_bias": np.radians(degrees)}}
+
+
+FIALA = {"tyres": "fiala", "friction": 0.9}
+SLALOM = {"base": "slalom", "tyres": "fiala", "friction": 0.5}
+UNEVEN = {"camera_delays": (0.02, 0.015, 0.01, 0.025)}
+CONDITIONS = (
+    Condition("camera", CAMERA, MIX),
+    Condition("GPS", GPS, MIX),
+    Condition("camera and GPS", FUSION, MIX),
+    Condition("camera, gentle steering", CAMERA),
+    Condition("GPS, gentle steering", GPS),
+    Condition("camera, 10 km/h", CAMERA, MIX | {"speed": 10.0 * KMH}),
+    Condition("camera, 40 km/h, gentle", CAMERA, {"speed": 40.0 * KMH}),
+    Condition("camera, gyro 0.5 deg/s off", CAMERA, biased(0.5), BIASED),
+    Condition("GPS, gyro 0.5 deg/s off", GPS, biased(0.5), BIASED),
+    Condition("camera 20, 15, 10, 25 ms late", CAMERA, MIX | UNEVEN),
+    Condition("GPS out for 5 s", GPS, MIX | {"gps_outage": (3.0, 8.0)}),
+    Condition("half the disturbances it was told", CAMERA, pushed(0.5), foreseen=False),
+    Condition("twice the disturbances it was told", CAMERA, pushed(2.0), foreseen=False),
+    Condition("half the disturbances, three levels", CAMERA, pushed(0.5), THREE),
+    Condition("twice the disturbances, three levels", CAMERA, pushed(2.0), THREE),
+    Condition("a gust of unknown strength", CAMERA, MIX | GUST, foreseen=False),
+    Condition("the same gust, three levels", CAMERA, MIX | GUST, THREE, foreseen=False),
+    Condition("camera, four members", CAMERA, MIX, FOUR),
+    Condition("camera, three levels", CAMERA, MIX, THREE),
+    Condition("tyres change at 5 s, four members", CAMERA, MIX | CHANGE, FOUR),
+    Condition("the same, three levels", CAMERA, MIX | CHANGE, THREE),
+    Condition("the same, one filter", CAMERA, MIX | CHANGE, foreseen=False),
+    Condition("from the change on, four members", CAMERA, MIX | CHANGE, FOUR, CHANGED),
+    Condition("from the change on, three levels", CAMERA, MIX | CHANGE, THREE, CHANGED),
+    Condition("from the change on, one filter", CAMERA, MIX | CHANGE, {}, CHANGED, foreseen=False),
+    Condition("Fiala tyres, friction 0.9", CAMERA, MIX | FIALA, LIMITED, bounded=False),
+    Condition("slalom, Fiala tyres, friction 0.5", CAMERA, SLALOM, LIMITED, bounded=False),
+)
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A quantity that grows from left to right. at: the condition at a value. log: of `curves`."""
+
+    question: str
+    label: str
+    values: tuple[float, ...]
+    at: Callable[[float], Condition]
+    log: str = "y"
+
+    def conditions(self) -> list[Condition]:
+        """The condition at every value."""
+        return [self.at(value) for value in self.values]
+
+
+def _stiff(factor: float) -> Condition:
+    same = dict.fromkeys(STIFF, factor)
+    return Condition(f"both axles {factor:g} of nominal", CAMERA, MIX | same)
+
+
+def _steered(degrees: float) -> Condition:
+    size = {"amplitude": np.radians(degrees), "amplitude_2": 0.6 * np.radians(degrees)}
+    return Condition(f"steering of {degrees:g} deg", CAMERA, size)
+
+
+def _late(ms: float) -> Condition:
+    late = {"camera_delays": (1e-3 * ms,)}
+    return Condition(f"camera {ms:g} ms late", CAMERA, MIX | late)
+
+
+def _slow(period: float) -> Condition:
+    return Condition(f"GPS every {period:g} s", GPS, MIX | {"gps_period": period})
+
+
+def _dark(seconds: float) -> Condition:
+    out = {"gps_outage": (3.0, 3.0 + seconds)} if seconds else {}
+    return Condition(f"no GPS for {seconds:g} s", GPS, MIX | out)
+
+
+def _off(degrees: float) -> Condition:
+    return Condition(f"gyro {degrees:g} deg/s off", CAMERA, biased(degrees), BIASED)
+
+
+INERTIAL = {"fast": ["gyro", "accel_y"]}
+
+
+def _noisy(factor: float) -> Condition:
+    """A car that rolls, since its accelerometer feels that: there is no bound."""
+    noise = {"roll": True, "noise": {"accel": 0.1 * factor}}
+    own = INERTIAL | {"accel_time": 2.0}
+    filters: Filters = {
+        "joint, finds the noise": ("joint", own),
+        "exact-kf": ("exact-kf", INERTIAL),
+        TRUE: ("exact-kf", INERTIAL | {"accel_y_noise": 0.1 * factor}),
+    }
+    name = f"accelerometer noise x {factor:g}"
+    return Condition(name, CAMERA, MIX | noise, INERTIAL, bounded=False, filters=filters)
+
+
+def _shaken(factor: float) -> Condition:
+    filters = {"joint, three levels": ("joint", THREE)}
+    return Condition(f"disturbances x {factor:g}", CAMERA, pushed(factor), filters=filters)
+
+
+CURVES = (
+    Curve("What do other tyres cost?", "stiffness of both axles / nominal",
+          (0.6, 0.8, 1.0, 1.2, 1.4), _stiff),
+    Curve("How much steering do the tyres need?", "steering amplitude / deg",
+          (0.125, 0.25, 0.5, 1.0, 2.0, 4.0), _steered, "xy"),
+    Curve("What does a late camera cost?", "delay of the camera / ms",
+          (0.0, 30.0, 60.0, 100.0, 150.0, 200.0), _late),
+    Curve("What does a slow GPS cost?", "period of the GPS / s",
+          (0.05, 0.1, 0.2, 0.5, 1.0, 2.0), _slow, "xy"),
+    Curve("What does a GPS that is out cost?", "length of the outage / s",
+          (0.0, 1.0, 2.0, 3.0, 4.0, 6.0), _dark),
+    Curve("What does a gyro's bias cost?", "bias of the gyro / (deg/s)",
+          (0.0, 0.1, 0.2, 0.5, 1.0, 2.0), _off),
+    Curve("What does another noise of the accelerometer cost?",
+          "accelerometer noise / data sheet's", (0.25, 0.5, 1.0, 2.0, 4.0), _noisy, "xy"),
+    Curve("What do other disturbances cost?", "disturbances / those assumed",
+          (0.5, 0.7, 1.0, 1.4, 2.0), _shaken, "xy"),
+)  # fmt: skip
+
+COMPLETE = INERTIAL | LIMITED | BIASED | {"accel_bias_sd": 0.3}
+WITHOUT: dict[str, dict[str, Any]] = {
+    "joint, complete": {},
+    "without accelerometer": {"fast": ["gyro"], "accel_bias_sd": 0.0},
+    "without friction": {"inverse_friction_sd": 0.0},
+    "without stiffness": {"front_tyres_sd": 1e-6, "rear_tyres_sd": 1e-6},
+    "without disturbances": {"force_sd": 1.0, "moment_sd": 1.0},
+    "without biases": {"bias_sd": 0.0, "accel_bias_sd": 0.0},
+}
+"""Options over `COMPLETE`: a state is left out or known at the start."""
+
+
+def _parts(name: str, env_id: str, scenario: Mapping[str, Any]) -> Condition:
+    filters = {label: ("joint", COMPLETE | left) for label, left in WITHOUT.items()}
+    return Condition(name, env_id, {"roll": True} | dict(scenario), bounded=False, filters=filters)
+
+
+PARTS = (
+    _parts("camera, car that rolls", CAMERA, MIX),
+    _parts("GPS, car that rolls", GPS, MIX),
+    _parts("gyro 0.5 deg/s off, car that rolls", CAMERA, biased(0.5)),
+    _parts("Fiala tyres, car that rolls", CAMERA, MIX | FIALA),
+)

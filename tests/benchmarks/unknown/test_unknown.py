@@ -1,0 +1,92 @@
+"""The suite of unknown tyres: its bound knows what acted, errors and intervals are joint's."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sideslip.benchmarks.unknown import conditions, curves, measure, suite
+from sideslip.benchmarks.unknown.conditions import CAMERA, CONDITIONS, CURVES, PARTS, WITHOUT
+
+NAMED = {each.name: each for each in CONDITIONS}
+FIALA = "Fiala tyres, friction 0.9"
+FEW = tuple(
+    each
+    for each in CONDITIONS
+    if each.name in ("camera and GPS", "twice the disturbances it was told", FIALA)
+    or "change" in each.name
+)
+
+
+@pytest.fixture(scope="module")
+def few() -> Any:
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (suite, curves):
+            patch.setattr(module, "CONDITIONS", FEW)
+            patch.setattr(module, "CURVES", CURVES[3:4])
+            patch.setattr(module, "PARTS", PARTS[2:3])
+        yield suite.run(4, jobs=1)
+
+
+def test_every_condition_has_its_numbers_and_the_bound_holds(few: Any) -> None:
+    numbers = {
+        (row.scenario, row.metric): row.value for row in few.rows if row.estimator == "joint"
+    }
+    assert numbers["camera and GPS", "rmse_over_bound"] > 0.9
+    assert numbers["camera and GPS", "rmse_over_exact_kf"] < 0.5
+    double = "twice the disturbances it was told"
+    assert 0.9 < numbers[double, "rmse_over_bound"] < 1.6 and numbers[double, "nees"] > 2.0
+    assert (FIALA, "rmse_over_bound") not in numbers
+    table = few.tables[0]
+    assert [line[0] for line in table.cells] == [each.name for each in FEW]
+    assert few.verdict.splitlines()[1].startswith("joint, which estimates them, has")
+
+
+def test_no_verdict_line_is_longer_than_a_screen(few: Any) -> None:
+    assert max(map(len, few.verdict.splitlines())) <= 110
+
+
+def test_a_bank_is_nearer_to_the_bound_of_changing_tyres_than_one_filter(few: Any) -> None:
+    over = {row.scenario: row.value for row in few.rows if row.metric == "rmse_over_bound"}
+    four, one = (f"from the change on, {each}" for each in ("four members", "one filter"))
+    assert 0.9 < over[four] < over[one]
+
+
+def test_a_curve_has_a_point_for_every_value_and_its_bound_below(few: Any) -> None:
+    curve = CURVES[3]
+    names = [what.name for what in curve.conditions()]
+    rmse = {(r.scenario, r.estimator): r.value for r in few.rows if r.metric == "rmse"}
+    bound = [rmse[name, curves.BOUND] for name in names]
+    assert bound == sorted(bound)  # a slower GPS sees less
+    assert all(rmse[name, "joint"] > 0.9 * rmse[name, curves.BOUND] for name in names)
+    titles = [question for question, _, _ in few.answers]
+    assert titles[1:] == ["Do the intervals hold what they promise?", curve.question]
+
+
+def test_intervals_that_promise_more_hold_more(few: Any) -> None:
+    shares = [
+        row.value
+        for row in few.rows
+        if row.estimator == "joint" and row.scenario == "all with linear tyres"
+    ]
+    assert len(shares) == len(measure.LEVELS) and shares == sorted(shares)
+    assert shares[-1] > 0.8
+
+
+def test_a_filter_without_bias_states_pays_for_the_bias(few: Any) -> None:
+    ratio = {r.estimator: r.value for r in few.rows if r.metric == "ratio"}
+    assert list(ratio) == list(WITHOUT)
+    assert ratio["joint, complete"] == 1.0 and ratio["without biases"] > 3.0
+
+
+def test_a_gust_has_the_bound_of_a_filter_that_does_not_know_its_strength() -> None:
+    """The bound that knows it is that of the same drives without wind."""
+    gust = measure.measure((NAMED["a gust of unknown strength"], (0, 1)))
+    calm = measure.measure((NAMED["camera"], (0, 1)))
+    assert (gust.best > 1.02 * calm.best).all()
+
+
+def test_an_episode_that_ends_early_is_left_out_and_counted() -> None:
+    spinning = conditions.Condition("fast", CAMERA, {"speed": 25.0, "rear_stiffness": 0.3})
+    found = measure.measure((spinning, (0, 1)))
+    assert found.left_out == 2 and np.shape(found.squares) == (0, 2)
