@@ -9,7 +9,7 @@ import pytest
 
 from sideslip.benchmarks import recovery
 from sideslip.benchmarks.picture import write_picture
-from sideslip.benchmarks.recovery import CARS, Case, grid, saved
+from sideslip.benchmarks.recovery import CARS, CLAIRVOYANT, ORACLES, Begun, Case, grid, saved
 from sideslip.benchmarks.report.html import write_report
 
 CAR, COMS = CARS
@@ -30,6 +30,29 @@ def test_a_slide_that_turns_further_out_is_lost_and_one_that_turns_back_is_saved
     found = saved(Case(CAR, "none", (3, 3), 4))
     assert found[0, 2].max() == found[2, 0].max() == 0.0
     assert found[2, 2].mean() > 0.0 and found[0, 0].mean() > 0.0
+
+
+def test_after_a_beginning_the_agent_takes_over() -> None:
+    """Row by row, with the memory that it has built up meanwhile."""
+
+    class Counts:
+        def predict(self, obs: Any, state: Any, start: Any, deterministic: bool) -> Any:
+            count = 0.0 if state is None else state + 1.0
+            return np.full((3, 1), 0.1 * count, np.float32), count
+
+    begun, state, taken = Begun(Counts(), np.array([1.0, -1.0, 1.0]), np.array([2, 1, 0])), None, []
+    for _ in range(3):
+        action, state = begun.predict(np.zeros((3, 2)), state, None)
+        taken.append(action[:, 0])
+    np.testing.assert_allclose(taken, [[1.0, -1.0, 0.0], [1.0, 0.1, 0.1], [0.2, 0.2, 0.2]])
+
+
+def test_of_several_beginnings_the_best_counts() -> None:
+    points, tries = (3, 3), ((1.0, 0.0), (1.0, 0.5), (-1.0, 1.5))
+    found = [saved(Case(CAR, ORACLES[0], points, 4, (each,))) for each in tries]
+    np.testing.assert_array_equal(found[0], saved(Case(CAR, ORACLES[0], points, 4)))
+    both = saved(Case(CAR, ORACLES[0], points, 4, tries))
+    np.testing.assert_array_equal(both, np.maximum.reduce(found))
 
 
 def test_starts_are_what_the_axes_say(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -56,7 +79,10 @@ def test_table_rows_maps_and_picture(tmp_path: Path, monkeypatch: pytest.MonkeyP
     suite = recovery.run(quick=True, jobs=1)
     assert [table.title for table in suite.tables] == list(CARS)
     shares = {(row.scenario, row.controller): row for row in suite.rows}
-    assert set(shares) == {(car, name) for car in CARS for name in ("none", "lqr")}
+    names = ("none", "lqr", CLAIRVOYANT)
+    assert set(shares) == {(car, name) for car in CARS for name in names}
+    for car in CARS:
+        assert shares[car, CLAIRVOYANT].value >= max(shares[car, n].value for n in names)
     assert all(0.0 <= row.low <= row.value <= row.high <= 1.0 for row in suite.rows)
     for each in suite.maps:
         assert "deg" in each.x_label and "deg/s" in each.y_label
