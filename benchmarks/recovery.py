@@ -123,7 +123,8 @@ def saved(case: Case) -> Array:
         last = np.where(step.running, step.info["beta"], last)
     env.close()
     shape = (tries, len(gamma), len(beta), case.seeds)
-    return (~lost & (np.abs(last) < CAUGHT)).astype(float).reshape(shape).max(axis=0)
+    caught = (~lost & (np.abs(last) < CAUGHT)).astype(float).reshape(shape)
+    return np.asarray(caught.max(axis=0))
 
 
 def run(quick: bool = False, jobs: int | None = None, console: Console | None = None) -> Suite:

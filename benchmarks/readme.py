@@ -1,0 +1,89 @@
+"""The README's table of the matrix, made from the rows of a run.
+
+`sideslip bench control --json rows.json`, then `python -m sideslip.benchmarks.readme
+rows.json` writes the tiers' rows to docs/control.json and the table into README.md.
+"""
+
+import argparse
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from .control.cells import REFERENCE_CONTROLLER, REFERENCE_FILTER
+from .control.contests import NOMINAL, PARAMETERS, STATE
+from .harness.results import Row, read_json, write_json, write_text
+
+ROWS, README = Path("docs/control.json"), Path("README.md")
+METRICS = ("cost_vs_nominal", "failure_rate")
+HEADS = {"1": "COMS, 18-28 km/h", "2a": "car, dry", "2b": "any friction", "2c": "limit"}
+SHOWN: Mapping[str, tuple[str, str]] = {
+    "`oracle-state`: knows state and car": (STATE, ""),
+    "`oracle-parameters`: knows car and biases": (PARAMETERS, ""),
+    "`adaptive-nmpc` on `joint` with friction": ("adaptive-nmpc", "joint, friction"),
+    "`adaptive-lqr` on `joint`": ("adaptive-lqr", "joint"),
+    "`nmpc` on `exact-kf`": ("nmpc", REFERENCE_FILTER),
+    "`nominal`: `lqr` on `exact-kf`": (NOMINAL, ""),
+    "`mpc` on `exact-kf`": ("mpc", REFERENCE_FILTER),
+    "`sliding-mode` on `exact-kf`": ("sliding-mode", REFERENCE_FILTER),
+    "`model-following` on `exact-kf`": ("model-following", REFERENCE_FILTER),
+    "`two-dof` on `exact-kf`": ("two-dof", REFERENCE_FILTER),
+    "`esc` on `exact-kf`": ("esc", REFERENCE_FILTER),
+    "no control": ("none", ""),
+    "`lqr` on `joint`": (REFERENCE_CONTROLLER, "joint"),
+    "`lqr` on `exact-kf` without bias states": (REFERENCE_CONTROLLER, "exact-kf, no bias states"),
+    "`lqr` on `exact-kf`, camera alone": (REFERENCE_CONTROLLER, "exact-kf, camera"),
+    "`lqr` on `bicycle-kf` (no camera, no GPS)": (REFERENCE_CONTROLLER, "bicycle-kf"),
+    "`lqr` on `uneven-delay-kf`": (REFERENCE_CONTROLLER, "uneven-delay-kf"),
+    "`lqr` on `dakf`": (REFERENCE_CONTROLLER, "dakf"),
+}
+"""(controller, estimator) of each line, by what it is called."""
+
+
+def tier_rows(path: str | Path) -> list[Row]:
+    """The tiers' rows of a file that the table is made of; raises what `read_json` does."""
+    tiers = {f"tier {tier}" for tier in HEADS}
+    return [row for row in read_json(path) if row.metric in METRICS and row.scenario in tiers]
+
+
+def table(rows: Sequence[Row]) -> str:
+    """Cost in % of nominal's with its interval, and in brackets failures in %, as Markdown."""
+    found = {(row.scenario, row.controller, row.estimator, row.metric): row for row in rows}
+    lines = ["| | " + " | ".join(f"{tier}: {text}" for tier, text in HEADS.items()) + " |"]
+    lines.append("|---" * (1 + len(HEADS)) + "|")
+    for name, who in SHOWN.items():
+        cells = []
+        for tier in HEADS:
+            cost, failing = (found.get((f"tier {tier}", *who, metric)) for metric in METRICS)
+            spread = "" if cost is None or who[0] == NOMINAL else _spread(cost)
+            if cost is None or failing is None:
+                cells.append("")
+            else:
+                cells.append(f"{100.0 * cost.value:.0f}{spread} ({100.0 * failing.value:.0f})")
+        lines.append(f"| {name} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def _spread(row: Row) -> str:
+    return f" [{100.0 * row.low:.0f}, {100.0 * row.high:.0f}]"
+
+
+def put(text: str, made: str) -> str:
+    """A README with another table; ValueError where it has none."""
+    pattern = re.compile(r"^\| \| 1: [^\n]*\n(\|[^\n]*\n)+", re.MULTILINE)
+    if len(pattern.findall(text)) != 1:
+        raise ValueError("the README has no table that begins with the tiers, or several")
+    return pattern.sub(lambda _: made + "\n", text)
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("rows", type=Path, help="of sideslip bench control --json")
+    rows = tier_rows(parser.parse_args().rows)
+    readme = put(README.read_text(encoding="utf-8"), table(rows))
+    write_json(ROWS, rows)
+    write_text(README, readme)
+
+
+if __name__ == "__main__":
+    main()
