@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from ..envs.backend.extras import extra
 from ..envs.backend.files import whole
 from ..envs.rendering.palette import INK, colour
 from .control.contests import TITLES
@@ -20,12 +21,8 @@ def write_picture(path: str | Path, suites: Sequence[Suite]) -> None:
 
     Needs the extra `report`. Raises ValueError if no suite has a row to draw.
     """
-    try:
+    with extra("report", "pictures need matplotlib"):
         from matplotlib.figure import Figure
-    except ModuleNotFoundError:
-        raise ModuleNotFoundError(
-            "pictures need matplotlib: pip install 'sideslip[report]'"
-        ) from None
     rows = [row for suite in suites for row in suite.rows]
     error, score = "error of sideslip / mrad", "score (0: nominal, 1: oracle-state)"
     panels = [

@@ -82,22 +82,13 @@ def check_options(what: str, function: Callable[..., Any], options: Iterable[str
         raise TypeError(f"{what}: {unknown_names('option', unknown, known)}")
 
 
-def count_of(num_envs: Any) -> int:
-    """How many environments; TypeError for what is no whole number, ValueError below one."""
-    if isinstance(num_envs, bool) or not isinstance(num_envs, int | np.integer):
-        raise TypeError(f"num_envs is a number of environments, got {brief(num_envs)}")
-    if num_envs < 1:
-        raise ValueError(f"num_envs is at least 1, got {brief(num_envs)}")
-    return int(num_envs)
-
-
-def steps_of(max_episode_steps: Any) -> int:
-    """How many steps; TypeError for what is no whole number, ValueError below one."""
-    if isinstance(max_episode_steps, bool) or not isinstance(max_episode_steps, int | np.integer):
-        raise TypeError(f"max_episode_steps is a number of steps, got {brief(max_episode_steps)}")
-    if max_episode_steps < 1:
-        raise ValueError(f"max_episode_steps is at least 1, got {brief(max_episode_steps)}")
-    return int(max_episode_steps)
+def count_of(name: str, value: Any, what: str) -> int:
+    """How many of `what`; TypeError for what is no whole number, ValueError below one."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer):
+        raise TypeError(f"{name} is a number of {what}, got {brief(value)}")
+    if value < 1:
+        raise ValueError(f"{name} is at least 1, got {brief(value)}")
+    return int(value)
 
 
 def each_of(name: str, value: Any, count: int) -> Sequence[Any]:

@@ -12,7 +12,7 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from .arguments import actions_of, count_of, each_of, mask_of, mode_of, named, seeds_of, steps_of
+from .arguments import actions_of, count_of, each_of, mask_of, mode_of, named, seeds_of
 from .engine.batch import step_rows
 from .engine.config import EnvConfig
 from .engine.episodes import Episodes
@@ -76,12 +76,14 @@ class StabilityVectorEnv(DrawnRows, Episodes, VectorEnv[Observations, Any, npt.N
         max_episode_steps: int | None = None,
         **arguments: Any,
     ) -> None:
-        self.num_envs = N = count_of(num_envs)
+        self.num_envs = N = count_of("num_envs", num_envs, "environments")
         self._mode = mode_of(autoreset_mode)
         if info not in _INFO:
             raise ValueError(f"info is 'all' or 'ends', got {info!r}")
         self._all_infos = info == "all"
-        self._longest = None if max_episode_steps is None else steps_of(max_episode_steps)
+        self._longest = max_episode_steps
+        if max_episode_steps is not None:
+            self._longest = count_of("max_episode_steps", max_episode_steps, "steps")
         one, rows = _rows_of(arguments, N)
         Episodes.__init__(self, rows)
         self.reference = one.reference

@@ -16,6 +16,7 @@ from gymnasium.envs.registration import EnvSpec
 from .arguments import mapping_of, unknown_names
 from .backend.arrays import read
 from .backend.elementary import PI
+from .backend.extras import extra
 from .backend.random import uniforms
 from .backend.rebuild import plain
 from .engine.arrays import Row
@@ -43,14 +44,10 @@ class Eye:
     """
 
     def __init__(self, delay: str, appearance: Mapping[str, Any] | None) -> None:
-        try:
+        with extra("vision", "vision='image' needs {}"):
             from .sensors.camera.finder import LaneFinder
             from .sensors.camera.pinhole import Pinhole
             from .sensors.camera.road_image import Appearance, Painter, Scene
-        except ModuleNotFoundError as error:
-            raise ModuleNotFoundError(
-                f"vision='image' needs {error.name}: pip install 'sideslip[vision]'"
-            ) from None
         fields = mapping_of("appearance", appearance or {})
         if unknown := [name for name in fields if name not in Appearance.__dataclass_fields__]:
             known = Appearance.__dataclass_fields__

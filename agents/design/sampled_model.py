@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from ...envs.backend.extras import extra
 from ...envs.record import Array
 from ...envs.task.cost import BETA_SCALE, EFFORT_WEIGHT, GAMMA_SCALE, STEER_SCALE
 from ...envs.task.reference import ZERO_SLIP
@@ -186,12 +187,8 @@ def optimal(G: Array, H: Array, Q: Array, R: Array, N: Array, moved: int) -> tup
 
     Raises ModuleNotFoundError, naming the extra, without python-control.
     """
-    try:
+    with extra("design", "designing this controller needs python-control"):
         import control
-    except ModuleNotFoundError:
-        raise ModuleNotFoundError(
-            "designing this controller needs python-control: pip install 'sideslip[design]'"
-        ) from None
     d = moved
     A, B, W = G[:d, :d], H[:d], G[d:, d:]
     K, P, _ = control.dlqr(A, B, Q[:d, :d], R, N[:d])

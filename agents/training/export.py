@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ...envs.backend.extras import extra
 from ...estimators.learned.memory import Cell
 from ...estimators.learned.network import Network
 
@@ -23,14 +24,10 @@ def network_from_sb3(model: Any, normaliser: Any = None, history: int = 1) -> Ne
     Raises ValueError for a model that is none of these, or an observation of another width,
     ModuleNotFoundError without torch.
     """
-    try:
+    with extra("train", "networks come from stable-baselines3"):
         from stable_baselines3.common.torch_layers import FlattenExtractor
 
         from .normalise import Standardised
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(
-            "networks come from stable-baselines3: pip install 'sideslip[train]'", name=error.name
-        ) from error
     policy = getattr(model, "policy", model)
     actor = known_policy(type(policy))(policy)
     space = policy.action_space

@@ -9,18 +9,15 @@ import numpy.typing as npt
 from gymnasium.envs.registration import load_env_creator
 from gymnasium.vector import AutoresetMode, VectorEnv
 
+from ...envs.backend.extras import extra
 from ...envs.task.info import info_of
 from ...envs.vector import StabilityVectorEnv
 from ...estimators.vector.estimate import EstimateObservation
 from .row import Row
 
-try:
+with extra("train", "training needs torch and stable-baselines3"):
     from stable_baselines3.common.vec_env import VecEnv, VecMonitor
     from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
-except ModuleNotFoundError as error:
-    raise ModuleNotFoundError(
-        "training needs torch and stable-baselines3: pip install 'sideslip[train]'", name=error.name
-    ) from None
 
 Observations = npt.NDArray[np.float32]
 Indices = int | Iterable[int] | None

@@ -10,6 +10,7 @@ import typer
 from rich.console import Console
 from rich.progress import track
 
+from ...envs.backend.extras import extra
 from ...envs.backend.files import whole, write_whole
 from ...envs.documents import read_document, write_document
 from .output import check_files, wrote
@@ -45,12 +46,8 @@ def lane_command(
     Without height and tilt among the intrinsics they are estimated from a picture, for a straight
     lane of the width stated; without intrinsics a lens of usual width is assumed.
     """
-    try:
+    with extra("vision", "the lane finder needs {}"):
         import cv2
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(
-            f"the lane finder needs {error.name}: pip install 'sideslip[vision]'"
-        ) from None
     from ...envs.sensors.camera.films import PICTURES, Film, read_picture
 
     console = Console(soft_wrap=True)

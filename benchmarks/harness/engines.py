@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 import joblib
 
 from ...envs.arguments import check_choice
+from ...envs.backend.extras import extra
 
 Case = TypeVar("Case")
 Result = TypeVar("Result")
@@ -43,12 +44,8 @@ def engine(name: str = PROCESSES, address: str = "") -> Iterator[None]:
             raise ValueError(f"an address is of a Ray cluster (engine {RAY!r}), got {address!r}")
         yield
         return
-    try:
+    with extra("scale", "the engine 'ray' needs ray"):
         import ray
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(
-            "the engine 'ray' needs ray: pip install 'sideslip[scale]'", name=error.name
-        ) from error
     quiet = {"env_vars": {"SIDESLIP_QUIET": "1", "OPENBLAS_NUM_THREADS": "1"}}
     try:
         if address:  # Ray itself asks for minutes, then ends the process

@@ -11,16 +11,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ...envs.backend.extras import extra
 from ...envs.rendering.palette import FACTS, GREY, INK, base, colour
 from ..harness.stats import Estimate
 from .colours import line_styles
 
-try:
+with extra("report", "figures need plotly"):
     from plotly import graph_objects as go
-except ModuleNotFoundError as error:
-    raise ModuleNotFoundError(
-        "figures need plotly: pip install 'sideslip[report]'", name=error.name
-    ) from error
 
 Array = npt.NDArray[np.floating[Any]]
 

@@ -13,6 +13,7 @@ from rich.progress import track
 
 from ...agents import make_agent
 from ...agents.rollout import steps_of
+from ...envs.backend.extras import extra
 from ...envs.backend.files import whole
 from ...envs.ticks import TICK
 from ..harness.results import check_writable
@@ -41,14 +42,9 @@ def check_film(path: Path | None) -> None:
     if path.suffix.lower() not in RATES:
         raise ValueError(f"a film ends in {' or '.join(RATES)}, got {str(path)!r}")
     check_writable(path)
-    try:
-        import moviepy
-        import pygame
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(
-            f"a film needs {error.name}: pip install 'sideslip[render]'", name=error.name
-        ) from None
-    assert moviepy and pygame
+    with extra("render", "a film needs {}"):
+        import moviepy  # noqa: F401
+        import pygame  # noqa: F401
 
 
 def film_drive(

@@ -16,22 +16,19 @@ from typing import Any, Protocol
 import joblib
 from rich.console import Console
 
+from ...envs.backend.extras import extra
 from ..harness.drives import Drive
 from ..harness.engines import cores
 from ..harness.parallel import progress, run_cases
 from ..harness.stats import root_mean
 from .task import SAMPLERS, STORAGE, Task, squares
 
-try:
+with extra("tune", "tuning needs optuna"):
     import cmaes  # noqa: F401  Optuna imports it when it is too late
     import optuna
     from optuna.trial import FrozenTrial, TrialState
     from sqlalchemy.engine import make_url
     from sqlalchemy.exc import SQLAlchemyError
-except ModuleNotFoundError as error:
-    raise ModuleNotFoundError(
-        "tuning needs optuna: pip install 'sideslip[tune]'", name=error.name
-    ) from error
 
 BATCH = 8  # trials asked for before any result is in: the same search for every number of jobs
 DIGITS = 3  # of what is found

@@ -4,14 +4,11 @@ import types
 from collections.abc import Callable
 from typing import Any, TypeVar
 
+from .extras import extra
 from .rebuild import plain
 
-try:
+with extra("mpc", "the plant on symbols needs CasADi"):
     import casadi as ca
-except ModuleNotFoundError:
-    raise ModuleNotFoundError(
-        "the plant on symbols needs CasADi: pip install 'sideslip[mpc]'"
-    ) from None
 
 F = TypeVar("F", bound=Callable[..., Any])
 

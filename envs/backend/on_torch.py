@@ -9,14 +9,11 @@ from collections.abc import Callable
 from types import FunctionType, MethodType
 from typing import Any
 
+from .extras import extra
 from .rebuild import plain
 
-try:
+with extra("train", "the device engine needs torch"):
     import torch as torch  # for the other modules of the device engine
-except ModuleNotFoundError:
-    raise ModuleNotFoundError(
-        "the device engine needs torch: pip install 'sideslip[train]'"
-    ) from None
 
 DTYPES = {"float64": torch.float64, "float32": torch.float32}
 

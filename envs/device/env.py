@@ -74,7 +74,7 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
         graph: bool = False,
         **arguments: Any,
     ) -> None:
-        self.num_envs = count_of(num_envs)
+        self.num_envs = count_of("num_envs", num_envs, "environments")
         self._mode = mode_of(autoreset_mode)
         self.device, self.dtype = device_of(device), dtype_of(dtype)
         self._compiled = compiles(compile, self.device)
@@ -129,16 +129,9 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
         """The step with these capacities, and all rows on the device."""
         host = self._host
         all_samples = bool(host.config.base.start.switches[FLAGS.all_samples])
-        step = Step(
-            self._kind,
-            self.control_period,
-            most,
-            all_samples,
-            host.config.bounds,
-            self.dtype,
-            self.device,
-            self._compiled,
-        )
+        how = self.dtype, self.device, self._compiled
+        n, bounds = self.control_period, host.config.bounds
+        step = Step(self._kind, n, most, all_samples, bounds, *how)
         self._step = Graphed(step) if self._graphed else step
         self._rows = DeviceRows(host, most, self.device, self.dtype)
 

@@ -20,6 +20,8 @@ Tensor = torch.Tensor
 _MOTION, _DRIVE, _REFS, _LEAD = (
     slice(part[0], part[-1] + 1) for part in (Z.motion, Z.drive, Z.refs, Z.lead)
 )
+_PACKED = _MOTION, _DRIVE, Z.driver, _REFS, _LEAD, Z.clock.tick, Z.clock.failure
+"""Where the first fields of a `State` lie in the packed state."""
 
 
 def device_of(device: Any) -> torch.device:
@@ -99,19 +101,9 @@ def state_of(
     """The state on the device, and the keys (2, N), of packed states (N, STATE_WIDTH)."""
     whole = torch.as_tensor(states.T.copy())
     slow_state = read_packed(whole, capacity)
-    state = State(
-        whole[_MOTION],
-        whole[_DRIVE],
-        whole[Z.driver],
-        whole[_REFS],
-        whole[_LEAD],
-        whole[Z.clock.tick],
-        whole[Z.clock.failure],
-        *slow_state,
-        torch.as_tensor(over.copy()),
-        torch.as_tensor(reports.T.copy()),
-    )
-    moved = [each.to(device, None if each.dtype == torch.bool else dtype) for each in state]
+    parts = [*(whole[part] for part in _PACKED), *slow_state]
+    parts += [torch.as_tensor(over.copy()), torch.as_tensor(reports.T.copy())]
+    moved = [each.to(device, None if each.dtype == torch.bool else dtype) for each in parts]
     return State(*moved), whole[Z.clock.key_low : Z.clock.key_high + 1].to(device, torch.int64)
 
 
@@ -120,12 +112,7 @@ def write_states(state: State, states: Array) -> None:
     whole = torch.as_tensor(states.T.copy())
     types = [None if each.dtype == torch.bool else torch.float64 for each in state]
     here = State(*(each.to("cpu", to) for each, to in zip(state, types, strict=True)))
-    whole[_MOTION] = here.motion
-    whole[_DRIVE] = here.drive
-    whole[Z.driver] = here.driver
-    whole[_REFS] = here.refs
-    whole[_LEAD] = here.lead
-    whole[Z.clock.tick] = here.tick
-    whole[Z.clock.failure] = here.failure
+    for part, values in zip(_PACKED, here, strict=False):
+        whole[part] = values
     write_packed(here.slow_state, whole)
     states[:] = whole.numpy().T

@@ -10,15 +10,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..backend.extras import extra
 from ..rendering import canvas
 
-try:
+with extra("highway", "roads and traffic need highway-env"):
     from highway_env.road.lane import CircularLane, LineType, SineLane, StraightLane
     from highway_env.road.road import RoadNetwork
-except ModuleNotFoundError as error:
-    raise ModuleNotFoundError(
-        'roads and traffic need highway-env: pip install "sideslip[highway]"', name=error.name
-    ) from None
 
 assert canvas  # which keeps pygame from greeting
 WIDTH = StraightLane.DEFAULT_WIDTH  # m

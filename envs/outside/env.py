@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..arguments import check_choice, number_of
+from ..arguments import check_choice
 from ..backend.arrays import at, read, write
 from ..backend.rebuild import plain
 from ..engine.layout import P, Z
@@ -121,11 +121,7 @@ class OutsideEnv(PlantEnv):
         """Start an episode; see `StabilityEnv`."""
         asked = dict(options or {})
         check_options(asked, self.model)
-        scenario = scenario_from(asked.get("scenario", self.config.base.scenario))
-        if "duration" in asked:
-            duration = number_of("reset option duration", asked["duration"])
-            scenario = scenario.replace(duration=duration)
-        check_scenario(scenario, self.model)
+        check_scenario(self.config.with_options(asked).scenario, self.model)
         if "state" in asked:  # s and y are X and Y on the straight road of these plants
             state = asked["state"]
             asked["state"] = {**state, "s": state.get("X", 0.0), "y": state.get("Y", 0.0)}

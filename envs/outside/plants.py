@@ -22,6 +22,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from ..backend.extras import extra
 from ..engine.packing import car_of
 from ..vehicle.actuators import yaw_moment
 from ..vehicle.dynamics import Motion
@@ -48,13 +49,8 @@ class Acting(NamedTuple):
 
 @functools.cache
 def _module(name: str) -> Any:
-    try:
+    with extra("outside", "an outside plant needs commonroad-vehicle-models"):
         return import_module(f"vehiclemodels.{name}")
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(
-            "an outside plant needs commonroad-vehicle-models: pip install 'sideslip[outside]'",
-            name=error.name,
-        ) from error
 
 
 @functools.cache

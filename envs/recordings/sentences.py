@@ -11,15 +11,13 @@ from collections.abc import Iterator
 from functools import cache
 from typing import Any, NamedTuple
 
-try:
+from ..backend.extras import extra
+
+with extra("wires", "decoding NMEA needs pynmeagps"):
     from pynmeagps import NMEAMessage, calc_checksum, get_parts
     from pynmeagps.exceptions import NMEAMessageError
     from pynmeagps.nmeatypes_core import NMEA_TALKERS
     from pynmeagps.nmeatypes_get import NMEA_PAYLOADS_GET
-except ModuleNotFoundError as error:
-    raise ModuleNotFoundError(
-        "decoding NMEA needs pynmeagps: pip install 'sideslip[wires]'", name=error.name
-    ) from None
 
 DECODED = ("RMC", "VTG", "GGA", "GSA", "GSV")
 VENDOR, OTHER = "of vendors", "other"

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from ..arguments import brief
+from ..backend.extras import extra
 
 if TYPE_CHECKING:
     from .nmea import Counts, Epoch
@@ -146,12 +147,8 @@ def _file(path: Path) -> Line:
 
 
 def _serial(port: str, baud: int) -> Line:
-    try:
+    with extra("wires", "a serial port needs pyserial"):
         import serial
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(
-            "a serial port needs pyserial: pip install 'sideslip[wires]'", name=error.name
-        ) from None
     device = serial.Serial(port, baud, timeout=PAUSE)
     return Line(lambda: bytes(device.read(min(device.in_waiting or 1, _MOST))), device.close)
 

@@ -5,6 +5,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..backend.extras import extra
+
 if TYPE_CHECKING:
     import pandas as pd
 
@@ -16,12 +18,8 @@ def read_table(path: Path) -> "pd.DataFrame":
     Raises ModuleNotFoundError without the extra, FileNotFoundError, and ValueError where the file
     is no table.
     """
-    try:
+    with extra("report", "reading a log needs pandas"):
         import pandas as pd
-    except ModuleNotFoundError:
-        raise ModuleNotFoundError(
-            "reading a log needs pandas: pip install 'sideslip[report]'"
-        ) from None
     if not path.exists():
         raise FileNotFoundError(f"{path}: there is no such file")
     if not path.is_file():
@@ -77,12 +75,8 @@ def _matlab(path: Path, head: bytes) -> "pd.DataFrame":
 
 def _mdf(path: Path) -> "pd.DataFrame":
     """All channels on the clock of the fastest, which becomes `time_s`."""
-    try:
+    with extra("mdf", "reading MDF needs asammdf"):
         from asammdf import MDF
-    except ModuleNotFoundError:
-        raise ModuleNotFoundError(
-            "reading MDF needs asammdf: pip install 'sideslip[mdf]'"
-        ) from None
     with MDF(path) as file:
         table: pd.DataFrame = file.to_dataframe()
     return table.rename_axis("time_s").reset_index()

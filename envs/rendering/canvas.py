@@ -10,13 +10,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..backend.extras import extra
+
 os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
-try:
+with extra("render", "pictures need pygame"):
     import pygame
-except ModuleNotFoundError as error:
-    raise ModuleNotFoundError(
-        "pictures need pygame: pip install 'sideslip[render]'", name=error.name
-    ) from None
 
 Points = npt.ArrayLike
 """Places, (n, 2)."""

@@ -1,7 +1,7 @@
 """What a scenario's fields may be; a value out of place is refused by its field's name."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from ..arguments import brief, check_choice, is_finite, listed
@@ -32,32 +32,8 @@ _CHOICES = {
     "tier": TIER_NAMES,
 }
 _FLAGS = ("mirror", "small_angle", "lags", "roll")
-_NUMBERS = (
-    "duration",
-    "disturbance_force",
-    "disturbance_moment",
-    "disturbance_time",
-    "curve_start",
-    "curve_ramp",
-    "speed_change",
-    "change_start",
-    "change_length",
-    "surge",
-    "surge_frequency",
-    "wind_height",
-    "grade",
-    "hdop",
-    "hdop_spread",
-    "hdop_time",
-    "camera_jitter",
-    "camera_loss",
-    "driver_preview",
-    "driver_gain",
-    "driver_lag",
-    "driver_rate",
-    "trace_step",
-)
 _NUMBERS_OR_NONE = ("acceleration", "gps_period")
+_MAY_BE_INFINITE = ("half_width", "camera_heading", "camera_offset")
 _TIMES_OR_NONE = {  # how many
     "camera_delays": (1, 2, 3, 4),
     "gps_delays": (1, 2, 3, 4),
@@ -90,12 +66,15 @@ _POSITIVE_DRAWS = (
 _POSITIVE_OR_NONE = ("path_speed", "friction_right", "tyre_change_time")
 
 
-def check(fields: Fields) -> None:
-    """ValueError for a field out of place, with the scenario's name and the field's."""
+def check(fields: Fields, numbers: Iterable[str]) -> None:
+    """ValueError for a field out of place, with the scenario's name and the field's.
+
+    numbers: the fields that are one number, neither drawn nor None.
+    """
     try:
         _check_names(fields)
         _check_mappings(fields)
-        _check_numbers(fields)
+        _check_numbers(fields, numbers)
         _check_draws(fields)
         _check_motion(fields)
         _check_sensors(fields)
@@ -154,9 +133,10 @@ def _check_number(name: str, value: Any) -> None:
         raise ValueError(f"{name} {brief(value)} is not finite")
 
 
-def _check_numbers(fields: Fields) -> None:
-    for name in _NUMBERS:
-        _check_number(name, fields[name])
+def _check_numbers(fields: Fields, numbers: Iterable[str]) -> None:
+    for name in numbers:
+        if name not in _MAY_BE_INFINITE:
+            _check_number(name, fields[name])
     for name in _NUMBERS_OR_NONE:
         _check_number(name, 0.0 if fields[name] is None else fields[name])
     width = fields["half_width"]  # only compared with: it may be as wide as a float can be

@@ -158,7 +158,7 @@ class Scenario:
             value = getattr(self, entry.name)
             if isinstance(value, list):
                 object.__setattr__(self, entry.name, tuple(value))
-        check(vars(self))
+        check(vars(self), [each.name for each in dataclasses.fields(self) if each.type is float])
 
     def range(self, name: str) -> tuple[float, float]:
         """(low, high) of a drawn quantity; zeros where it is None."""

@@ -212,18 +212,9 @@ class EstimateObservation(
         beta, gamma = infos.get("beta"), infos.get("gamma")
         known = beta is not None and gamma is not None
         truth = (beta, gamma) if known else (np.zeros(N), np.zeros(N))
-        summary = np.zeros((N, 3))
-        self.estimator.take(
-            mask,
-            *records,
-            np.ascontiguousarray(obs, np.float32),
-            outputs.inner,
-            outputs.plan,
-            outputs.limits,
-            *truth,
-            out,
-            summary,
-        )
+        summary, inner = np.zeros((N, 3)), np.ascontiguousarray(obs, np.float32)
+        what = inner, outputs.inner, outputs.plan, outputs.limits, *truth, out, summary
+        self.estimator.take(mask, *records, *what)
         for key, place in outputs.keys:
             if place == NEES and not known:
                 continue

@@ -50,23 +50,9 @@ def observe_batch(
     waiting = 0
     for i in range(len(filters)):
         if done[i] < rows[i]:
-            done[i] = observe(
-                filters[i],
-                gains_of(pool, places[i]),
-                fast[i],
-                rows[i],
-                packets[i],
-                counts[i],
-                maximum(done[i], 0),
-                obs[i],
-                inner,
-                plan,
-                limits,
-                beta[i],
-                gamma[i],
-                out[i],
-                summary[i],
-            )
+            f, gains, start = filters[i], gains_of(pool, places[i]), maximum(done[i], 0)
+            own = obs[i], inner, plan, limits, beta[i], gamma[i], out[i], summary[i]
+            done[i] = observe(f, gains, fast[i], rows[i], packets[i], counts[i], start, *own)
             waiting += 1 if done[i] < rows[i] else 0
     return waiting
 

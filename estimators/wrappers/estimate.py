@@ -142,19 +142,9 @@ class EstimateObservation(
             estimator.step(base.rows[:rows], base.packets[: base.delivered])
             write(estimator, obs, *last, out, summary)
         while self._ours:
-            done = observe_entry()(
-                estimator.filters,
-                estimator.gains,
-                base.rows,
-                rows,
-                base.packets,
-                base.delivered,
-                done,
-                obs,
-                *last,
-                out,
-                summary,
-            )
+            record = base.rows, rows, base.packets, base.delivered, done
+            memory = estimator.filters, estimator.gains
+            done = observe_entry()(*memory, *record, obs, *last, out, summary)
             if done == rows:  # which a refused action leaves at none
                 break
             estimator.design_missing()

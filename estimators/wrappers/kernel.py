@@ -97,21 +97,6 @@ def observe(
 def observe_entry() -> Any:
     """`observe` as a plain call."""
     small, wide, matrix = np.zeros(1, np.float32), np.zeros(1), np.zeros((1, 1))
-    return entry(
-        observe,
-        np.zeros(1, FILTER),
-        np.zeros((1, 1, 1)),
-        matrix,
-        0,
-        matrix,
-        0,
-        0,
-        small,
-        0,
-        np.zeros((1, 3), np.int64),
-        wide,
-        0.0,
-        0.0,
-        small,
-        wide,
-    )
+    memory, record = (np.zeros(1, FILTER), np.zeros((1, 1, 1))), (matrix, 0, matrix, 0, 0)
+    outputs = small, 0, np.zeros((1, 3), np.int64), wide, 0.0, 0.0, small, wide
+    return entry(observe, *memory, *record, *outputs)

@@ -206,7 +206,7 @@ def test_without_highway_env_the_error_names_the_extra() -> None:
         "gym.make('sideslip/Highway-v0')"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert done.returncode and 'pip install "sideslip[highway]"' in done.stderr.splitlines()[-1]
+    assert done.returncode and "pip install 'sideslip[highway]'" in done.stderr.splitlines()[-1]
 
 
 def test_a_start_off_the_roads_own_is_refused() -> None:
