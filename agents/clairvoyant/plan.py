@@ -3,7 +3,7 @@
 Iterative LQR on the env itself: slopes of the plant's text along a run, a backward sweep within the
 limits, and runs of the env that try the new actions with the sweep's gains. What is found is a run
 and costs what the env says, cap and failures included; it is a local optimum, sought from several
-starts. The linear plant has one programme and one optimum (`qp.py`).
+starts.
 """
 
 import time
@@ -19,7 +19,6 @@ from ...envs.engine.layout import P
 from ..controllers.base import Controller
 from ..rollout import steps_of
 from .foresight import Forecast, State, forecast_of, state_of
-from .qp import is_linear, solve_linear
 from .slopes import INPUTS, Problem, Trajectory, limits_along, problem_of, slopes_along
 from .sweep import sweep
 
@@ -38,8 +37,8 @@ SLOW = (1e-3, 3)  # so little gained, relative, in so many steps in a row: settl
 class Plan:
     """Actions (K, width) for an episode, the best run that a start led to.
 
-    cost: of the run in the env. status: "settled", "stuck" (no step was cheaper), "stopped" (after
-    `MOST_SWEEPS` steps) or the quadratic programme's. seconds: of CPU time.
+    cost: of the run in the env. status: "settled", "stuck" (no step was cheaper) or "stopped"
+    (after `MOST_SWEEPS` steps). seconds: of CPU time.
     """
 
     actions: Actions
@@ -92,17 +91,12 @@ def plan(env: gym.Env[Any, Any], seed: int, start: npt.ArrayLike | None = None) 
     """
     began = time.process_time()
     env.reset(seed=seed)
-    base: Any = env.unwrapped
-    forecast = forecast_of(base, base.control_period if is_linear(base) else 1)
+    forecast = forecast_of(env.unwrapped)
     shape = (forecast.fixed.periods, forecast.fixed.width)
     actions = np.zeros(shape) if start is None else np.asarray(start, np.float64)
     if actions.shape != shape:
         raise ValueError(f"a plan of this episode has shape {shape}, got {actions.shape}")
-    if is_linear(base):
-        made, _, status = solve_linear(forecast)
-        best = drive(env, seed, made)
-    else:
-        best, status = _search(env, seed, forecast, actions)
+    best, status = _search(env, seed, forecast, actions)
     taken = best.trajectory.actions.astype(np.float32)
     return Plan(taken, best.cost, status, time.process_time() - began)
 

@@ -1,4 +1,4 @@
-"""The clairvoyant's plan on the linear plant: one quadratic programme, solved by OSQP.
+"""The best plan on the linear plant, found another way: one quadratic programme, solved by OSQP.
 
 On the small-angle plant with linear tyres at a held speed the env's own tick is affine and its
 cost quadratic, so that expanding them at zero loses nothing but the cap of the cost rate.
@@ -14,12 +14,11 @@ import numpy.typing as npt
 import osqp
 from scipy import sparse
 
-from .foresight import Fixed, Forecast, Known, State
-from .plant import advance, carried, node_cost, node_errors, scales
+from sideslip.agents.clairvoyant.foresight import Fixed, Forecast, Known, State
+from sideslip.agents.clairvoyant.plant import advance, carried, node_cost, node_errors, scales
 
 Array = npt.NDArray[np.float64]
 
-SOLVED = ("solved",)
 _OPTIONS = {
     "verbose": False,
     "eps_abs": 1e-8,
@@ -50,17 +49,6 @@ class Programme:
     def actions(self, z: Array) -> Array:
         """(K, width) of a solution."""
         return z[: -self.size].reshape(-1, self.size + self.width)[:, self.size :]
-
-
-def is_linear(base: Any) -> bool:
-    """Whether an episode of an env is a quadratic programme with one slope for all periods.
-
-    The rate limit of steering, tyres that change and a driver who reacts to the car are not.
-    """
-    scenario = base.scenario
-    plant = scenario.small_angle and scenario.tyres == "linear"
-    plant = plant and scenario.tyre_change_time is None and scenario.steering != "driver"
-    return bool(plant and base.held_speed is not None and base.action_space.shape == (1,))
 
 
 @functools.lru_cache(maxsize=8)
