@@ -82,12 +82,13 @@ def check_options(what: str, function: Callable[..., Any], options: Iterable[str
         raise TypeError(f"{what}: {unknown_names('option', unknown, known)}")
 
 
-def count_of(name: str, value: Any, what: str) -> int:
-    """How many of `what`; TypeError for what is no whole number, ValueError below one."""
+def count_of(name: str, value: Any, what: str, least: int = 1, most: int | None = None) -> int:
+    """How many of `what`; TypeError for no whole number, ValueError out of least .. most."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
         raise TypeError(f"{name} is a number of {what}, got {brief(value)}")
-    if value < 1:
-        raise ValueError(f"{name} is at least 1, got {brief(value)}")
+    if value < least or (most is not None and value > most):
+        span = f"at least {least}" if most is None else f"{least} to {most} {what}"
+        raise ValueError(f"{name} is {span}, got {brief(value)}")
     return int(value)
 
 

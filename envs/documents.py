@@ -1,15 +1,21 @@
-"""Documents: what a user writes about a vehicle or a scenario, as TOML or JSON on disk."""
+"""Documents: what is written about a vehicle or a scenario, as TOML or JSON, and typed objects."""
 
 import json
 import math
 import os
 import tomllib
 from collections.abc import Mapping
+from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar, get_origin
 
+from .arguments import brief, is_finite, listed
 from .backend.files import write_whole
 
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+Made = TypeVar("Made", bound="DataclassInstance")
 ENDINGS = (".toml", ".json")
 
 
@@ -68,21 +74,53 @@ def write_document(path: "str | os.PathLike[str]", values: Mapping[str, Any]) ->
     if kind == ".json":
         text = json.dumps(values, indent=1)
     else:
-        text = "\n".join(f"{_key(name)} = {_toml(value)}" for name, value in values.items())
+        text = "\n".join(f"{_key(name)} = {toml_of(value)}" for name, value in values.items())
     write_whole(os.fspath(path), (text + "\n").encode())
 
 
-def _toml(value: Any) -> str:
+def toml_of(value: Any) -> str:
+    """A number, text, list or mapping as TOML writes it behind a key."""
     if isinstance(value, Mapping):
-        return (
-            "{" + ", ".join(f"{_key(name)} = {_toml(each)}" for name, each in value.items()) + "}"
-        )
+        pairs = (f"{_key(name)} = {toml_of(each)}" for name, each in value.items())
+        return f"{{ {', '.join(pairs)} }}"
     if isinstance(value, list | tuple):
-        return "[" + ", ".join(map(_toml, value)) + "]"
+        return "[" + ", ".join(map(toml_of, value)) + "]"
     if isinstance(value, float) and not math.isfinite(value):
         return repr(value)  # inf, which JSON calls Infinity
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 def _key(name: str) -> str:
-    return name if name.isascii() and name.isidentifier() else _toml(name)
+    return name if name.isascii() and name.isidentifier() else toml_of(name)
+
+
+def made_of(kind: type[Made], entry: Any, where: str) -> Made:
+    """A dataclass's instance from a JSON object, whose lists may stand for tuples.
+
+    Raises ValueError, with the place and the field, for an unknown or missing field and a value of
+    another type.
+    """
+    if not isinstance(entry, dict):
+        raise ValueError(f"{where}: expected a JSON object, got {brief(entry)}")
+    known: dict[str, Any] = {each.name: each for each in fields(kind)}
+    needed = {name for name, each in known.items() if each.default is each.default_factory}
+    for what, names in (("unknown", entry.keys() - known), ("missing", needed - entry.keys())):
+        if names:
+            raise ValueError(f"{where}: {what} {listed(sorted(names))}")
+    lists = {name: value for name, value in entry.items() if isinstance(value, list)}
+    tuples = {n: tuple(v) for n, v in lists.items() if get_origin(known[n].type) is tuple}
+    check_types(kind, entry | tuples, where)
+    try:
+        return kind(**entry | tuples)
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from None
+
+
+def check_types(kind: "type[DataclassInstance]", values: Mapping[str, Any], where: str) -> None:
+    """ValueError, with the place and the field, for a value of another type than a dataclass's."""
+    types: dict[str, Any] = {each.name: each.type for each in fields(kind)}
+    for name, value in values.items():
+        wanted = get_origin(types[name]) or types[name]
+        fits = isinstance(value, wanted) or (wanted is float and is_finite(value))
+        if not fits or isinstance(value, bool):
+            raise ValueError(f"{where}: {name} is {brief(value)}, not {wanted.__name__}")

@@ -8,22 +8,11 @@ from ...envs.backend.arrays import offsets
 from ...envs.backend.decorators import jit
 from ...envs.backend.rebuild import plain
 from ...envs.record import Array
-from ...envs.vehicle.linear import bicycle_coefficients
+from ...envs.vehicle.linear import Bicycle, bicycle_coefficients
 from ...envs.vehicle.vehicle import Vehicle
 
-
-class NominalCar(NamedTuple):
-    """A vehicle as laws read it, an array at these indices: SI units, stiffness per tyre."""
-
-    m: Any
-    I: Any  # noqa: E741
-    l_f: Any
-    l_r: Any
-    C_f: Any
-    C_r: Any
-
-
-CAR, _ = offsets(NominalCar)
+CAR, _ = offsets(Bicycle)
+"""A vehicle as laws read it, an array at these indices: SI units, stiffness per tyre."""
 
 
 class Plant(NamedTuple):
@@ -39,10 +28,8 @@ class Plant(NamedTuple):
 
 
 def nominal_car(vehicle: Vehicle) -> Array:
-    """The numbers of `NominalCar`, (6,)."""
-    v = vehicle
-    numbers = v.mass, v.yaw_inertia, v.front_arm, v.rear_arm, v.front_stiffness, v.rear_stiffness
-    return np.array(NominalCar(*numbers))
+    """The numbers at `CAR`, (6,)."""
+    return np.array(vehicle.lateral)
 
 
 @jit

@@ -2,12 +2,13 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import MISSING, asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import gymnasium as gym
 
 from ... import __version__
+from ...envs.documents import check_types
 from ...estimators.wrappers.estimate import EstimateObservation
 from ..env_facts import AnyEnv, facts_of
 
@@ -48,21 +49,16 @@ class Card:
     def __post_init__(self) -> None:
         pairs = self.observation
         if not isinstance(pairs, list | tuple) or not all(map(_is_entry, pairs)):
-            raise ValueError(f"the card's observation is a list of (name, unit), got {pairs!r}")
+            raise ValueError(f"observation is a list of (name, unit), got {pairs!r}")
         object.__setattr__(self, "observation", tuple((name, unit) for name, unit in pairs))
         if len({name for name, _ in pairs}) != len(pairs):
-            raise ValueError("the card's observation names an entry twice")
+            raise ValueError("observation names an entry twice")
         if ":" in str(self.estimator):  # a file from elsewhere would name code to be imported
             raise ValueError(
-                f"the card's estimator is a name, got the entry point {self.estimator!r}: "
+                f"estimator is a name, got the entry point {self.estimator!r}: "
                 "sideslip.register_estimator gives it one"
             )
-        for each in fields(self):
-            value = getattr(self, each.name)
-            kinds = _KINDS.get(each.type, ())
-            if kinds and (isinstance(value, bool) or not isinstance(value, kinds)):
-                wanted = " or ".join(kind.__name__ for kind in kinds)
-                raise ValueError(f"the card's {each.name} is {wanted}, got {value!r}")
+        check_types(Card, vars(self), "the card")
         self.to_json()
 
     @classmethod
@@ -101,39 +97,12 @@ class Card:
             **rest,
         )
 
-    @classmethod
-    def from_mapping(cls, content: Any) -> "Card":
-        """A card from its JSON object; ValueError for a field that is missing or unknown."""
-        if not isinstance(content, dict):
-            raise ValueError(f"a card is a JSON object, got {type(content).__name__}")
-        known = {each.name: each for each in fields(cls)}
-        needed = {
-            name
-            for name, each in known.items()
-            if each.default is MISSING and each.default_factory is MISSING
-        }
-        for what, names in (
-            ("lacks", needed - content.keys()),
-            ("has unknown fields:", content.keys() - known),
-        ):
-            if names:
-                raise ValueError(f"the card {what} {', '.join(sorted(names))}")
-        return cls(**content)
-
     def to_json(self, **more: Any) -> str:
         """The card as a JSON object, with further fields."""
         try:
             return json.dumps(asdict(self) | more, allow_nan=False)
         except (TypeError, ValueError) as error:
             raise ValueError(f"the card holds what JSON has not: {error}") from None
-
-
-_KINDS: dict[Any, tuple[type, ...]] = {
-    str: (str,),
-    int: (int,),
-    float: (float, int),
-    JsonMap: (dict,),
-}
 
 
 def _is_entry(pair: Any) -> bool:

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from safetensors.numpy import save
 
 from ...envs.backend.files import write_whole
+from ...envs.documents import made_of
 from ...estimators.learned.network import Network
 from ...estimators.learned.network_file import ENDING as ENDING
 from ...estimators.learned.network_file import (
@@ -104,7 +105,7 @@ def load_policy(path: str | Path) -> Policy:
         if not isinstance(observation, list):
             raise ValueError(f"the card's observation is a list, got {observation!r}")
         network = network_of(fields.pop("network", None), len(observation), tensors)
-        return Policy(found.stem, network, Card.from_mapping(fields))
+        return Policy(found.stem, network, made_of(Card, fields, "the card"))
     except ValueError as error:
         raise ValueError(f"{found}: {error}") from None
 

@@ -14,9 +14,8 @@ from typing import Any
 from zipfile import BadZipFile, ZipFile
 
 import gymnasium as gym
-import numpy as np
 
-from ...envs.task.observation import Entry
+from ...envs.task.observation import Entry, space_of
 from ...estimators.wrappers.estimate import EstimateObservation
 from ..env_facts import AnyEnv, facts_of
 from ..learned.card import Card
@@ -193,7 +192,7 @@ def _frames(file: Path, space: Any, layout: Sequence[Entry]) -> int:
     if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
         raise ValueError(f"{file} was trained on {space}, not on an observation of one dimension")
     frames, rest = divmod(space.shape[0], len(layout))
-    if frames > 0 and rest == 0 and space == _box(layout, frames):
+    if frames > 0 and rest == 0 and space == space_of(layout, frames):
         return frames
     here = ", ".join(entry.name for entry in layout)
     raise ValueError(
@@ -203,12 +202,6 @@ def _frames(file: Path, space: Any, layout: Sequence[Entry]) -> int:
     )
 
 
-def _box(layout: Sequence[Entry], frames: int = 1) -> gym.spaces.Box:
-    """The space of a VecFrameStack, which repeats each bound in place."""
-    low, high = np.array([(entry.low, entry.high) for entry in layout], np.float32).T
-    return gym.spaces.Box(np.repeat(low, frames), np.repeat(high, frames), dtype=np.float32)
-
-
 def _known(space: Any) -> str:
     """The id of ours that has this observation, with the names, as far as there is one."""
     for env_id in [name for name in gym.registry if name.startswith("sideslip/")]:
@@ -216,6 +209,6 @@ def _known(space: Any) -> str:
             layout = facts_of(gym.make(env_id)).layout
         except ModuleNotFoundError:  # of an extra
             continue
-        if space == _box(layout):
+        if space == space_of(layout):
             return f", those of {env_id}: {', '.join(entry.name for entry in layout)}"
     return " that no environment here has by itself (with an estimator, say which)"

@@ -4,23 +4,22 @@ import json
 import math
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar, get_origin
+from typing import TYPE_CHECKING, Any
 
-from ...envs.arguments import brief, check_choice, is_finite, listed
+from ...envs.arguments import check_choice
 from ...envs.backend.files import whole, write_whole
+from ...envs.documents import made_of as made_of
 from ...envs.record import Array
 from .explorer import Explorer
 from .metrics import METRICS
 from .stats import Estimate
 
 if TYPE_CHECKING:
-    from _typeshed import DataclassInstance
     from pandas import DataFrame
 
-Made = TypeVar("Made", bound="DataclassInstance")
 VERDICTS = ("", "reproduced", "partly", "not reproduced", "report only")
 
 
@@ -188,27 +187,6 @@ def read_objects(path: str | Path) -> list[dict[str, Any]]:
     if not isinstance(entries, list) or not all(isinstance(each, dict) for each in entries):
         raise ValueError(f"{path}: expected a JSON list of objects")
     return entries
-
-
-def made_of(kind: type[Made], entry: Any, where: str) -> Made:
-    """A dataclass's instance from a JSON object; ValueError, with the place and the field, for an
-    unknown or missing field and a value of another type."""
-    if not isinstance(entry, dict):
-        raise ValueError(f"{where}: expected a JSON object, got {brief(entry)}")
-    known: dict[str, Any] = {each.name: each for each in fields(kind)}
-    needed = {name for name, each in known.items() if each.default is each.default_factory}
-    for what, names in (("unknown", entry.keys() - known), ("missing", needed - entry.keys())):
-        if names:
-            raise ValueError(f"{where}: {what} {listed(sorted(names))}")
-    for name, value in entry.items():
-        wanted = get_origin(known[name].type) or known[name].type
-        fits = isinstance(value, wanted) or (wanted is float and is_finite(value))
-        if not fits or isinstance(value, bool):
-            raise ValueError(f"{where}: {name} is {brief(value)}, not {wanted.__name__}")
-    try:
-        return kind(**entry)
-    except ValueError as error:
-        raise ValueError(f"{where}: {error}") from None
 
 
 def write_parquet(path: str | Path, rows: Sequence[Row]) -> None:

@@ -1,14 +1,15 @@
 """The file of tunings: entries are replaced whole, and the file whole or not at all."""
 
 import json
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 from ...agents.tuned import Options, read_tuned
+from ...envs.documents import toml_of
 from ...estimators.design.tunings import read_tunings
 from ..harness.results import write_text
 
+_KEYS = ("estimator", "sensors", "command", "note", "q", "noise")
 _HEAD = """\
 # Tunings: process noise per second, (unit of the state)^2 / s, and measurement noise where it was
 # searched too. Each entry is the output of its command; `sensors` are the slow ones.
@@ -37,18 +38,9 @@ def _key(entry: dict[str, Any]) -> tuple[str, str]:
 
 
 def _text(entry: dict[str, Any]) -> str:
-    lines = ["[[tuning]]"]
-    for key in ("estimator", "sensors", "command", "note"):
-        if key in entry:
-            lines.append(f"{key} = {json.dumps(entry[key], ensure_ascii=False)}")
-    for key in ("q", "noise"):
-        if entry.get(key):
-            lines.append(f"{key} = {_numbers(entry[key].items())}")
-    return "\n".join(lines) + "\n"
-
-
-def _numbers(pairs: Iterable[tuple[str, float]]) -> str:
-    return "{ " + ", ".join(f"{name} = {float(value)!r}" for name, value in pairs) + " }"
+    there = [key for key in _KEYS if entry.get(key) not in (None, {})]
+    lines = "".join(f"{key} = {toml_of(entry[key])}\n" for key in there)
+    return f"[[tuning]]\n{lines}"
 
 
 _TUNED = """\

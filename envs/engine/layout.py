@@ -10,7 +10,7 @@ from typing import Annotated, Any, NamedTuple
 from ..backend.arrays import offsets
 from ..record import PACKET_WIDTH
 from ..scenarios.driver import Driver
-from ..scenarios.roads import Bicycle, Lead
+from ..scenarios.roads import Lead
 from ..scenarios.speed import Pace
 from ..scenarios.steering import STEERING_WIDTH
 from ..scenarios.tracks import Path
@@ -23,6 +23,7 @@ from ..sensors.slow import SLOW, VALUES
 from ..task.reference import Target
 from ..vehicle.actuators import Lag
 from ..vehicle.dynamics import Car, Motion, Road
+from ..vehicle.linear import Bicycle
 
 
 class Disturbance(NamedTuple):

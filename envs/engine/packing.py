@@ -9,7 +9,7 @@ import numpy as np
 from ..arguments import brief, check_choice
 from ..record import Array
 from ..scenarios.driver import Driver
-from ..scenarios.roads import ROADS, bicycle_of
+from ..scenarios.roads import ROADS
 from ..scenarios.scenario import Scenario
 from ..scenarios.speed import Pace
 from ..scenarios.steering import STEERING_KINDS, STEERING_WIDTH
@@ -24,6 +24,7 @@ from ..task.reference import REFERENCES, target_of
 from ..ticks import FOREVER, TICK, ticks
 from ..vehicle.actuators import lag_of
 from ..vehicle.dynamics import Car, Motion, Road
+from ..vehicle.linear import Bicycle
 from ..vehicle.tyres import TYRE_LAWS
 from ..vehicle.vehicle import GRAVITY, Vehicle
 from .arrays import Start
@@ -199,7 +200,7 @@ def episode_config(
         path=path_of(scenario.path, vehicle.width),
         change=Change(FOREVER, 1.0, 1.0),  # drawn
         sight=View(scenario.camera_heading, scenario.camera_offset),
-        leader=bicycle_of(nominal),
+        leader=Bicycle(*nominal.lateral),
     )
     switches = Switches(
         small_angle=int(scenario.small_angle),

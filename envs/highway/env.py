@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..arguments import brief, check_choice
+from ..arguments import check_choice, count_of
 from ..backend.arrays import read
 from ..engine.layout import P, Z
 from ..engine.window import WINDOW
@@ -68,11 +68,8 @@ class HighwayEnv(StabilityEnv):
         **options: Any,
     ) -> None:
         check_choice("road", road, ROADS)
-        if isinstance(traffic, bool) or not isinstance(traffic, int | np.integer):
-            raise TypeError(f"traffic is a number of vehicles, got {brief(traffic)}")
-        if not 0 <= traffic <= MOST:
-            raise ValueError(f"traffic is 0 to {MOST} vehicles, got {traffic}")
-        self.road, self.hazard, self.traffic = road, hazard_from(hazard), int(traffic)
+        self.road, self.hazard = road, hazard_from(hazard)
+        self.traffic = count_of("traffic", traffic, "vehicles", 0, MOST)
         on_road = self._on_road(scenario_from(scenario))
         super().__init__(sensors, on_road, vehicle, reference=reference, **options)
         self._around: Traffic | None = None

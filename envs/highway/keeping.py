@@ -23,7 +23,7 @@ from ..outside.env import PlantEnv
 from ..outside.plants import Acting
 from ..scenarios.scenario import Scenario
 from ..sensors.camera import at_preview
-from ..task.observation import Entry
+from ..task.observation import Entry, space_of
 from ..ticks import TICK
 from ..vehicle.dynamics import Motion
 from ..vehicle.vehicle import Vehicle
@@ -220,8 +220,7 @@ class OwnObservation(gym.ObservationWrapper[Any, Any, Any]):
         names = [f"{name}_hat" for name in STATES]
         own = [Entry(name, unit, -200.0, 200.0) for name, unit in zip(names, units, strict=True)]
         self.layout = (*env.get_wrapper_attr("layout"), *own)
-        low, high = np.array([entry[2:] for entry in self.layout]).T.astype(np.float32)
-        self.observation_space = gym.spaces.Box(low, high, dtype=np.float32)
+        self.observation_space = space_of(self.layout)
 
     def observation(self, observation: Any) -> Any:
         """Ours with theirs behind it."""

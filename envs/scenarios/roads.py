@@ -5,23 +5,11 @@ from typing import Any, NamedTuple
 from ..backend.decorators import inlined
 from ..backend.primitives import maximum
 from ..ticks import TICK
-from ..vehicle.linear import bicycle_coefficients
-from ..vehicle.vehicle import Vehicle
+from ..vehicle.linear import Bicycle, bicycle_coefficients
 
 ROADS = ("straight", "nominal-path")
 STRAIGHT, NOMINAL_PATH = range(len(ROADS))
 _SLOWEST = 1.0  # m/s, of the nominal car
-
-
-class Bicycle(NamedTuple):
-    """A linear bicycle: arguments of `bicycle_coefficients` in their order, letters as there."""
-
-    m: Any
-    I: Any  # noqa: E741  the papers' letter
-    l_f: Any
-    l_r: Any
-    C_f: Any
-    C_r: Any
 
 
 class Lead(NamedTuple):
@@ -29,18 +17,6 @@ class Lead(NamedTuple):
 
     beta: Any  # rad
     gamma: Any  # rad/s
-
-
-def bicycle_of(vehicle: Vehicle) -> Bicycle:
-    """The linear bicycle of a vehicle."""
-    return Bicycle(
-        vehicle.mass,
-        vehicle.yaw_inertia,
-        vehicle.front_arm,
-        vehicle.rear_arm,
-        vehicle.front_stiffness,
-        vehicle.rear_stiffness,
-    )
 
 
 @inlined

@@ -1,6 +1,10 @@
 """What an observation contains: the name, unit and bounds of each entry."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
+
+import gymnasium as gym
+import numpy as np
 
 from ..record import FAST, FAST_UNITS
 from ..sensors.slow import SLOW
@@ -19,6 +23,12 @@ SAMPLED = 6  # the first columns of a fast row are sensors; the policy sees last
 AGE_CAP = 10.0  # s
 
 _FAST_BOUNDS = (10.0, 50.0, 50.0, 10.0, 100.0, 100.0, 1.0, 2000.0, 2000.0, 1.0, 50.0)
+
+
+def space_of(layout: Sequence[Entry], frames: int = 1) -> "gym.spaces.Box[np.float32]":
+    """The space of an observation; of a stack of frames each bound is repeated in place."""
+    low, high = np.array([entry[2:] for entry in layout]).T.astype(np.float32)
+    return gym.spaces.Box(np.repeat(low, frames), np.repeat(high, frames), dtype=np.float32)
 
 
 def observation_layout(slow: tuple[str, ...], n: int, fast: str) -> tuple[Entry, ...]:

@@ -4,7 +4,7 @@ The matrices are written into arrays by the functions below, here and in compile
 """
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +17,17 @@ if TYPE_CHECKING:
     from control import StateSpace
 
 Array = npt.NDArray[np.float64]
+
+
+class Bicycle(NamedTuple):
+    """A linear bicycle: arguments of `bicycle_coefficients` in their order, letters as there."""
+
+    m: Any
+    I: Any  # noqa: E741  the papers' letter
+    l_f: Any
+    l_r: Any
+    C_f: Any
+    C_r: Any
 
 
 @jit
@@ -124,16 +135,8 @@ def _lateral(vehicle: Vehicle, speed: float, states: int, inputs: int = 2) -> tu
     """A (states, states) and B (states, inputs) of `write_lateral`."""
     if not speed > 0.0:
         raise ValueError(f"a linear model needs a positive speed, got {speed!r} m/s")
-    car = (
-        vehicle.mass,
-        vehicle.yaw_inertia,
-        vehicle.front_arm,
-        vehicle.rear_arm,
-        vehicle.front_stiffness,
-        vehicle.rear_stiffness,
-    )
     A, B = np.zeros((states, states)), np.zeros((states, inputs))
-    _write_lateral(A, B, car, float(speed), states, inputs, vehicle.preview)
+    _write_lateral(A, B, vehicle.lateral, float(speed), states, inputs, vehicle.preview)
     return A, B
 
 

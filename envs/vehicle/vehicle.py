@@ -8,6 +8,8 @@ from typing import Any
 from ..arguments import LARGEST, brief, is_finite
 
 GRAVITY = 9.81
+LATERAL = ("mass", "yaw_inertia", "front_arm", "rear_arm", "front_stiffness", "rear_stiffness")
+"""What a linear bicycle is made of, in the order of `linear.Bicycle`."""
 
 
 def _unit(unit: str, text: str, default: float | None = None) -> Any:
@@ -91,6 +93,11 @@ class Vehicle:
             front_stiffness=self.front_stiffness * front,
             rear_stiffness=self.rear_stiffness * (front if rear is None else rear),
         )
+
+    @property
+    def lateral(self) -> tuple[float, ...]:
+        """The parameters of `LATERAL`."""
+        return tuple(getattr(self, name) for name in LATERAL)
 
     @property
     def wheelbase(self) -> float:

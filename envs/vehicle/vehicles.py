@@ -8,12 +8,11 @@ from typing import Any
 
 from ..arguments import brief, check_choice, is_finite, unknown_names
 from ..documents import is_document, read_document
-from .vehicle import COMS, PASSENGER_CAR, Vehicle
+from .vehicle import COMS, LATERAL, PASSENGER_CAR, Vehicle
 
 VehicleSource = str | os.PathLike[str] | Mapping[str, Any] | Vehicle
 """What `vehicle_from` takes."""
 
-_LATERAL = ("mass", "yaw_inertia", "front_arm", "rear_arm", "front_stiffness", "rear_stiffness")
 _STIFFNESS = ("front_stiffness", "rear_stiffness")
 WIRES = ("steering", "latency", "noise")
 """Tables that a vehicle's file may hold beside the car: what `sideslip identify` found of its
@@ -83,7 +82,7 @@ def _vehicle_of(values: dict[str, Any]) -> Vehicle:
     if unknown := [key for key in values if key not in _FIELDS]:
         keys = [*_FIELDS, "base", *(name + each for name in _STIFFNESS for each in _CONVENTIONS)]
         raise TypeError(unknown_names("vehicle parameter", unknown, keys))
-    missing = [name for name in _LATERAL if name not in values]
+    missing = [name for name in LATERAL if name not in values]
     if missing and not based:
         raise ValueError(
             f"missing {', '.join(map(_key, missing))} (or name a vehicle under 'base')"

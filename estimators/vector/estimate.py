@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 from gymnasium.envs.registration import EnvSpec
@@ -12,7 +11,7 @@ from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
-from ...envs.task.observation import Entry
+from ...envs.task.observation import Entry, space_of
 from ...envs.vehicle.vehicles import VehicleSource
 from ..wrappers.arguments import Arguments, Setup, Source
 from ..wrappers.estimate import EstimateObservation as Single
@@ -86,8 +85,7 @@ class EstimateObservation(
         self._outputs = outputs_of(arguments.label, states, outputs, std, name, inner)
         self._title = titled(arguments.label, name)
         self.layout: tuple[Entry, ...] = self._outputs.layout
-        low, high = self._outputs.bounds
-        self.single_observation_space = gym.spaces.Box(low, high, dtype=np.float32)
+        self.single_observation_space = space_of(self.layout)
         self.observation_space = batch_space(self.single_observation_space, env.num_envs)
         self._out = np.zeros((env.num_envs, len(self.layout)), np.float32)
         self._ended: Mask | None = None  # rows that the next step resets; None: all are to be reset

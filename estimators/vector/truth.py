@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 from gymnasium.envs.registration import EnvSpec
@@ -11,6 +10,7 @@ from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
+from ...envs.task.observation import space_of
 from ..wrappers.truth import STIFFNESSES, parameters_of, states_of, truth_entries
 from ..wrappers.truth import TruthObservation as Single
 from .records import state_of, true_states, true_vehicles
@@ -49,8 +49,7 @@ class TruthObservation(
             )
         self._parameters, self._states = tuple(parameters), tuple(states)
         self.layout = truth_entries(self._parameters, self._states, env.layout)
-        low, high = np.array([entry[2:] for entry in self.layout]).T.astype(np.float32)
-        self.single_observation_space = gym.spaces.Box(low, high, dtype=np.float32)
+        self.single_observation_space = space_of(self.layout)
         self.observation_space = batch_space(self.single_observation_space, env.num_envs)
         self._same_step = env.metadata.get("autoreset_mode") == AutoresetMode.SAME_STEP
         if self._same_step and states:

@@ -9,7 +9,7 @@ import numpy.typing as npt
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
 
-from ...envs.task.observation import Entry
+from ...envs.task.observation import Entry, space_of
 from ...envs.vehicle.vehicles import VehicleSource
 from ..estimator import Estimator
 from .arguments import AnyEstimator, Arguments, Setup, Source, setup_of
@@ -85,8 +85,7 @@ class EstimateObservation(
         states, label = self.estimator.names, self._arguments.label
         self.outputs: Outputs = outputs_of(label, states, outputs, std, name, inner)
         self.layout: tuple[Entry, ...] = self.outputs.layout
-        low, high = self.outputs.bounds
-        self.observation_space = gym.spaces.Box(low, high, dtype=np.float32)
+        self.observation_space = space_of(self.layout)
         self._width, self._title = len(self.layout), titled(label, name)
         self._summary = np.zeros(3)
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -37,11 +36,6 @@ class Outputs:
     plan: npt.NDArray[np.int64]
     limits: npt.NDArray[np.float64]
     keys: tuple[tuple[str, int], ...]
-
-    @property
-    def bounds(self) -> Any:
-        """The lowest and the highest observation, (2, width) float32."""
-        return np.array([each[2:] for each in self.layout]).T.astype(np.float32)
 
 
 def outputs_of(

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from gymnasium.utils import RecordConstructorArgs
 
 from ...envs.engine.views import TRUE_STATE
-from ...envs.task.observation import Entry
+from ...envs.task.observation import Entry, space_of
 from ...envs.vehicle.vehicle import Vehicle
 from ..estimator import Estimator
 from ..protocol import ForeignEstimator
@@ -116,8 +116,7 @@ class TruthObservation(
         self._parameters, self._states = tuple(parameters), tuple(states)
         inner = env.get_wrapper_attr("layout")
         self.layout = truth_entries(self._parameters, self._states, inner)
-        low, high = np.array([entry[2:] for entry in self.layout]).T.astype(np.float32)
-        self.observation_space = gym.spaces.Box(low, high, dtype=np.float32)
+        self.observation_space = space_of(self.layout)
         self._values = np.zeros(len(self._parameters), np.float32)
 
     def reset(

@@ -135,5 +135,5 @@ def test_a_policys_card_names_no_code() -> None:
     """It comes with a file from elsewhere."""
     from sideslip.agents.learned.card import Card
 
-    with pytest.raises(ValueError, match="the card's estimator is a name, got the entry point"):
+    with pytest.raises(ValueError, match="estimator is a name, got the entry point"):
         Card(VISION, (("gyro", "rad/s"),), 10, "zero-slip", estimator="os:system")

@@ -187,9 +187,9 @@ BAD: dict[str, tuple[Callable[[Any, Any, Any], Any], str]] = {
         r"missing tensors: \['cell_0_bias_in'",
     ),
     "no network": (lambda t, m, c: c.pop("network"), "card's network holds hidden"),
-    "lacks": (lambda t, m, c: c.pop("env_id"), "lacks env_id"),
-    "unknown field": (lambda t, m, c: c.update(colour="red"), "unknown fields: colour"),
-    "kind": (lambda t, m, c: c.update(steps="many"), "card's steps is int, got 'many'"),
+    "lacks": (lambda t, m, c: c.pop("env_id"), "missing env_id"),
+    "unknown field": (lambda t, m, c: c.update(colour="red"), "the card: unknown colour"),
+    "kind": (lambda t, m, c: c.update(steps="many"), "steps is 'many', not int"),
     "entry": (
         lambda t, m, c: c.update(observation=[["gyro"], ["a", "b"], ["c", "d"]]),
         r"list of \(name, unit\)",
@@ -264,7 +264,7 @@ def test_what_cannot_be_saved_is_refused(tmp_path: Path) -> None:
         save_policy(tmp_path / "mine.safetensors", a_network(inputs=4), CARD)
     with pytest.raises(ValueError, match="what JSON has not"):
         replace(CARD, evaluation={"cost": float("nan")})
-    with pytest.raises(ValueError, match="cpu_seconds is float or int, got '2'"):
+    with pytest.raises(ValueError, match="cpu_seconds is '2', not float"):
         replace(CARD, cpu_seconds="2")  # type: ignore[arg-type]
 
 
