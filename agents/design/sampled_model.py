@@ -8,7 +8,6 @@ speed, with the driver's command and the references held as they are now.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -201,10 +200,3 @@ def optimal(G: Array, H: Array, Q: Array, R: Array, N: Array, moved: int) -> tup
     answer = np.linalg.solve(R + B.T @ P @ B, B.T @ (P @ A12 + P12 @ W) + N2.T)
     V = np.block([[P, P12], [P12.T, np.zeros_like(W)]])
     return np.asarray(np.hstack([K, answer]), np.float64), V
-
-
-def closed_loop(model: DesignModel, K: Any) -> Array:
-    """The map of the states that inputs move over a period, (4, 4); its eigenvalues are poles."""
-    d = len(DYNAMIC)
-    closed: Array = model.G[:d, :d] - model.H[:d] @ np.asarray(K)[:, :d]
-    return closed

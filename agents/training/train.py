@@ -8,7 +8,7 @@ stable-baselines3's format) and `curve.jsonl` (the evaluations).
 import json
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -276,10 +276,3 @@ class _Keeper(BaseCallback):
         save_policy(self.folder / POLICY, network_from_sb3(self.model), card)
         with whole(self.folder / BEST) as file:
             self.model.save(file)
-
-
-def with_defaults(**arguments: Any) -> Task:
-    """A task with these arguments, None standing for the default."""
-    return replace(
-        Task(), **{name: value for name, value in arguments.items() if value is not None}
-    )

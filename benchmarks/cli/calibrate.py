@@ -1,7 +1,5 @@
 """`sideslip calibrate`: what the clairvoyant costs, into a file beside the user."""
 
-import shlex
-import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -13,7 +11,7 @@ from rich.table import Table
 from ...envs.arguments import check_choice
 from ..harness.engines import PROCESSES, engine
 from .cluster import Address, EngineName
-from .output import check_files, wrote
+from .output import check_files, command_line, wrote
 
 
 def calibrate_command(
@@ -42,9 +40,8 @@ def calibrate_command(
         check_choice("contest", name, known)
     asked = [known[name] for name in contest or known]
     console, folder = Console(), Path(f".{path.name}.cases").absolute()
-    command = shlex.join(["sideslip", *sys.argv[1:]])
     with engine(engine_name, address):
-        made = calibrate(asked, folder, seeds, command, jobs, console)
+        made = calibrate(asked, folder, seeds, command_line(), jobs, console)
     update(path, made)
     forget(cases_of(asked, folder, seeds))
     table = Table("contest", "none", "clairvoyant", "a plan wins")

@@ -3,7 +3,6 @@
 
 import json
 import shlex
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,7 +14,7 @@ from rich.table import Table
 from ... import __version__
 from ...envs.sensors.slow import SENSOR_SETS
 from .names import check_env, complete
-from .output import check_files, options_of, wrote
+from .output import check_files, command_line, options_of, wrote
 
 if TYPE_CHECKING:
     from ...agents.training.train import Progress as Now
@@ -48,7 +47,7 @@ def train_command(
 
     With --resume the options left out are those of the training in the folder.
     """
-    from ...agents.training.train import CURVE, POLICY, task_in, train, with_defaults
+    from ...agents.training.train import CURVE, POLICY, Task, task_in, train
     from ..policies import evaluate, evaluation
 
     options: dict[str, Any] = {
@@ -62,7 +61,7 @@ def train_command(
     options = {name: value for name, value in options.items() if value is not None}
     if env is not None:
         check_env(env)
-    task = with_defaults(**options)
+    task = Task(**options)
     folder = out or Path(_name_of(task))
     if resume:
         task = task_in(folder, **options)
@@ -161,7 +160,7 @@ def train_estimator_command(
         states=tuple(each for each in READ if each in there),
         scenarios=tuple(wanted),
         seed=seed,
-        command=shlex.join(["sideslip", *sys.argv[1:]]),
+        command=command_line(),
         sideslip=__version__,
     )
     with console.status("") as status:

@@ -28,8 +28,9 @@ from ..control.episodes import Chunk, Driven, drive
 from ..control.scores import gains
 from ..harness.engines import cores
 from ..harness.parallel import run_cases
-from ..harness.results import Suite, Table, write_text
+from ..harness.results import Suite, write_text
 from .spaces import SLOW, Number, options_of, space
+from .suite import found_table
 from .task import STORAGE
 
 TRIALS = 60
@@ -190,13 +191,8 @@ def write_log(path: Path, log: dict[str, Any]) -> None:
 
 
 def suite_of(task: Contestant, log: dict[str, Any]) -> Suite:
-    """What a study found, as a table; a number at the end of its range is marked."""
-    best, cells = log["best"], []
-    for number in task.numbers:
-        value = best["numbers"][number.name]
-        edge = min(value / number.low, number.high / value) < 1.25
-        limits = f"{number.low:g} .. {number.high:g}"
-        cells.append([number.name, f"{value:g}", limits, "at its end" if edge else ""])
+    """What a study found, as a table."""
+    best = log["best"]
     start = math.inf if log["start"] is None else math.exp(log["start"])
     text = (
         f"{len(log['trials'])} trials over {len(task.contests)} contests of {task.kind} on "
@@ -204,5 +200,5 @@ def suite_of(task: Contestant, log: dict[str, Any]) -> Suite:
         f"the untuned nominal's (geometric mean, a failure counts 20), {100.0 * start:.1f} % at "
         "the start."
     )
-    table = Table("Found", ("option", "value", "range", ""), cells, keyed=False)
+    table = found_table(best["numbers"], task.search)
     return Suite("tune", f"Tuning {task.name} in {task.kind}", text, tables=[table])

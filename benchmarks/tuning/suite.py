@@ -5,7 +5,7 @@ error, `study` searches, `file` stores what was found.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from ..harness.results import Suite, Table
 from ..harness.stats import interval, ratio_of_roots, root_mean
 from .task import SAMPLERS, STORAGE, Array, Task, simulate, squares
 
-_EDGE = 0.1  # decades: so close to an end of its range a number counts as being there
+_EDGE = 1.25  # times an end of its range or less: the number counts as being there
 
 
 def run(
@@ -50,7 +50,7 @@ def run(
         f"RMSE of {task.target} from 2 s on in {task.unit}, with 95 % bootstrap intervals; "
         f"{trials} trials. The default is make_estimator with no more than what is held "
         "fixed.",
-        tables=[_comparison(task, training, test, found), _numbers(task, found)],
+        tables=[_comparison(task, training, test, found), found_table(found, task.search)],
     )
     return suite, found
 
@@ -88,15 +88,15 @@ def _spread(errors: Array) -> str:
     return f"{value:.4g} ({low:.4g} .. {high:.4g})"
 
 
-def _numbers(task: Task, found: dict[str, float]) -> Table:
+def found_table(found: Mapping[str, float], search: Mapping[str, tuple[float, float]]) -> Table:
+    """The numbers that were found; one at the end of its range is marked."""
     cells = []
-    for name, value in found.items():
-        low, high = task.search[name]
-        edge = math.log10(value / low) < _EDGE or math.log10(high / value) < _EDGE
-        at = "at its end" if edge else ""
+    for name, (low, high) in search.items():
+        value = found[name]
+        at = "at its end" if min(value / low, high / value) < _EDGE else ""
         cells.append([name, f"{value:g}", f"{low:g} .. {high:g}", at])
     note = "A number at the end of its range: the optimum does without it, or lies beyond."
-    return Table("Found", ("option", "value", "range", ""), cells, note)
+    return Table("Found", ("option", "value", "range", ""), cells, note, keyed=False)
 
 
 def entry(task: Task, found: dict[str, float], command: str, note: str = "") -> dict[str, Any]:
