@@ -1,7 +1,7 @@
 """The matrix: contests, estimators, controllers, and the cells they make."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 from ...agents import AGENTS
@@ -40,15 +40,15 @@ LEARNED: tuple[tuple[str, str], ...] = (("", "ppo-yaw-vision"),)
 """(estimator, policy), a policy by its shipped name or path; in tier 1, whose car it knows. One
 that was trained on fewer sensors reads what it knows by name."""
 SHARED = {
-    "mpc": (NOMINAL, {"grip", "disturbance_time"}),
-    "nmpc": (NOMINAL, {"grip", "disturbance_time"}),
-    "adaptive-lqr": (NOMINAL, {"grip", "disturbance_time", "steer_weight"}),
-    "adaptive-nmpc": ("nmpc", {"horizon", "grip", "disturbance_time", "steer_weight"}),
-    ORACLES[PARAMETERS][0]: (NOMINAL, {"grip", "steer_weight"}),
-    ORACLES[PARAMETERS][1]: ("nmpc", {"horizon", "grip", "steer_weight"}),
+    "mpc": {"grip", "disturbance_time"},
+    "nmpc": {"grip", "disturbance_time"},
+    "adaptive-lqr": {"grip", "disturbance_time", "steer_weight"},
+    "adaptive-nmpc": {"grip", "disturbance_time"},
+    ORACLES[PARAMETERS][0]: {"grip", "steer_weight"},
+    ORACLES[PARAMETERS][1]: {"grip"},
 }
-"""By contestants that are not tuned: of whose controller they take over what; of a filter, all of
-`nominal`'s, where they do not know the truth."""
+"""What contestants too slow to be tuned take over from `nominal`'s controller; of its filter all,
+where they do not know the truth."""
 SLOW_CONTROLLERS = ("mpc", "nmpc", "adaptive-nmpc", ORACLES[STATE][1], ORACLES[PARAMETERS][1])
 
 EPISODES, QUICK_EPISODES, SLOW_EPISODES = 1000, 8, 128
@@ -103,11 +103,11 @@ class Cell:
             return tuned(self.contest.kind, NOMINAL) | {"controller": {}}
         kind, name = self.contest.kind, self.rung or self.controller
         if name in SHARED and not any(tuned(kind, name).values()):
-            source, numbers = SHARED[name]
-            best = replace(self, controller=source).best["controller"]
-            shared = {key: best[key] for key in numbers & best.keys()}
-            known = {} if self.rung else tuned(kind, NOMINAL)["filter"]
-            return {"filter": known, "controller": shared}
+            best = tuned(kind, NOMINAL)
+            shared = {
+                key: best["controller"][key] for key in SHARED[name] & best["controller"].keys()
+            }
+            return {"filter": {} if self.rung else best["filter"], "controller": shared}
         return tuned(kind, NOMINAL if name == REFERENCE_CONTROLLER else name)
 
     @property

@@ -13,7 +13,7 @@ from sideslip.benchmarks.control import build
 from sideslip.benchmarks.control import episodes as drive
 from sideslip.benchmarks.control import suite as control
 from sideslip.benchmarks.control.cells import LEARNED, REFERENCE_FILTER, RUNGS, Cell, cells
-from sideslip.benchmarks.control.contests import PARAMETERS, YAW, Contest, contests, oracle_of
+from sideslip.benchmarks.control.contests import YAW, Contest, contests
 from sideslip.benchmarks.control.episodes import Chunk
 from sideslip.benchmarks.control.run import CachedDrive, measure
 from sideslip.benchmarks.control.seeds import salt_of
@@ -73,28 +73,6 @@ def test_every_contest_has_its_rungs_and_no_cell_stands_twice() -> None:
         assert any(cell.controller == LEARNED[0][1] for cell in mine) == (contest.tier == "1")
     fast = list(cells(contests(), quick=True))
     assert set(fast) < set(all_) and not any(cell.slow and not cell.rung for cell in fast)
-
-
-def test_who_is_not_tuned_takes_over_what_means_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The adaptive NMPC and the oracle's have `nmpc`'s plan, the oracle a filter of its own."""
-    found = {
-        "nominal": {"filter": {"force_sd": 7.0}, "controller": {"grip": 0.4, "steer_weight": 3.0}},
-        "nmpc": {"filter": {"force_sd": 9.0}, "controller": {"grip": 0.6, "horizon": 0.3}},
-    }
-    nothing: dict[str, Any] = {"filter": {}, "controller": {}}
-    monkeypatch.setattr(
-        "sideslip.benchmarks.control.cells.tuned", lambda _, n: found.get(n, nothing)
-    )
-    contest = next(each for each in contests() if oracle_of(each, PARAMETERS).endswith("nmpc"))
-    best = {name: Cell(contest, "", name).best for name in ("nmpc", "mpc", "adaptive-lqr")}
-    assert best["nmpc"] == found["nmpc"]
-    assert best["mpc"] == {"filter": {"force_sd": 7.0}, "controller": {"grip": 0.4}}
-    assert best["adaptive-lqr"]["controller"] == found["nominal"]["controller"]
-    adaptive, oracle = (Cell(contest, "", who).best for who in ("adaptive-nmpc", PARAMETERS))
-    assert adaptive == {"filter": {"force_sd": 7.0}, "controller": found["nmpc"]["controller"]}
-    assert oracle == {"filter": {}, "controller": found["nmpc"]["controller"]}
-    del found["nmpc"]
-    assert Cell(contest, "", "adaptive-nmpc").best["controller"] == {"grip": 0.4}
 
 
 def test_truth_is_told_without_error() -> None:
