@@ -20,9 +20,9 @@ class Request:
     """The options of a run.
 
     quick: few seeds. jobs: processes, None for all processors. episodes: of a cell of the matrix,
-    None for the suite's own number. keep: a folder for finished cases. clairvoyant: a file of
-    `sideslip calibrate`, None for the package's. challenge: a user's contestants, who drive instead
-    of the matrix.
+    or seeds of estimation, unknown and papers; None for the suite's own number. keep: a folder for
+    finished cases. clairvoyant: a file of `sideslip calibrate`, None for the package's. challenge:
+    a user's contestants, who drive instead of the matrix.
     """
 
     quick: bool = False
@@ -38,7 +38,8 @@ _Run = Callable[[Any, Request], Suite]
 
 
 def _seeds(suite: Any, r: Request) -> Any:
-    return suite.run(suite.QUICK_SEEDS if r.quick else suite.SEEDS, r.jobs, r.console)
+    usual = suite.QUICK_SEEDS if r.quick else suite.SEEDS
+    return suite.run(r.episodes or usual, r.jobs, r.console)
 
 
 def _control(suite: Any, r: Request) -> Any:

@@ -189,7 +189,7 @@ def bench(
     picture: Annotated[Path | None, typer.Option(help="The summary: PNG, PDF or SVG.")] = None,
     jobs: Jobs = None,
     episodes: Annotated[
-        int | None, typer.Option(min=4, help="Episodes a cell of the suite control (1000).")
+        int | None, typer.Option(min=4, help="A cell of control (1000), or seeds of other suites.")
     ] = None,
     keep: Annotated[
         Path | None, typer.Option(help="A folder for finished cases: a stopped run goes on.")
