@@ -42,7 +42,7 @@ class Estimator:
     rows, columns): its memory and its tables, as compiled code takes them.
     Counters of what was skipped: `refused` (older than the filter's window), `duplicates`,
     `future`, `invalid` (not finite), `poor` (quality 0, too few satellites), `unknown` (sensor or
-    stamp), `gated` (an innovation that the gate does not believe).
+    stamp), `gated` (an innovation that the gate does not believe), `stuck` (the last packet again).
     """
 
     def __init__(

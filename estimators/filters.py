@@ -50,7 +50,7 @@ ANY = SLOW_NAMES
 GPS = ("gps",)
 CAMERA = ("camera",)
 
-TYRES = (("front_tyres_sd", 0.23), ("rear_tyres_sd", 0.23))
+TYRES = (("front_tyres_sd", 0.23), ("rear_tyres_sd", 0.23), ("wary", 10))
 ROBUST = (
     ("fast", ("gyro", "accel_y")),
     ("q_front_tyres", 0.006),

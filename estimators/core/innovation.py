@@ -1,15 +1,25 @@
-"""A sample's innovation: its variance, whether it is possible at all, and what it tells of R."""
+"""A sample's innovation: its variance, whether it is possible at all, and what it tells of R.
 
+A gate alone starves a filter that has lost itself. Gated samples in a row whose residuals agree
+show that it is the filter which is wrong, or that what is measured has jumped, as a heading does by
+the half turn of a flipped antenna: then the state that only this sensor measures is forgotten by as
+much as the residual, and the sensor is believed again. A state that another sensor measures, which
+was believed meanwhile, is not forgotten.
+"""
+
+from math import log
 from typing import Any
 
 from ...envs.backend.decorators import jit
+from ...envs.backend.elementary import wrap
 from ...envs.backend.primitives import maximum, minimum, sqrt
 from ...envs.record import PACKET
 from .covariance import dot, project, project_clone
-from .delay import CLONE
-from .memory import Memory, Row
+from .delay import BUFFER, CLONE
+from .memory import SLOW, SNAPSHOTS, Memory, Row
 from .transition import variance
 
+_ALIKE = 4.0  # standard deviations
 _LEAST, _MOST = 0.05, 100.0  # of the scale of R
 
 
@@ -90,6 +100,87 @@ def innovate(f: Memory, s: int, first: int, packet: Row) -> bool:
         nis += f.white[i] * f.white[i]
     f.nis = nis
     return not (f.gate[p] > 0.0 and nis > f.gate[p])
+
+
+@jit
+def _agrees(f: Memory, s: int) -> bool:
+    """Whether every residual is the last gated one, within `_ALIKE` deviations of a difference."""
+    for i in range(f.rows[s]):
+        off, own = f.residual[i] - f.doubt[s, i], 0.0
+        if f.angle[s, i] == 1:
+            off = wrap(off)
+        for j in range(i + 1):
+            own += f.S[i, j] * f.S[i, j]  # Cholesky's factor
+        if off * off > 2.0 * _ALIKE * _ALIKE * own:
+            return False
+    return True
+
+
+@jit
+def _measured_by_others(f: Memory, s: int, state: int) -> bool:
+    """Whether another sensor that measures a state was believed since s was doubted."""
+    for other in range(SLOW):
+        if other != s and f.rows[other] > 0 and f.believed[other] >= f.doubted[s]:
+            for i in range(f.rows[other]):
+                if f.C[other, i, state] != 0.0:
+                    return True
+    return False
+
+
+@jit
+def _forget(f: Memory, state: int, variance: Any) -> None:
+    """Add a variance to a state, now and in what was captured of it."""
+    v = f.PC
+    for i in range(f.total):
+        v[i] = 0.0
+    v[state] = 1.0
+    if f.late == CLONE:
+        for s in range(SLOW):
+            for k in range(f.frames[s] * f.rows[s]):
+                v[f.first_clone[s] + k] = f.C[s, k % f.rows[s], state]
+    for i in range(f.total):
+        for j in range(f.total):
+            f.P[i, j] += variance * (v[i] * v[j])
+    if f.late == BUFFER:
+        for i in range(SNAPSHOTS + 1):
+            f.snapshot_P[i, state, state] += variance
+
+
+@jit
+def _begin_anew(f: Memory, s: int) -> bool:
+    """Forget what only sensor s measures, of each row the last state; False if there is nothing."""
+    forgot = False
+    for i in range(f.rows[s]):
+        state = 0
+        for k in range(f.n):
+            if f.C[s, i, k] != 0.0:
+                state = k
+        if not _measured_by_others(f, s, state):
+            _forget(f, state, f.residual[i] * f.residual[i])
+            forgot = True
+    return forgot
+
+
+@jit
+def believe(f: Memory, s: int, first: int, packet: Row) -> bool:
+    """Whether to use a sample: the gate lets it pass, or the filter begins anew with the sensor."""
+    passed = innovate(f, s, first, packet)
+    if f.wary == 0:
+        return passed
+    if not passed and f.believed[s] >= 0:
+        if f.members > 0:  # as unlikely as the gate is high, or a member gains by refusing
+            f.weight -= 0.5 * f.gate[f.rows[s]]
+            for i in range(f.rows[s]):
+                f.weight -= log(f.S[i, i])
+        if f.doubts[s] == 0 or not _agrees(f, s):
+            f.doubts[s], f.doubted[s] = 0, f.tick
+        f.doubts[s] += 1
+        for i in range(f.rows[s]):
+            f.doubt[s, i] = f.residual[i]
+        if f.doubts[s] < f.wary or not _begin_anew(f, s):
+            return False
+    f.believed[s], f.doubts[s] = f.tick, 0
+    return True
 
 
 @jit

@@ -54,6 +54,7 @@ class Counters(NamedTuple):
     poor: int = 4  # quality 0, or too few satellites
     unknown: int = 5  # no sensor of ours, or a stamp that is no tick of the sensor's clock
     gated: int = 6  # an innovation that chi-square calls impossible
+    stuck: int = 7  # every value as in the sensor's last packet, of an earlier tick, while it moves
 
 
 class Car(NamedTuple):
@@ -155,6 +156,7 @@ _SLOW = [  # slow sensors: what each one measures, how noisy it is, when it capt
     ("hdop_factor", _FLOAT, (KNOTS,)),
     ("least_satellites", _FLOAT),  # packets with fewer are refused
     ("gate", _FLOAT, (ROWS + 1,)),  # by dimension, the largest NIS; 0: no gate
+    ("wary", _INT),  # gated samples that agree until the sensor is believed again; 0: it never is
     ("adapt", _FLOAT),  # share of a new innovation in the scale of R; 0: R as configured
     ("first_slow", _INT),  # index of the first slow sensor that is used; -1: none
     ("period", _INT, (SLOW,)),  # ticks; 0: not used
@@ -208,6 +210,12 @@ _NOW = [
     ("counts", _INT, (len(Counters._fields),)),
     ("scale", _FLOAT, (SLOW, ROWS)),  # of R, where it adapts
     ("nis", _FLOAT),  # of the last packet; NaN where it is not known
+    # `wary`: of each slow sensor
+    ("last", _FLOAT, (SLOW, PACKET_WIDTH)),  # packet
+    ("believed", _INT, (SLOW,)),  # tick of the last sample that was used; -1: none was
+    ("doubts", _INT, (SLOW,)),  # gated samples since then that agree with each other
+    ("doubted", _INT, (SLOW,)),  # tick of the first of them
+    ("doubt", _FLOAT, (SLOW, ROWS)),  # residual of the last of them
     ("first_fix", _INT),  # captured tick of the first heading fix; -1: none yet
     ("next", _INT, (SLOW,)),  # tick of the next capture
     ("seen", _INT, (SLOW, SEEN)),  # captured ticks of frames that came

@@ -9,11 +9,12 @@ import numpy as np
 
 from ...envs.backend.decorators import apart, copied, jit
 from ...envs.backend.primitives import floor
-from ...envs.record import PACKET
+from ...envs.record import PACKET, PACKET_WIDTH
 from .delay import BUFFER, DROPPED, find, known
 from .memory import COUNTERS, SLOW, WAITING, Gains, Memory, Row
 from .rewind import take_late
 from .speed import finite
+from .transition import SLOWEST
 from .update import measure
 
 
@@ -47,6 +48,23 @@ def _timely(f: Memory, captured: Any, arrived: Any) -> bool:
 
 
 @jit
+def _stuck(f: Memory, s: int, packet: Row) -> bool:
+    """Whether two values or more, and all there are, are those of the sensor's last packet, and the
+    car moves: noise repeats no number, and a receiver's rounded course comes with a position."""
+    last = f.last[s]
+    if packet[PACKET.captured] == last[PACKET.captured]:  # a duplicate
+        return False
+    same = 0
+    for i in range(PACKET.value, PACKET_WIDTH):
+        if packet[i] == last[i]:
+            same += 1
+        elif finite(packet[i]):
+            same = 0 - PACKET_WIDTH
+    copied(packet, last)
+    return same > 1 and f.speed > SLOWEST
+
+
+@jit
 def sound(f: Memory, packet: Row) -> bool:
     """Whether a packet is one for this filter and fit for use; what is not is counted.
 
@@ -72,6 +90,9 @@ def sound(f: Memory, packet: Row) -> bool:
         few = packet[column] > 0.0 and packet[column] < f.least_satellites  # 0 or NaN: unknown
     if packet[PACKET.quality] <= 0.0 or few:
         f.counts[COUNTERS.poor] += 1
+        return False
+    if f.wary > 0 and _stuck(f, s, packet):
+        f.counts[COUNTERS.stuck] += 1
         return False
     return True
 

@@ -64,6 +64,8 @@ def begin(f: Memory, first: int) -> None:
         copied(f.prior[i], f.P[i])
     for s in range(SLOW):
         _fill(f.scale[s], 1.0)
+        _fill(f.last[s], np.nan)
+        f.believed[s], f.doubts[s] = -1, 0
         for i in range(FRAMES):
             f.stamp[s, i] = -1
         for i in range(SEEN):

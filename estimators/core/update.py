@@ -10,7 +10,7 @@ from ...envs.backend.primitives import absolute, maximum
 from ...envs.record import PACKET
 from .covariance import dot, expected, measure_clone, measure_state
 from .delay import BUFFER, CONSTANT, LARSEN, STORED_ONE, carry_gains
-from .innovation import adapt, innovate, noise_of, project_row
+from .innovation import adapt, believe, noise_of, project_row
 from .intersample import NONE, PSEUDO, begin_shares, correct_sample, share_sample
 from .memory import COUNTERS, SNAPSHOTS, WINDOW, Gains, Memory, Row
 from .speed import frame_row
@@ -130,7 +130,7 @@ def measure(f: Memory, gains: Gains, s: int, first: int, packet: Row, judge: boo
     elif first == STORED_ONE and f.late == LARSEN:
         _correct_states(f, s)
     else:
-        if judge and not innovate(f, s, first, packet):
+        if judge and not believe(f, s, first, packet):
             f.counts[COUNTERS.gated] += 1
             f.first_fix = fix
             return False

@@ -132,6 +132,7 @@ def _write_trust(f: Memory, config: FilterConfig) -> None:
     f.model_error, f.r_told = config.model_error, config.noise["accel_y"] ** 2
     if config.accel_time > 0.0 and f.accel_row > 0:
         f.r_share = 1.0 - math.exp(-f.step / config.accel_time)
+    f.wary = config.wary
     if config.gate is not None:
         f.gate[1:] = chi2.ppf(config.gate, np.arange(1, ROWS + 1))
     knots = config.hdop_table if f.kind != VELOCITY_ROLL else ()  # applied by the first layer

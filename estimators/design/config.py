@@ -30,6 +30,7 @@ from .tunings import TUNINGS
 
 Array = npt.NDArray[np.float64]
 
+CERTAIN = 1.0 - 1e-9
 SATELLITES = 4.0  # double-layer-gps 4.3
 ASSUMED_DELAY = 0.033  # s
 
@@ -86,6 +87,10 @@ class FilterConfig:
     levels: of joint, factors on force_sd and moment_sd, or pairs of one for each, which its members
         take in turn; the likeliest counts most (default (1,)).
     gate: a probability; a sample whose innovation is less likely than 1 - gate is skipped.
+    wary: with delay "clone" or "buffer", above 0 (default of all but joint): a packet that repeats
+        the last one while the car moves is skipped; the gate is 1 - 1e-9 where none is configured,
+        a sensor's first sample passes it, and after so many gated samples in a row that agree with
+        each other the filter begins anew with the sensor.
     adapt: share of a new innovation in an R that follows them (0: R as configured).
     force_sd (N), moment_sd (N m), disturbance_time (s): of disturbances that are forces.
     prior: standard deviations of states at the start, by state.
@@ -110,6 +115,7 @@ class FilterConfig:
     hdop_table: tuple[tuple[float, float], ...]
     satellites: float
     gate: float | None
+    wary: int
     members: int
     levels: Array  # (count, 2), of force_sd, moment_sd
     robust: float
@@ -157,7 +163,7 @@ def configure(
         noise_over_speed=noise_over_speed,
         hdop_table=hdop_table(row, read),
         satellites=read.number("satellites", SATELLITES),
-        gate=_gate(read),
+        **_gate(rules["delay"], read),
         **bank_of(states, models[0].forces, read),
         robust=read.not_negative("robust", "standard deviations"),
         model_error=read.not_negative("model_error", "shares of a force"),
@@ -263,8 +269,12 @@ def _models(
     return (first, MODELS[row.second]) if row.second else (first,)
 
 
-def _gate(read: Options) -> float | None:
-    gate = read.value("gate", None)
-    if gate is None:
-        return None
-    return read.checked("gate", gate, "is a probability between 0 and 1", lambda v: 0.0 < v < 1.0)
+def _gate(delay: str, read: Options) -> dict[str, Any]:
+    """`gate` and `wary` of a `FilterConfig`."""
+    count = read.number("wary", 0.0, "is a number of samples", lambda v: v in range(1000))
+    wary = int(count) if delay in ("clone", "buffer") else 0
+    gate = read.value("gate", CERTAIN if wary else None)
+    if gate is not None:
+        expected = "is a probability between 0 and 1"
+        gate = read.checked("gate", gate, expected, lambda v: 0.0 < v < 1.0)
+    return {"gate": gate, "wary": wary}
