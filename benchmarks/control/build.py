@@ -23,7 +23,7 @@ from ...estimators.design.models import TYRES
 from ...estimators.filters import FILTERS
 from ...estimators.vector.estimate import EstimateObservation
 from ..harness.drives import quietly
-from .cells import REFERENCE_CONTROLLER, REFERENCE_FILTER, SETUPS, TRUTH, Cell
+from .cells import ADAPTIVE, REFERENCE_CONTROLLER, REFERENCE_FILTER, SETUPS, TRUTH, Cell
 from .contests import STEERING
 
 STEPS = 200  # of a decision's time
@@ -87,7 +87,8 @@ def estimate_options(cell: Cell) -> dict[str, Any]:
             options = options | {"slow": slow_sensors(cell.contest.env_id)}
         if name in (FILTER, CURVED):
             levels = levels_of(scenario_from(cell.env_options["scenario"]))
-            options = levels | (cell.best["filter"] if name == FILTER else {}) | options
+            own = name == FILTER or cell.controller == ADAPTIVE.get(cell.estimator)
+            options = levels | (cell.best["filter"] if own else {}) | options
             unused = set() if "gps" in options["slow"] else {"hdop_table"}
             if "accel_y" not in options["fast"]:
                 unused |= {"accel_y_noise", "accel_bias_sd"}

@@ -47,8 +47,8 @@ SHARED = {
     ORACLES[PARAMETERS][0]: {"grip", "steer_weight"},
     ORACLES[PARAMETERS][1]: {"grip"},
 }
-"""What contestants too slow to be tuned take over from `nominal`'s controller; of its filter all,
-where they do not know the truth."""
+"""What contestants that are not tuned take over from `nominal`'s controller; of its filter all,
+where they have the same."""
 SLOW_CONTROLLERS = ("mpc", "nmpc", "adaptive-nmpc", ORACLES[STATE][1], ORACLES[PARAMETERS][1])
 
 EPISODES, QUICK_EPISODES, SLOW_EPISODES = 1000, 8, 128
@@ -107,7 +107,8 @@ class Cell:
             shared = {
                 key: best["controller"][key] for key in SHARED[name] & best["controller"].keys()
             }
-            return {"filter": {} if self.rung else best["filter"], "controller": shared}
+            apart = self.rung or name in ADAPTIVE.values()
+            return {"filter": {} if apart else best["filter"], "controller": shared}
         return tuned(kind, NOMINAL if name == REFERENCE_CONTROLLER else name)
 
     @property

@@ -22,7 +22,7 @@ from ...agents.rungs import NOMINAL, RUNGS
 from ...agents.tuned import Options
 from ...envs.backend.cache import source_stamp
 from ...envs.record import Array
-from ..control.cells import REFERENCE_FILTER, Cell
+from ..control.cells import ADAPTIVE, REFERENCE_FILTER, Cell
 from ..control.contests import Contest, candidates, contests
 from ..control.episodes import Chunk, Driven, drive
 from ..control.scores import gains
@@ -88,7 +88,8 @@ def contests_of(name: str, kind: str) -> list[Contest]:
 
 def driven(contest: Contest, name: str, options: Options, seeds: tuple[int, ...]) -> Driven:
     """A contestant's episodes with some options."""
-    estimator = "" if name in RUNGS else REFERENCE_FILTER
+    follows = {who: estimator for estimator, who in ADAPTIVE.items()}
+    estimator = "" if name in RUNGS else follows.get(name, REFERENCE_FILTER)
     return drive(Chunk(Cell(contest, estimator, name, tuned=options), seeds))
 
 

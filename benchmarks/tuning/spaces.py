@@ -48,6 +48,7 @@ _LQG = (
     Number("steer_weight", 100.0, 0.3, 1e3, steering=True),
 )
 _MPC = (*_LEVELS, _TIME._replace(of=("filter", "controller")), _GRIP)
+_ADAPTIVE = (*_LEVELS[:2], _LEVELS[-1], _TIME._replace(of=("filter", "controller")), _GRIP)
 
 SPACES: dict[str, tuple[Number, ...]] = {
     "two-dof": (Number("gain", 1.0, 0.1, 10.0), Number("pole", POLE, 2.0, 60.0), *_FILTER),
@@ -75,12 +76,19 @@ SPACES: dict[str, tuple[Number, ...]] = {
         Number("steer_weight", 10.0, 0.3, 1e3, steering=True),
         *_MPC,
     ),
+    "adaptive-lqr": (Number("steer_weight", 100.0, 0.3, 1e3, steering=True), *_ADAPTIVE),
+    "adaptive-nmpc": (
+        Number("horizon", 0.5, 0.2, 1.0),  # s
+        Number("steer_weight", 10.0, 0.3, 1e3, steering=True),
+        *_ADAPTIVE,
+    ),
     "nominal": _LQG,
     "oracle-parameters-lqr": tuple(each for each in _LQG if each.name != "bias_sd"),  # it knows it
 }
-"""By contestant; all but the rungs, which bring their own, drive on `exact-kf` with all sensors.
-In the matrix `lqr` has what was found for `nominal`, which is the same design."""
-SLOW = ("mpc", "nmpc", "oracle-parameters-lqr")
+"""By contestant; all but the rungs, which bring their own, drive on `exact-kf` with all sensors,
+the adaptive ones on the filter whose tyres they follow. In the matrix `lqr` has what was found for
+`nominal`, which is the same design."""
+SLOW = ("mpc", "nmpc", "adaptive-nmpc", "oracle-parameters-lqr")
 """Contestants whose worse trials end after a few seeds."""
 
 

@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,8 @@ import pytest
 pytest.importorskip("optuna")
 
 from sideslip.agents.tuned import FILE, read_tuned, tuned
+from sideslip.benchmarks.control.build import estimate_options
+from sideslip.benchmarks.control.cells import Cell
 from sideslip.benchmarks.control.contests import Contest
 from sideslip.benchmarks.control.episodes import NUMBERS, Driven
 from sideslip.benchmarks.control.seeds import tuning_seeds
@@ -53,6 +56,20 @@ def test_the_objective_is_the_mean_log_of_paired_costs() -> None:
     nominal = driven(SHORT, "nominal", nothing, SEEDS).costs
     wanted = np.clip(np.log((costs + 1e-3) / (nominal + 1e-3)), -3.0, 3.0).mean()
     assert objective(gain, SEEDS, {"gain": 3.0}) == pytest.approx(wanted, rel=1e-12)
+
+
+def test_an_adaptive_contestant_is_tuned_with_the_filter_it_follows(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Its numbers reach that filter, and nobody else's on the same one."""
+    asked: list[Cell] = []
+    monkeypatch.setattr(controllers, "drive", lambda chunk: asked.append(chunk.cell))
+    asked_of = controllers.contestant("adaptive-nmpc", "car-yaw", (1,))
+    options = asked_of.options(asked_of.start | {"force_sd": 77.0})
+    driven(asked_of.contests[0], asked_of.name, options, (1,))
+    (cell,) = asked
+    assert estimate_options(cell)["options"]["force_sd"] == 77.0
+    assert estimate_options(replace(cell, controller="lqr"))["options"]["force_sd"] != 77.0
 
 
 def test_a_failure_costs_twenty_times_nominal(monkeypatch: pytest.MonkeyPatch) -> None:
