@@ -22,7 +22,8 @@ from .contests import Contest
 from .episodes import NUMBERS, SIGNALS, Chunk, Driven, drive
 from .seeds import Seeds
 
-CHUNK = 250
+CHUNK = 64
+"""Episodes of a case: a run of so many is found again by a longer one."""
 _LENGTH = 24
 
 
@@ -54,14 +55,14 @@ def measure(
     """
     if not cells:
         return Results()
-    chunks = []
-    for cell in cells:
-        mine = seeds(cell.contest) if callable(seeds) else seeds
-        mine = mine[:SLOW_EPISODES] if cell.slow else mine
-        chunks += [
-            Chunk(cell, tuple(mine[first : first + CHUNK]), keep=first == 0)
-            for first in range(0, len(mine), CHUNK)
-        ]
+    asked = {cell: seeds(cell.contest) if callable(seeds) else seeds for cell in cells}
+    asked = {cell: each[:SLOW_EPISODES] if cell.slow else each for cell, each in asked.items()}
+    chunks = [  # the first of every cell before the second of any: a stopped run has them all
+        Chunk(cell, tuple(mine[first : first + CHUNK]), keep=first == 0)
+        for first in range(0, max(map(len, asked.values())), CHUNK)
+        for cell, mine in asked.items()
+        if first < len(mine)
+    ]
     cached = CachedDrive(keep and keep.absolute())  # a worker of a cluster runs elsewhere
     driven = run_cases(by or cached, chunks, title, jobs, console)
     parts: dict[Cell, list[Driven]] = {}
