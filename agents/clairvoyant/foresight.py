@@ -73,8 +73,8 @@ class Fixed(NamedTuple):
     """Parameters that are constant within an episode; hashable, so that they are a solver's key.
 
     car: with zeros for the fields of `Known`. motor, steering: of a step; motor_tick,
-    steering_tick: of a tick. ticks: of a step. steps: in a control period. periods: of the
-    episode. width: of the action.
+    steering_tick: of a tick. ticks: of a step, a control period. periods: of the episode. width:
+    of the action.
     """
 
     car: Car
@@ -89,7 +89,6 @@ class Fixed(NamedTuple):
     kind: Kind
     width: int
     ticks: int
-    steps: int
     periods: int
 
 
@@ -97,8 +96,8 @@ class Fixed(NamedTuple):
 class Forecast:
     """An episode as a plan sees it.
 
-    known: (len(Known), periods * steps + 1), the last column of the episode's end. start: the
-    state at tick 0. driver: (periods, n) rad, the driver's command at every tick.
+    known: (len(Known), periods + 1), the last column of the episode's end. start: the state at
+    tick 0. driver: (periods, n) rad, the driver's command at every tick.
     """
 
     fixed: Fixed
@@ -107,23 +106,20 @@ class Forecast:
     driver: Array
 
 
-def forecast_of(base: Any, steps: int = 1, actions: Array | None = None) -> Forecast:
+def forecast_of(base: Any, actions: Array | None = None) -> Forecast:
     """The rest of an episode that was just reset.
 
-    base: the unwrapped env at tick 0. steps: of the plan in one control period, which they divide.
-    actions: (K, width), none: zero; a driver who reacts to the car steers as in the run of these
-    actions. Raises ValueError where steps do not divide it, and for an env that is not
-    at the start of an episode.
+    base: the unwrapped env at tick 0. actions: (K, width), none: zero; a driver who reacts to the
+    car steers as in the run of these actions. Raises ValueError for an env that is not at the start
+    of an episode.
     """
     n = base.control_period
-    if steps < 1 or n % steps:
-        raise ValueError(f"{steps} steps do not divide a control period of {n} ticks")
     snapshot = base.get_state()
     p, z = snapshot["params"], snapshot["state"]
     if z[Z.clock.tick] != 0.0:
         raise ValueError("a forecast starts at an episode's start: call reset() first")
     start = state_of(z)
-    fixed = _fixed(base, p, snapshot["config"].start.switches, n // steps, steps)
+    fixed = _fixed(base, p, snapshot["config"].start.switches, n)
     ticks = fixed.periods * n
     if actions is None:
         actions = np.zeros((fixed.periods, fixed.width))
@@ -141,7 +137,7 @@ def state_of(z: Array) -> State:
     return State._make((*motion, drive.T_l, drive.T_r, drive.integral, drive.slewing, drive.added))
 
 
-def _fixed(base: Any, p: Array, switches: Any, ticks: int, steps: int) -> Fixed:
+def _fixed(base: Any, p: Array, switches: Any, ticks: int) -> Fixed:
     vehicle, lags = base.vehicle, base.scenario.lags
     motor, steering = (vehicle.motor_lag, vehicle.steering_lag) if lags else (0.0, 0.0)
     task = read(p, P.task)
@@ -158,8 +154,7 @@ def _fixed(base: Any, p: Array, switches: Any, ticks: int, steps: int) -> Fixed:
         plain(kind_of)(p, switches),
         base.action_space.shape[0],
         ticks,
-        steps,
-        -int(-task.duration // (ticks * steps)),
+        -int(-task.duration // ticks),
     )
 
 

@@ -109,7 +109,7 @@ def _search(
     for sweeps in range(MOST_SWEEPS):
         if forecast.fixed.kind.follows:  # the driver answers to the newest run
             env.reset(seed=seed)
-            forecast = forecast_of(env.unwrapped, 1, best.trajectory.actions)
+            forecast = forecast_of(env.unwrapped, best.trajectory.actions)
         before = best.cost
         best, damping = _improve(env, seed, problem, forecast, best, damping)
         if best.cost >= before:

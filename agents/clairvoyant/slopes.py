@@ -70,8 +70,6 @@ class Problem:
 @functools.lru_cache(maxsize=8)
 def problem_of(fixed: Fixed) -> Problem:
     """The functions, cached for each of the newest few kinds of episode."""
-    if fixed.steps != 1:
-        raise ValueError(f"the plan takes one step a control period, got {fixed.steps}")
     names = carried(fixed)
     scale, size = np.array(scales(fixed, names)), len(names)
     w, known = ca.SX.sym("w", size + fixed.width), ca.SX.sym("known", len(Known._fields))

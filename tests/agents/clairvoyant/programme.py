@@ -52,7 +52,7 @@ class Programme:
 
 
 @functools.lru_cache(maxsize=8)
-def _expansion(fixed: Fixed, v_x: float) -> tuple[Any, Any]:
+def _expansion(fixed: Fixed, steps: int, v_x: float) -> tuple[Any, Any]:
     """Two functions of `Known`: of a period, and of the episode's end.
 
     They return (next state, its slope, cost, its gradient, its Hessian) at zero, and (cost,
@@ -61,11 +61,11 @@ def _expansion(fixed: Fixed, v_x: float) -> tuple[Any, Any]:
     names = tuple(name for name in carried(fixed) if name not in ("v_x", "integral"))
     scale, size = scales(fixed, names), len(names)
     w = ca.SX.sym("w", size + fixed.width)
-    known = ca.SX.sym("known", len(Known._fields), fixed.steps)
+    known = ca.SX.sym("known", len(Known._fields), steps)
     rest = State(*(0.0,) * len(State._fields))._replace(v_x=v_x)
     x = rest._replace(**{name: scale[i] * w[i] for i, name in enumerate(names)})
     first, cost = x, ca.SX(0.0)
-    for j in range(fixed.steps):
+    for j in range(steps):
         here = Known(*ca.vertsplit(known[:, j]))
         step = advance(fixed, x, ca.vertsplit(w[size:]), here)
         cost += node_cost(fixed, node_errors(fixed, x, here), here) + step.effort
@@ -86,22 +86,22 @@ def _expansion(fixed: Fixed, v_x: float) -> tuple[Any, Any]:
     return at_zero(inside), at_zero(end)
 
 
-def programme_of(forecast: Forecast) -> Programme:
-    """The quadratic programme of an episode whose forecast goes tick by tick."""
+def programme_of(forecast: Forecast, steps: int) -> Programme:
+    """The programme of an episode whose forecast goes tick by tick; steps: in a control period."""
     fixed, start = forecast.fixed, forecast.start
     if fixed.ticks != 1:
         raise ValueError(f"the linear plan is made of ticks, got steps of {fixed.ticks}")
     names = tuple(name for name in carried(fixed) if name not in ("v_x", "integral"))
-    size, K = len(names), fixed.periods
-    inside, end = _expansion(fixed, start.v_x)
-    known = forecast.known[:, :-1].reshape(len(Known._fields), K, fixed.steps)
+    size, K = len(names), fixed.periods // steps
+    inside, end = _expansion(fixed, steps, start.v_x)
+    known = forecast.known[:, :-1].reshape(len(Known._fields), K, steps)
     n = size + fixed.width
     q, constant, offsets = np.zeros(K * n + size), 0.0, np.empty((K, size))
     for k in range(K):
         after, slope, cost, g, H = inside(known[:, k])
         offsets[k], q[k * n : (k + 1) * n] = after.ravel(), g.ravel()
         constant += cost.item()
-    last = np.tile(forecast.known[:, -1:], (1, fixed.steps))
+    last = np.tile(forecast.known[:, -1:], (1, steps))
     cost, g, H_end = end(last)
     q[K * n :], constant = g.ravel()[:size], constant + cost.item()
     blocks = [sparse.csc_matrix(H)] * K
@@ -121,9 +121,9 @@ def programme_of(forecast: Forecast) -> Programme:
     return Programme(P, q, constant, A, np.r_[equal, -most], np.r_[equal, most], size, fixed.width)
 
 
-def solve_linear(forecast: Forecast) -> tuple[Array, float, str]:
+def solve_linear(forecast: Forecast, steps: int) -> tuple[Array, float, str]:
     """(actions (K, 1), the least cost without the cap, OSQP's status)."""
-    made = programme_of(forecast)
+    made = programme_of(forecast, steps)
     solver = osqp.OSQP()
     solver.setup(sparse.triu(made.P, format="csc"), made.q, made.A, made.low, made.high, **_OPTIONS)
     found = solver.solve(raise_error=False)

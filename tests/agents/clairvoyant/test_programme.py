@@ -31,10 +31,12 @@ def make(reference: str = "zero-slip", **changes: Any) -> gymnasium.Env[Any, Any
 
 
 def optimum(env: gymnasium.Env[Any, Any], seed: int) -> tuple[Array, float]:
-    """The programme's actions for an episode, and its least cost."""
-    env.reset(seed=seed)
+    """The programme's actions for an episode, and its least cost; a forecast of every tick."""
     base: Any = env.unwrapped
-    actions, least, status = solve_linear(forecast_of(base, base.control_period))
+    how = {"scenario": base.scenario, "reference": base.reference}
+    ticks = gymnasium.make("sideslip/YawVision-v0", control_period=1, **how)
+    ticks.reset(seed=seed)
+    actions, least, status = solve_linear(forecast_of(ticks.unwrapped), base.control_period)
     assert status == "solved"
     return actions, least
 
