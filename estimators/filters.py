@@ -50,7 +50,7 @@ ANY = SLOW_NAMES
 GPS = ("gps",)
 CAMERA = ("camera",)
 
-TYRES = (("front_tyres_sd", 0.23), ("rear_tyres_sd", 0.23), ("wary", 10))
+JOINT = (("front_tyres_sd", 0.23), ("rear_tyres_sd", 0.23), ("wary", 10))
 ROBUST = (
     ("fast", ("gyro", "accel_y")),
     ("q_front_tyres", 0.006),
@@ -148,14 +148,14 @@ FILTERS: dict[str, Filter] = {
         slow=ANY,
         gains="covariance",
         disturbances="forces",
-        options=TYRES,
+        options=JOINT,
         source="docs/estimators.md, beyond the papers",
     ),
     "joint-robust": Filter(
         slow=ANY,
         gains="covariance",
         disturbances="forces",
-        options=(*TYRES, *ROBUST),
+        options=(*JOINT, *ROBUST),
         source="docs/estimators.md, beyond the papers",
     ),
 }

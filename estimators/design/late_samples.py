@@ -58,6 +58,11 @@ def check_window(f: Memory, config: FilterConfig) -> None:
         )
     if f.late == BUFFER and f.pace > 1:
         raise ValueError(f"{who}: delay='buffer' is for filters that listen at every tick")
+    if f.late == BUFFER and config.accel_time > 0.0:
+        raise ValueError(
+            f"{who}: delay='buffer' filters stored ticks again and does not store the noise that "
+            f"accel_time={config.accel_time:g} finds; use delay='clone'"
+        )
     if f.late not in (BUFFER, STORED):
         return
     window = WINDOW - EVERY if f.late == BUFFER else WINDOW - 1

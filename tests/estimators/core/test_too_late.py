@@ -137,6 +137,12 @@ def test_a_sample_that_nothing_is_held_of_changes_nothing(rule: Any) -> None:
             {"delay": "buffer"},
             "delay='buffer' is for filters that listen at every tick",
         ),
+        (
+            "joint-robust",
+            {"camera": CAMERA},
+            {"delay": "buffer"},
+            "does not store the noise that accel_time=2 finds",
+        ),
     ],
 )
 def test_a_sensor_later_than_the_window_is_refused_when_the_filter_is_built(
