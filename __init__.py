@@ -8,6 +8,8 @@ Importing this package registers its Gymnasium environments and loads nothing el
 ...     print(name)
 sideslip/AfsYawFusion-v0
 sideslip/Highway-v0
+sideslip/LinearYawGps-v0
+sideslip/LinearYawVision-v0
 sideslip/Outside-v0
 sideslip/YawFusion-v0
 sideslip/YawGps-v0
@@ -55,6 +57,45 @@ _ENVIRONMENTS: dict[str, dict[str, Any]] = {
     "sideslip/YawFusion-v0": {"sensors": "fusion", "reference": "model"},
     "sideslip/AfsYawFusion-v0": {"sensors": "fusion", "reference": "model", "steering": True},
 }
+# Linear, Gaussian, known: the best policy's cost is computed (`agents.optimum`, docs/memory.md).
+# The noise of sensors that the optimal filter does not read leaves them nothing to say.
+_MOTORS = {"motor_lag": 0.0, "steering_lag": 0.0, "motor_torque": 600.0}
+_LINEAR = {
+    "name": "linear",
+    "steering": "wander",
+    "amplitude": 0.005,
+    "frequency": 0.2,
+    "hold": 0.01,
+    "disturbance_time": 1.0,
+    "small_angle": True,
+    "tyres": "linear",
+    "roll": False,
+    "vehicle": _MOTORS,
+    "nominal": _MOTORS,
+    "hdop_law": "constant",
+    "hdop_spread": 0.0,
+    "half_width": 1e9,
+    "noise": {
+        "gyro": 0.003,
+        "camera_psi": 3e-4,
+        "camera_y": 0.001,
+        "course": 0.003,
+        "accel": 1e4,
+        "wheel": 100.0,
+        "gps_speed": 100.0,
+        "gps_position": 1e4,
+    },
+}
+_OPTIMA = {"Vision": -0.021510993, "Gps": -0.014128621}
+_ENVIRONMENTS |= {
+    f"sideslip/LinearYaw{name}-v0": {
+        "sensors": name.lower(),
+        "reference": "zero-slip",
+        "fast": "all",
+        "scenario": _LINEAR,
+    }
+    for name in _OPTIMA
+}
 
 # This file runs again under the checkout's own name (pytest) and in every worker process, so the
 # entry point is a string and an id that stands in the registry is left alone.
@@ -65,6 +106,7 @@ for _id, _kwargs in _ENVIRONMENTS.items():
             entry_point="sideslip.envs.stability:StabilityEnv",
             vector_entry_point="sideslip.envs.vector:StabilityVectorEnv",
             kwargs=_kwargs,
+            reward_threshold=_OPTIMA.get(_id[len("sideslip/LinearYaw") : -len("-v0")]),
         )
 for _id, _entry in {
     "sideslip/Highway-v0": "sideslip.envs.highway.env:HighwayEnv",

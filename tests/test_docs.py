@@ -59,10 +59,11 @@ def run(code: str, folder: Path, package: Path, **variables: str) -> str:
 
 
 @pytest.mark.long
-def test_the_readmes_examples_run(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("page", "least"), [("README.md", 3), ("docs/memory.md", 2)])
+def test_a_pages_examples_run(page: str, least: int, tmp_path: Path) -> None:
     """One after the other, as a reader types them."""
-    blocks = [code for kind, _, code in FENCE.findall((ROOT / "README.md").read_text())]
-    assert len(blocks) >= 3
+    blocks = [code for kind, _, code in FENCE.findall((ROOT / page).read_text())]
+    assert len(blocks) >= least
     run("\n".join(blocks), tmp_path / "empty", ROOT / "src")
 
 

@@ -125,7 +125,7 @@ def forecast_of(base: Any, actions: Array | None = None) -> Forecast:
         actions = np.zeros((fixed.periods, fixed.width))
     drive, driver, refs = _driven(base, snapshot, actions, n)
     command = driver
-    if not fixed.kind.follows:
+    if not fixed.kind.follows and base.scenario.steering != "wander":
         command = np.array([programmed(p, float(k)) for k in range(ticks + 1)])
     known = _known(p, fixed, drive, command, refs)
     return Forecast(fixed, known, start, command[:-1].reshape(-1, n))

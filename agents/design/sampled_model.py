@@ -84,7 +84,7 @@ def design_model(vehicle: Vehicle, speed: float, purpose: Purpose) -> DesignMode
     """The model of a vehicle at a speed in m/s; ValueError unless that is positive."""
     G1, H1, C, D = one_tick(vehicle, speed, purpose)
     n, m = H1.shape
-    W = TICK * np.diag(_weights(purpose))
+    W = TICK * np.diag(cost_weights(purpose))
     step, G, H = np.hstack([G1, H1]), np.eye(n), np.zeros((n, m))
     whole = np.zeros((n + m, n + m))
     for _ in range(purpose.period):
@@ -147,7 +147,7 @@ def _tick_of_the_plane(vehicle: Vehicle, speed: float, purpose: Purpose) -> tupl
     return np.hstack([G[:2], H[:2, :2]]), H[:2, 2:]
 
 
-def _weights(purpose: Purpose) -> Sequence[float]:
+def cost_weights(purpose: Purpose) -> Sequence[float]:
     """The weights of the four that the cost judges: docs/ARCHITECTURE.md, "Cost and score"."""
     return (
         1.0 / BETA_SCALE**2,

@@ -31,6 +31,7 @@ class Channels(NamedTuple):
     initial: int = 6  # disturbance force and moment at reset; clock phases
     scenario: int = 7  # uniforms of the scenario's draws; the counter's tick is the attempt
     sky: int = 8  # log HDOP's innovation, its start at reset, two unused
+    steering: int = 9  # of a driver who wanders; three unused
 
 
 CHANNELS = Channels()

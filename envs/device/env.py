@@ -111,8 +111,9 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
         """
         configs = list({id(config): config for config in configs}.values())
         for config in configs:
-            if config.scenario.trace:
-                raise ValueError(f"{config.scenario.name!r}: no trace is driven on a device")
+            if config.scenario.steering in ("trace", "wander"):
+                what = f"{config.scenario.name!r}: no {config.scenario.steering}"
+                raise ValueError(f"{what} is driven on a device")
             kind = _kind_of(config)
             if kind != self._kind:
                 raise ValueError(

@@ -10,7 +10,7 @@ from ..backend.random import CHANNELS, normals
 from ..record import FAST
 from ..scenarios.draws import DRAWS, DRAWS_WIDTH, realise
 from ..scenarios.driver import wanted_angle
-from ..scenarios.steering import DRIVER, write_steering
+from ..scenarios.steering import DRIVER, WANDER, write_steering
 from ..scenarios.tracks import laid
 from ..sensors.inertial import Chance, fast_row
 from ..sensors.link import clock_phase
@@ -107,6 +107,8 @@ def reset_vehicle(start: Start, key_low: int, key_high: int, bounds: Any, row: R
     if switches[FLAGS.steering] == DRIVER:
         person, path = read(p, P.driver), read(p, P.path)
         steer = wanted_angle(motion, path, road, target, person, p[P.task.stop])
+    elif switches[FLAGS.steering] == WANDER:
+        steer = d.amplitude * normals(key_low, key_high, 0, CHANNELS.steering)[0]
     z[Z.drive.delta_f] = steer
     z[Z.driver] = steer
     z[Z.drive.F_d] = p[P.disturbance.force] * n[0]

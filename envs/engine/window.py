@@ -14,7 +14,7 @@ from ..backend.primitives import to_float, whole
 from ..backend.random import CHANNELS, normals
 from ..backend.simd import LANES
 from ..record import Array
-from ..scenarios.steering import steering_at, trace_at
+from ..scenarios.steering import WANDER_AT, steering_at, trace_at
 from ..sensors.inertial import Chance
 from ..vehicle.dynamics import Motion
 from .layout import PARAMS_WIDTH, P, Z
@@ -30,6 +30,7 @@ class Window(NamedTuple):
 
 
 WINDOW, _HEIGHT = offsets(Window)
+_KEEP, _FRESH, _HOLD = P.programme[WANDER_AT : WANDER_AT + 3]
 
 
 def window_of(n: int, *lanes: int) -> Array:
@@ -46,11 +47,20 @@ def programmed(p: Any, tick: Any) -> Any:
 
 
 @jit
-def follow_trace(p: Any, z: Any, n: int, window: Any) -> None:
-    """Write the angles of a trace, where there is one, over those of the programme."""
+def follow(p: Any, z: Any, n: int, window: Any) -> None:
+    """Write the angles of a trace, or of a driver who wanders, over those of the programme."""
     if len(p) > PARAMS_WIDTH and p[PARAMS_WIDTH] > 0.0:
         for j in range(n):
             window[WINDOW.ahead, j] = trace_at(z[Z.clock.tick] + (j + 1), p[PARAMS_WIDTH:])
+    hold = p[_HOLD]
+    if hold > 0.0:
+        angle, key_low, key_high = z[Z.driver], int(z[Z.clock.key_low]), int(z[Z.clock.key_high])
+        for j in range(n):
+            tick = int(z[Z.clock.tick]) + (j + 1)
+            if tick % int(hold) == 0:
+                fresh = normals(key_low, key_high, tick, CHANNELS.steering)[0]
+                angle = p[_KEEP] * angle + p[_FRESH] * fresh
+            window[WINDOW.ahead, j] = angle
 
 
 @jit
@@ -70,7 +80,7 @@ def foresee(p: Any, z: Any, n: int, follows: int, window: Any) -> None:
         write(window, wheels, WINDOW.wheels, j)
         if not follows:
             put(window, steering_at(to_float(ticks), programme), WINDOW.ahead, j)
-    follow_trace(p, z, n, window)
+    follow(p, z, n, window)
 
 
 @jit

@@ -172,7 +172,7 @@ def _check_draws(fields: Fields) -> None:
                 f"{name} {fields[name]!r} needs a tyre_change_time, from which it acts"
             )
     steering, hold = fields["steering"], fields["hold"]
-    if steering in ("ramp", "sweep") and range_of(hold)[0] < TICK:
+    if steering in ("ramp", "sweep", "wander") and range_of(hold)[0] < TICK:
         raise ValueError(f"hold of a {steering} is 1 ms or more, got {hold!r}")
     if steering == "sine-with-dwell" and range_of(hold)[0] < 0.0:
         raise ValueError(f"hold of a dwell is not negative, got {hold!r}")

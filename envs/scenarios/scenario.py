@@ -24,9 +24,11 @@ class Scenario:
     frequency_2, frequency_3 and frequency_4; sweep: to frequency_2) and hold (of a step, a dwell, a
     ramp or a sweep, or from one lane change to the next); "trace" follows the angles of `trace`
     (rad at the wheels, recorded every trace_step seconds, straight between them) and holds the
-    last. mirror: the seed draws the side of steering, track, bend, bank, friction_right and start,
-    and that of the wind. initial_beta, initial_gamma: sideslip angle in rad and yaw rate in rad/s
-    that the car starts with.
+    last. "wander" is a zero-mean Ornstein-Uhlenbeck process of standard deviation amplitude and
+    corner frequency `frequency`, held for `hold` s from one angle to the next. mirror: the seed
+    draws the side of steering, track, bend, bank, friction_right and start, and that of the wind.
+    initial_beta, initial_gamma: sideslip angle in rad and yaw rate in rad/s that the car starts
+    with.
 
     The steering "driver" keeps to a path of `PATHS` (`driver.py`): the road's centre line, or a
     track that begins where the car is at the onset at the speed it starts with, for the vehicle's

@@ -8,22 +8,24 @@ can reset its rows without Python.
 from typing import Any
 
 from ..backend.decorators import jit
-from ..backend.elementary import PI, sincos, smoothstep
-from ..backend.primitives import anywhere, floor, maximum, minimum, select
+from ..backend.elementary import PI, exp, sincos, smoothstep
+from ..backend.primitives import anywhere, floor, maximum, minimum, select, sqrt
 from ..ticks import FOREVER, TICK, whole_ticks
 
 (
     STRAIGHT, SINE, SLALOM, LANE_CHANGE, STEP, RANDOM, DOUBLE_LANE_CHANGE, SINE_WITH_DWELL, RAMP,
-    SWEEP, HELD_STEP, DRIVER, TRACE,
-) = range(13)  # fmt: skip
+    SWEEP, HELD_STEP, DRIVER, TRACE, WANDER,
+) = range(14)  # fmt: skip
 STEERING_KINDS = (
     "straight", "sine", "slalom", "lane-change", "step", "random", "double-lane-change",
     "sine-with-dwell", "ramp", "sweep", "held-step", "driver", "trace",
+    "wander",
 )  # fmt: skip
 SINES, STEPS = 4, 3
 _RAMP_AT = 5 * SINES + 3 * STEPS
 _SWEEP_AT = _RAMP_AT + 3
-STEERING_WIDTH = _SWEEP_AT + 5
+WANDER_AT = _SWEEP_AT + 5
+STEERING_WIDTH = WANDER_AT + 3
 RISE = 0.2  # s, of a step
 
 
@@ -68,6 +70,14 @@ def trace_at(tick: Any, trace: Any) -> Any:
 
 
 @jit
+def wandering(amplitude: Any, hertz: Any, hold: Any) -> Any:
+    """(keep, fresh) of a driver who wanders: after `hold` s the angle is keep times what it was
+    plus fresh rad times a standard normal number; it has the standard deviation `amplitude`."""
+    keep = exp(maximum(-2.0 * PI * hertz * hold, -7.5))  # where `exp` ends
+    return keep, amplitude * sqrt(1.0 - keep * keep)
+
+
+@jit
 def _sine(programme: Any, i: int, amplitude: Any, hertz: Any, start: Any, end: Any) -> None:
     programme[5 * i] = amplitude
     programme[5 * i + 1] = 2.0 * PI * hertz
@@ -96,7 +106,7 @@ def _dwell(programme: Any, a: Any, hertz: Any, start: Any, dwell: Any) -> None:
 @jit
 def write_steering(kind: int, d: Any, programme: Any) -> None:
     """Fill the steering programme of a kind from drawn numbers; a driver's and a
-    trace's are empty.
+    trace's are empty, and one who wanders steers by `wandering` (`engine.window`).
 
     The slalom, the lane changes, the step and the random steering leave the car on its old
     heading: the slalom starts with a half wave of half the amplitude, the step is followed by its
@@ -150,3 +160,7 @@ def write_steering(kind: int, d: Any, programme: Any) -> None:
         programme[k + 3], programme[k + 4] = start, d.hold
     elif kind == HELD_STEP:
         _step(programme, 0, a, start, whole_ticks(RISE))
+    elif kind == WANDER:
+        keep, fresh = wandering(d.amplitude, d.frequency, d.hold)
+        k = WANDER_AT
+        programme[k], programme[k + 1], programme[k + 2] = keep, fresh, whole_ticks(d.hold)

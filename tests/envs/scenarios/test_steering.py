@@ -88,6 +88,7 @@ def test_each_kind_is_what_its_name_says() -> None:
         "held-step": 0.1 * steps[0],
         "driver": 0.0 * t,
         "trace": 0.0 * t,  # behind the programme
+        "wander": 0.0 * t,  # from angle to angle
     }
     assert set(expected) == set(STEERING_KINDS)
     for kind, angle in expected.items():

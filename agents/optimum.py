@@ -1,0 +1,237 @@
+"""The least expected cost of a linear scenario, by Riccati's equations: what no policy can beat.
+
+Where the plant is linear, all noise Gaussian and the cost a sum of squares, the best policy answers
+the best estimate as it would answer the state (certainty equivalence: Joseph and Tou 1961), and its
+cost follows from two recursions: that of the cost to go, backwards from the episode's end, and that
+of the estimate's covariance along the arrivals of the slow sensors' packets. What is left out are
+the cap of the cost and the limit of the motors, which the scenario makes rare.
+
+The information is that of the env's record, and of its observation with `fast="all"`: the gyro of
+every tick, packets with their stamps, the torques and the driver's angle that acted. The driver's
+next angle is none of it, except that of the start: the best guess is `keep` times the last one.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from ..envs.backend.rebuild import plain
+from ..envs.record import PACKET_WIDTH, Array
+from ..envs.scenarios.scenario import Scenario
+from ..envs.scenarios.steering import wandering
+from ..envs.task.reference import REFERENCES
+from ..envs.ticks import TICK
+from ..estimators.design.models import states_for
+from ..estimators.make import make_estimator
+from ..estimators.vector import estimate as vector
+from ..estimators.wrappers.estimate import EstimateObservation
+from .controllers.base import Controller
+from .design.sampled_model import DesignModel, Purpose, cost_weights, design_model, one_tick
+from .env_facts import AnyEnv, configs_of
+from .rungs import FILTER, OUTPUTS, levels_of
+
+_MUST = {
+    "steering": "wander", "small_angle": True, "tyres": "linear", "roll": False,
+    "hdop_law": "constant", "hdop_spread": 0.0,
+}  # fmt: skip
+_MAY = {
+    "name", "duration", "amplitude", "frequency", "hold", "speed", "friction", "noise",
+    "vehicle", "nominal", "disturbance_force", "disturbance_moment", "disturbance_time",
+    "half_width", "camera_delays", "camera_jitter", "camera_loss", "camera_outage", "gps_period",
+    "gps_delays", "gps_outage",
+}  # fmt: skip
+_SILENT = {"accel": 1e4, "wheel": 100.0, "gps_speed": 100.0, "gps_position": 1e4}
+"""Noise from which on a sensor that the filter does not read says nothing of the car."""
+
+
+@dataclass(frozen=True)
+class Plant:
+    """A linear scenario at the control's instants: x+ = G x + H u + w, w of covariance W.
+
+    model: as designs have it, the driver's angle decaying. rest: what noise within a period costs,
+    whatever the policy. start: covariance of x at the start. steps: periods of an episode.
+    """
+
+    model: DesignModel
+    W: Array
+    rest: float
+    start: Array
+    steps: int
+
+    @property
+    def driver(self) -> int:
+        """The place of the driver's angle in x."""
+        return self.model.purpose.states.index("driver")
+
+
+@dataclass(frozen=True)
+class Optimum:
+    """The best policy, u = -K_j E[x_j | what was measured], and what it costs.
+
+    cost: expected, of an episode. gains: K_j (steps, n). weights: S_j (steps,), what another input
+    costs: S_j du^2. errors: covariance of the best estimate, by schedule, (schedules, steps, n, n).
+    """
+
+    plant: Plant
+    cost: float
+    gains: Array
+    weights: Array
+    errors: Array
+
+    def cost_of(self, gains: Array) -> float:
+        """Expected cost of u = -L_j E[x_j | ...] for gains (steps, n), or (n,) of all steps."""
+        model, W = self.plant.model, self.plant.W
+        L = np.broadcast_to(gains, self.gains.shape)
+        total = 0.0
+        for errors in self.errors:
+            X = self.plant.start
+            for j, P in enumerate(errors):
+                known, d = X - P, self.gains[j] - L[j]
+                total += self.weights[j] * float(d @ known @ d)
+                closed = model.G - model.H @ L[j : j + 1]
+                X = closed @ known @ closed.T + model.G @ P @ model.G.T + W
+        return self.cost + total / len(self.errors)
+
+
+def plant_of(env: AnyEnv) -> Plant:
+    """The linear plant of an env, single or vector; ValueError where its scenario is not linear."""
+    config = configs_of(env)[0]
+    scenario, n = config.scenario, int(config.control_period)
+    _check(scenario, config.base, config.reference, config.steering, n)
+    car, speed = config.base.nominal, config.base.held_speed
+    assert speed is not None
+    kind = REFERENCES.index(config.reference)
+    full = config.base.vehicle.yaw_moment_limit
+    purpose = Purpose(n, full, False, kind, "forces", scenario.disturbance_time)
+    model = design_model(car, speed, purpose)
+    G1, _, C, _ = one_tick(car, speed, purpose)
+    names, weights = purpose.states, TICK * np.diag(cost_weights(purpose))
+    sd = np.zeros(len(names))
+    sd[[names.index("F_d"), names.index("N_d")]] = (
+        scenario.disturbance_force,
+        scenario.disturbance_moment,
+    )
+    fresh = np.diag(sd**2 * (1.0 - np.diag(G1) ** 2))
+    W, rest = np.zeros_like(G1), 0.0
+    for _ in range(n):
+        rest += float(np.trace(weights @ C @ W @ C.T))
+        W = G1 @ W @ G1.T + fresh
+    driver = names.index("driver")
+    amplitude, frequency, hold = (
+        scenario.range(name)[0] for name in ("amplitude", "frequency", "hold")
+    )
+    keep, fresh_angle = plain(wandering)(amplitude, frequency, hold)
+    model.G[driver, driver], W[driver, driver], sd[driver] = keep, fresh_angle**2, amplitude
+    return Plant(model, W, rest, np.diag(sd**2), round(scenario.duration / (n * TICK)))
+
+
+def _check(scenario: Scenario, base: Any, reference: str, steers: bool, n: int) -> None:
+    """ValueError, naming what, where no optimum is known."""
+    own = {key: getattr(scenario, key) for key in _MUST}
+    wrong = [f"{key} {value!r}" for key, value in own.items() if value != _MUST[key]]
+    wrong += [key for key in scenario.to_dict() if key not in _MAY | set(_MUST)]
+    wrong += [
+        f"noise of {name} below {least:g}"
+        for name, least in _SILENT.items()
+        if not scenario.noise.get(name, 0.0) >= least
+    ]
+    if base.vehicle != base.nominal or base.vehicle.motor_lag or base.vehicle.steering_lag:
+        wrong.append("a car with lags or of unknown parameters")
+    ranges = [scenario.range(name) for name in ("amplitude", "frequency", "hold")]
+    if base.held_speed is None or any(low != high for low, high in ranges):
+        wrong.append("quantities that are drawn")
+    if abs(ranges[2][0] - n * TICK) > 1e-9:
+        wrong.append(f"hold {ranges[2][0]:g} s at control periods of {n * TICK:g} s")
+    if reference != "zero-slip" or steers:
+        wrong.append("another task than the yaw moment's at zero slip")
+    if wrong:
+        raise ValueError(f"scenario {scenario.name!r} has no known optimum: {', '.join(wrong)}")
+
+
+def truth_of(env: AnyEnv) -> dict[str, Any]:
+    """Options of `exact-kf` that know the noise, the disturbances and where an episode starts."""
+    config = configs_of(env)[0]
+    start = dict.fromkeys(states_for(tuple(config.slow)), 0.0)
+    options = levels_of(config.scenario) | {"slow": list(config.slow), "prior": start}
+    speed, noise = config.base.held_speed, config.scenario.noise
+    if speed is not None and "course" in noise:
+        options["course_noise"] = noise["course"] / speed
+    return options
+
+
+def optimum(env: gym.Env[Any, Any], schedules: int = 1) -> Optimum:
+    """The optimum of a linear scenario of a single env, which is driven to see what arrives when.
+
+    schedules: seeds 0 .. schedules-1 whose arrivals are averaged over; one will do where nothing is
+    lost or late by chance. Raises ValueError as `plant_of`.
+    """
+    plant = plant_of(env)
+    gains, weights, cost = _regulator(plant)
+    errors = np.array([_errors(env, plant, seed) for seed in range(schedules)])
+    blind = np.einsum("j,ji,kjil,jl->", weights, gains, errors, gains) / schedules
+    return Optimum(plant, cost + float(blind), gains, weights, errors)
+
+
+def _regulator(plant: Plant) -> tuple[Array, Array, float]:
+    """K_j (steps, n), S_j (steps,), and the expected cost of an episode whose state is known."""
+    model, n = plant.model, len(plant.model.G)
+    G, H, V = model.G, model.H, np.zeros((n, n))
+    gains, weights, cost = np.empty((plant.steps, n)), np.empty(plant.steps), 0.0
+    for j in range(plant.steps - 1, -1, -1):
+        cost += plant.rest + float(np.trace(V @ plant.W))
+        S = model.R + H.T @ V @ H
+        K = np.linalg.solve(S, H.T @ V @ G + model.N.T)
+        V = model.Q + G.T @ V @ G - K.T @ S @ K
+        V = 0.5 * (V + V.T)
+        gains[j], weights[j] = K[0], S[0, 0]
+    return gains, weights, cost + float(np.trace(V @ plant.start))
+
+
+def _errors(env: gym.Env[Any, Any], plant: Plant, seed: int) -> Array:
+    """Covariance of the best estimate at every decision of a seed's episode, (steps, n, n)."""
+    env.reset(seed=seed)
+    base: Any = env.unwrapped
+    facts = {"vehicle": base.nominal, "sensors": base.slow_sensors, "speed": base.held_speed}
+    filter_ = make_estimator(FILTER, **facts, **truth_of(env))
+    names = plant.model.purpose.states
+    here = [names.index(name) for name in OUTPUTS]
+    there = [filter_.names.index(name) for name in OUTPUTS]
+    found = np.zeros((plant.steps, len(names), len(names)))
+    still = np.zeros(env.action_space.shape or (), np.float32)
+    for j in range(plant.steps):
+        record = base.record
+        filter_.step(record.fast, record.packets.reshape(-1, PACKET_WIDTH))
+        found[j][np.ix_(here, here)] = filter_.P[np.ix_(there, there)]
+        if j > 0:
+            found[j, plant.driver, plant.driver] = plant.W[plant.driver, plant.driver]
+        env.step(still)
+    return found
+
+
+class Lqg(Controller):
+    """The best policy of a linear scenario that goes on for ever, on `estimated` of its env.
+
+    It lacks the last steps, when nothing is to come, and takes the first angle for a last one.
+    `gains` (n,) is what `Optimum.cost_of` prices, but for that.
+    """
+
+    needs = (*(f"{name}_hat" for name in OUTPUTS), "steer_command")
+
+    def __init__(self, env: AnyEnv, gains: Array | None = None) -> None:
+        super().__init__(env)
+        plant = plant_of(env)
+        self.gains = _regulator(plant)[0][0] if gains is None else gains
+        names = plant.model.purpose.states
+        self._answer = self.gains[[names.index(name) for name in (*OUTPUTS, "driver")]]
+        self._answer[-1] *= plant.model.G[plant.driver, plant.driver]
+
+    def _law(self, inputs: Array, state: Array, action: Array) -> None:
+        action[:, 0] = -inputs @ self._answer
+
+
+def estimated(env: Any) -> Any:
+    """The env, single or vector, with the optimal estimate in its observation."""
+    wrapper: Any = EstimateObservation if isinstance(env, gym.Env) else vector.EstimateObservation
+    return wrapper(env, FILTER, outputs=OUTPUTS, std=False, options=truth_of(env))
