@@ -40,15 +40,13 @@ LEARNED: tuple[tuple[str, str], ...] = (("", "ppo-yaw-vision"),)
 """(estimator, policy), a policy by its shipped name or path; in tier 1, whose car it knows. One
 that was trained on fewer sensors reads what it knows by name."""
 SHARED = {
-    "mpc": {"grip", "disturbance_time"},
-    "nmpc": {"grip", "disturbance_time"},
-    "adaptive-lqr": {"grip", "disturbance_time", "steer_weight"},
-    "adaptive-nmpc": {"grip", "disturbance_time"},
-    ORACLES[PARAMETERS][0]: {"grip", "steer_weight"},
-    ORACLES[PARAMETERS][1]: {"grip"},
+    "adaptive-lqr": (NOMINAL, {"grip", "disturbance_time", "steer_weight"}),
+    ORACLES[PARAMETERS][0]: (NOMINAL, {"grip", "steer_weight"}),
+    ORACLES[PARAMETERS][1]: ("adaptive-nmpc", {"horizon", "grip", "steer_weight"}),
+    ORACLES[STATE][1]: ("adaptive-nmpc", {"horizon", "steer_weight"}),
 }
-"""What contestants that are not tuned take over from `nominal`'s controller; of its filter all,
-where they have the same."""
+"""By who is not tuned: from whom, closest in what it knows, it takes over what of the controller;
+its filter's levels are the scenario's."""
 SLOW_CONTROLLERS = ("mpc", "nmpc", "adaptive-nmpc", ORACLES[STATE][1], ORACLES[PARAMETERS][1])
 
 EPISODES, QUICK_EPISODES, SLOW_EPISODES = 1000, 8, 128
@@ -103,12 +101,9 @@ class Cell:
             return tuned(self.contest.kind, NOMINAL) | {"controller": {}}
         kind, name = self.contest.kind, self.rung or self.controller
         if name in SHARED and not any(tuned(kind, name).values()):
-            best = tuned(kind, NOMINAL)
-            shared = {
-                key: best["controller"][key] for key in SHARED[name] & best["controller"].keys()
-            }
-            apart = self.rung or name in ADAPTIVE.values()
-            return {"filter": {} if apart else best["filter"], "controller": shared}
+            source, numbers = SHARED[name]
+            best = tuned(kind, source)["controller"]
+            return {"filter": {}, "controller": {key: best[key] for key in numbers & best.keys()}}
         return tuned(kind, NOMINAL if name == REFERENCE_CONTROLLER else name)
 
     @property

@@ -13,7 +13,14 @@ from sideslip.benchmarks.control import build
 from sideslip.benchmarks.control import episodes as drive
 from sideslip.benchmarks.control import suite as control
 from sideslip.benchmarks.control.cells import LEARNED, REFERENCE_FILTER, RUNGS, Cell, cells
-from sideslip.benchmarks.control.contests import YAW, Contest, contests
+from sideslip.benchmarks.control.contests import (
+    PARAMETERS,
+    STATE,
+    YAW,
+    Contest,
+    contests,
+    oracle_of,
+)
 from sideslip.benchmarks.control.episodes import Chunk
 from sideslip.benchmarks.control.run import CachedDrive, measure
 from sideslip.benchmarks.control.seeds import salt_of
@@ -73,6 +80,25 @@ def test_every_contest_has_its_rungs_and_no_cell_stands_twice() -> None:
         assert any(cell.controller == LEARNED[0][1] for cell in mine) == (contest.tier == "1")
     fast = list(cells(contests(), quick=True))
     assert set(fast) < set(all_) and not any(cell.slow and not cell.rung for cell in fast)
+
+
+def test_who_is_not_tuned_takes_over_what_means_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The oracles' plans are the adaptive controller's, which knows nearly as much."""
+    found = {
+        "nominal": {"filter": {"force_sd": 7.0}, "controller": {"grip": 0.4, "steer_weight": 3.0}},
+        "adaptive-nmpc": {"filter": {"force_sd": 9.0}, "controller": {"grip": 0.6, "horizon": 0.3}},
+    }
+    nothing: dict[str, Any] = {"filter": {}, "controller": {}}
+    monkeypatch.setattr(
+        "sideslip.benchmarks.control.cells.tuned", lambda _, name: found.get(name, nothing)
+    )
+    contest = next(each for each in contests() if oracle_of(each, PARAMETERS).endswith("nmpc"))
+    assert Cell(contest, "joint, friction", "adaptive-nmpc").best == found["adaptive-nmpc"]
+    lqr = Cell(contest, "joint", "adaptive-lqr").best
+    assert lqr == {"filter": {}, "controller": found["nominal"]["controller"]}
+    parameters, state = (Cell(contest, "", each).best for each in (PARAMETERS, STATE))
+    assert parameters == {"filter": {}, "controller": {"grip": 0.6, "horizon": 0.3}}
+    assert state == {"filter": {}, "controller": {"horizon": 0.3}}
 
 
 def test_truth_is_told_without_error() -> None:
