@@ -59,7 +59,7 @@ _TEXT = (
     "have to find the slide first; the two oracles know it, and the car. clairvoyant: whatever any "
     f"of them saves, or one of {len(BEGINNINGS)} tries with full moment to one side for 0.05 to "
     "1 s and an oracle from then on: of such pieces the run that just saves a car is made "
-    "(Pontryagin), so that this is nearly all that can be saved, and surely not more."
+    "(Pontryagin), so that this is a lower bound of what can be saved, and probably near it."
 )
 
 
@@ -131,8 +131,8 @@ def run(quick: bool = False, jobs: int | None = None, console: Console | None = 
     """The maps of every controller on both cars; quick: a coarse grid and few seeds."""
     points, seeds = (QUICK_POINTS, QUICK_SEEDS) if quick else (POINTS, SEEDS)
     cases = [Case(car, name, points, seeds) for car in CARS for name in CONTROLLERS]
-    some = [BEGINNINGS[k : k + _TRIES] for k in range(0, len(BEGINNINGS), _TRIES)]
-    cases += [Case(car, ORACLES[0], points, seeds, each) for car in CARS for each in some]
+    starts = [BEGINNINGS[k : k + _TRIES] for k in range(0, len(BEGINNINGS), _TRIES)]
+    cases += [Case(car, ORACLES[0], points, seeds, each) for car in CARS for each in starts]
     found = dict(zip(cases, run_cases(saved, cases, NAME, jobs, console), strict=True))
     suite = Suite(NAME, "From where the car is still saved", _TEXT)
     beta, gamma = (np.degrees(axis) for axis in grid(points))

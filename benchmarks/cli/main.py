@@ -40,7 +40,7 @@ app.command("train")(train_command)
 app.command("train-estimator")(train_estimator_command)
 console = Console()
 
-Quick = Annotated[bool, typer.Option("--quick", help="Few seeds: a first look in seconds.")]
+Quick = Annotated[bool, typer.Option("--quick", help="Few seeds: a first look in minutes.")]
 Json = Annotated[Path | None, typer.Option("--json", help="Write the rows as JSON.")]
 Parquet = Annotated[Path | None, typer.Option("--parquet", help="Write the rows as Parquet.")]
 Html = Annotated[Path | None, typer.Option("--html", help="Write a self-contained report.")]

@@ -90,7 +90,7 @@ def estimate_options(cell: Cell) -> dict[str, Any]:
             own = name == FILTER or cell.controller == ADAPTIVE.get(cell.estimator)
             options = levels | (cell.best["filter"] if own else {}) | options
             unused = set() if "gps" in options["slow"] else {"hdop_table"}
-            if "accel_y" not in options["fast"]:
+            if "accel_y" not in options.get("fast", ()):
                 unused |= {"accel_y_noise", "accel_bias_sd"}
             options = {key: value for key, value in options.items() if key not in unused}
         found["options"] = options

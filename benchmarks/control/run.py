@@ -20,7 +20,7 @@ from ..harness.parallel import run_cases
 from .cells import SLOW_EPISODES, Cell
 from .contests import Contest
 from .episodes import NUMBERS, SIGNALS, Chunk, Driven, drive
-from .seeds import Seeds
+from .seeds import Seeds, salt_of
 
 CHUNK = 64
 """Episodes of a case: a run of so many is found again by a longer one."""
@@ -112,8 +112,8 @@ class CachedDrive:
 
 @cache
 def sources() -> str:
-    """A hash of all files that an episode's numbers depend on."""
-    digest = hashlib.sha256(source_stamp("agents").encode())
+    """A hash of all files that an episode's numbers depend on, tuned options and weights too."""
+    digest = hashlib.sha256((source_stamp("agents") + salt_of()).encode())
     for name in (
         "build.py",
         "cells.py",

@@ -75,18 +75,27 @@ def add_reliability(suite: Suite, found: Sequence[Measured]) -> None:
     """Rows and a figure of the share of errors within an interval against its confidence, where
     nothing happens that `joint` cannot foresee.
 
-    found: of all `CONDITIONS`.
+    Conditions share their seeds, so each seed's share is its mean over them; of conditions with the
+    same drives the first one counts. found: of all `CONDITIONS`.
     """
     shares = dict[str, list[Estimate]]()
+    drives = {(what.env_id, repr(what.scenario)): what for what in reversed(CONDITIONS)}
     for saturating in (False, True):
         kind = "saturating tyres" if saturating else "linear tyres"
         mine = [
             (what, each)
             for what, each in zip(CONDITIONS, found, strict=True)
-            if what.foreseen and what.bounded != saturating and len(each.best)
+            if what.foreseen
+            and what.bounded != saturating
+            and len(each.best)
+            and what is drives[what.env_id, repr(what.scenario)]
         ]
         for label in ("joint", "exact-kf"):
-            inside = np.concatenate([each.of(label)[2] for _, each in mine])
+            by_seed = dict[int, list[Array]]()
+            for _, each in mine:
+                for seed, share in zip(each.seeds, each.of(label)[2], strict=True):
+                    by_seed.setdefault(seed, []).append(share)
+            inside = np.array([np.mean(each, axis=0) for each in by_seed.values()])
             line = [interval(column, mean) for column in inside.T]
             shares[f"{label}, {kind}"] = line
             here = columns_of(*mine[0]) | {"scenario": f"all with {kind}", "n": len(inside)}

@@ -28,10 +28,11 @@ _CHUNK = 16
 class Measured:
     """Of some seeds: mean squared errors and NEES (seeds, filters), mean squares of the bound
     (seeds,), NaN where there is none, and shares of the errors within `LEVELS` (seeds, filters,
-    levels). Episodes that ended early are left out.
+    levels). Episodes that ended early are left out, `seeds` are the others'.
     """
 
     labels: tuple[str, ...]
+    seeds: tuple[int, ...]
     squares: Array
     best: Array
     nees: Array
@@ -63,7 +64,8 @@ def _together(parts: Sequence[Measured]) -> Measured:
         for name in ("squares", "best", "nees", "inside")
     )
     left_out = sum(part.left_out for part in parts)
-    return Measured(parts[0].labels, squares, best, nees, inside, left_out)
+    seeds = tuple(seed for part in parts for seed in part.seeds)
+    return Measured(parts[0].labels, seeds, squares, best, nees, inside, left_out)
 
 
 def measure(case: tuple[Condition, Iterable[int]]) -> Measured:
@@ -72,13 +74,14 @@ def measure(case: tuple[Condition, Iterable[int]]) -> Measured:
     env: Any = gym.make(what.env_id, scenario=LINEAR | dict(what.scenario), control_period=10)
     filters, left_out = dict[str, Any](), 0
     labels = tuple(what.all_filters)
-    squares, nees, inside, best = (list[Any]() for _ in range(4))
+    squares, nees, inside, best, there = (list[Any]() for _ in range(5))
     for seed in seeds:
         driven = _drive(env, seed)
         if driven is None:
             left_out += 1
             continue
         log, cars = driven
+        there.append(seed)
         late = log.time >= what.since - 1e-9
         if not filters or TRUE in filters:  # else only clocks differ, and the log has them
             filters = _filters(what, env.unwrapped, log)
@@ -96,7 +99,9 @@ def measure(case: tuple[Condition, Iterable[int]]) -> Measured:
         )
     n = len(labels)
     table = np.reshape(squares, (-1, n)), np.array(best), np.reshape(nees, (-1, n))
-    return Measured(labels, *table, np.reshape(inside, (-1, n, len(LEVELS))), left_out)
+    return Measured(
+        labels, tuple(there), *table, np.reshape(inside, (-1, n, len(LEVELS))), left_out
+    )
 
 
 def _drive(env: Any, seed: int) -> tuple[Log, tuple[Vehicle, Vehicle]] | None:

@@ -26,9 +26,10 @@ def run(seeds: int = SEEDS, jobs: int | None = None, console: Console | None = N
     suite = Suite(
         NAME,
         "What does it cost not to know the tyres?",
-        "Root mean square error of the sideslip angle from 2 s on, over the bound that knows the "
-        "tyres: the optimal filter of the true linear car with its true disturbances, which knows "
-        "when tyres change, but not how strong a gust is. joint and exact-kf know the nominal car "
+        'Root mean square error of the sideslip angle from 2 s on (of "from the change on" '
+        "from 5 s), over the bound that knows the tyres: the optimal filter of the true linear "
+        "car with its true disturbances, which knows when tyres change, but not how "
+        "strong a gust is. joint and exact-kf know the nominal car "
         "and the data sheet's noise. NEES: the mean square of joint's error over its own "
         "deviation, 1 where that is honest. Where tyres saturate there is no such bound; the ratio "
         "is to exact-kf alone. 95 % bootstrap over seeds.",
@@ -58,8 +59,8 @@ def run(seeds: int = SEEDS, jobs: int | None = None, console: Console | None = N
             "joint, which assumes nominal tyres",
             (*head, *(f"in {100.0 * each:.0f} %" for each in COVERED)),
             lines,
-            "left out: episodes that end early, in which tyres as they were drawn make the car "
-            "unstable. in 50 %: share of the errors within the interval of that confidence.",
+            "left out: episodes that end early, in which tyres that saturate let the car "
+            "spin. in 50 %: share of the errors within the interval of that confidence.",
         ),
         parts_table(suite, parts),
     ]
@@ -84,7 +85,7 @@ def _answer(over: Mapping[str, Mapping[str, Estimate]], against: Mapping[str, Es
         against[f"from the change on, {each}"].value for each in ("four members", "one filter")
     )
     return verdict(
-        "A filter believes in the tyres of a data sheet; a real car's are 40 % softer or stiffer.",
+        "A filter believes in the tyres of a data sheet; a real car's are up to 40 % off.",
         f"joint, which estimates them, has {min(ours):.2f} to {max(ours):.2f} times the least "
         f"error (worst: {worst}).",
         f"exact-kf, which believes in the data sheet, {min(theirs):.1f} to {max(theirs):.1f}.",

@@ -4,7 +4,8 @@ Defined where the plant is linear (small-angle plant, linear tyres, speed held):
 has a smaller mean squared error than the filter that knows the vehicle, the noise and the
 disturbances' statistics. Deterministic wind and biases do not change it: it knows them. Tyres that
 change on the way, and a gust whose strength it does not know, make the model vary with time: the
-filter then knows when, which no real one does.
+filter then knows when, which no real one does. A gust's strength is not Gaussian: with it this is
+the least error of a linear estimator.
 """
 
 import warnings

@@ -87,10 +87,10 @@ class FilterConfig:
     levels: of joint, factors on force_sd and moment_sd, or pairs of one for each, which its members
         take in turn; the likeliest counts most (default (1,)).
     gate: a probability; a sample whose innovation is less likely than 1 - gate is skipped.
-    wary: with delay "clone" or "buffer", above 0 (default of all but joint): a packet that repeats
-        the last one while the car moves is skipped; the gate is 1 - 1e-9 where none is configured,
-        a sensor's first sample passes it, and after so many gated samples in a row that agree with
-        each other the filter begins anew with the sensor.
+    wary: 0 is off (default; joint and joint-robust have 10). Above, with delay "clone" or "buffer":
+        a packet that repeats the last one while the car moves is skipped; the gate is 1 - 1e-9
+        where none is configured, a sensor's first sample passes it, and after so many gated samples
+        in a row that agree with each other the filter begins anew with the sensor.
     adapt: share of a new innovation in an R that follows them (0: R as configured).
     force_sd (N), moment_sd (N m), disturbance_time (s): of disturbances that are forces.
     prior: standard deviations of states at the start, by state.

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.control import episodes
+from sideslip.benchmarks.control import episodes, run
 from sideslip.benchmarks.control.cells import Cell
 from sideslip.benchmarks.control.contests import Contest
 from sideslip.benchmarks.control.episodes import Chunk, Driven
@@ -88,3 +88,18 @@ def test_a_damaged_case_is_driven_again(
         assert found.series is not None and np.array_equal(found.series, series)
     assert len(driven) == 2
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_other_tuned_options_are_another_case(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The salt follows them, and a case's name the salt: a tuning makes old cases nobody's."""
+    drive = CachedDrive(tmp_path)
+    chunk = Chunk(Cell(Contest(scenario="gust"), "", "nominal"), SEEDS)
+    names = []
+    for salt in ("one", "another", "one"):
+        monkeypatch.setattr(run, "salt_of", lambda salt=salt: salt)
+        run.sources.cache_clear()
+        names.append(drive._path(chunk).name)
+    run.sources.cache_clear()
+    assert names[0] == names[2] != names[1]

@@ -25,6 +25,7 @@ from sideslip.benchmarks.control.episodes import Chunk
 from sideslip.benchmarks.control.run import CachedDrive, measure
 from sideslip.benchmarks.control.seeds import salt_of
 from sideslip.envs import COMS, FAILURES, SCENARIOS
+from sideslip.envs.scenarios.manoeuvres import scenario_from
 from sideslip.estimators import EstimateObservation
 
 SEEDS = (3, 4, 2**32 - 1)
@@ -80,6 +81,17 @@ def test_every_contest_has_its_rungs_and_no_cell_stands_twice() -> None:
         assert any(cell.controller == LEARNED[0][1] for cell in mine) == (contest.tier == "1")
     fast = list(cells(contests(), quick=True))
     assert set(fast) < set(all_) and not any(cell.slow and not cell.rung for cell in fast)
+
+
+@pytest.mark.parametrize("estimator", [REFERENCE_FILTER, "joint"])
+def test_a_filter_drives_a_car_that_does_not_roll(estimator: str) -> None:
+    """Its levels are the scenario's, which has no accelerometer then."""
+    contest = Contest(scenario="tie-vision-fig8")
+    assert not scenario_from("tie-vision-fig8").roll
+    options = build.estimate_options(Cell(contest, estimator, "lqr"))["options"]
+    assert "fast" not in options and "accel_y_noise" not in options
+    driven = drive.drive(Chunk(Cell(contest, estimator, "lqr"), (1,)))
+    assert not driven.error and np.isfinite(driven.costs).all()
 
 
 def test_who_is_not_tuned_takes_over_what_means_the_same(monkeypatch: pytest.MonkeyPatch) -> None:

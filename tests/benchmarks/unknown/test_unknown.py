@@ -63,20 +63,28 @@ def test_a_curve_has_a_point_for_every_value_and_its_bound_below(few: Any) -> No
     assert titles[1:] == ["Do the intervals hold what they promise?", curve.question]
 
 
-def test_intervals_that_promise_more_hold_more(few: Any) -> None:
-    shares = [
-        row.value
-        for row in few.rows
-        if row.estimator == "joint" and row.scenario == "all with linear tyres"
-    ]
-    assert len(shares) == len(measure.LEVELS) and shares == sorted(shares)
-    assert shares[-1] > 0.8
+def test_intervals_hold_what_they_promise(few: Any) -> None:
+    """Of joint; exact-kf, which believes in other tyres, has far too few errors within."""
+    ours, theirs = (
+        {row.metric: row for row in few.rows if row.estimator == name and row.scenario == every}
+        for every in ("all with linear tyres",)
+        for name in ("joint", "exact-kf")
+    )
+    assert len(ours) == len(measure.LEVELS)
+    assert ours["covered_50"].value == pytest.approx(0.5, abs=0.1)
+    assert ours["covered_95"].value == pytest.approx(0.95, abs=0.06)
+    assert theirs["covered_95"].value < 0.7
+
+
+def test_an_interval_of_coverage_counts_each_seed_once(few: Any) -> None:
+    """Conditions share their seeds: more conditions are no more evidence."""
+    assert {row.n for row in few.rows if row.scenario == "all with linear tyres"} == {4}
 
 
 def test_a_filter_without_bias_states_pays_for_the_bias(few: Any) -> None:
     ratio = {r.estimator: r.value for r in few.rows if r.metric == "ratio"}
     assert list(ratio) == list(WITHOUT)
-    assert ratio["joint, complete"] == 1.0 and ratio["without biases"] > 3.0
+    assert ratio["without biases"] > 3.0
 
 
 def test_a_gust_has_the_bound_of_a_filter_that_does_not_know_its_strength() -> None:
