@@ -18,8 +18,8 @@ import gymnasium as gym
 import numpy as np
 
 from ..envs.backend.rebuild import plain
+from ..envs.engine.config import EnvConfig
 from ..envs.record import PACKET_WIDTH, Array
-from ..envs.scenarios.scenario import Scenario
 from ..envs.scenarios.steering import wandering
 from ..envs.task.reference import REFERENCES
 from ..envs.ticks import TICK
@@ -42,6 +42,7 @@ _MAY = {
     "half_width", "camera_delays", "camera_jitter", "camera_loss", "camera_outage", "gps_period",
     "gps_delays", "gps_outage",
 }  # fmt: skip
+_ZERO = ("motor_lag", "steering_lag", "motor_power", "antenna_ahead", "antenna_left")
 _SILENT = {"accel": 1e4, "wheel": 100.0, "gps_speed": 100.0, "gps_position": 1e4}
 """Noise from which on a sensor that the filter does not read says nothing of the car."""
 
@@ -99,7 +100,7 @@ def plant_of(env: AnyEnv) -> Plant:
     """The linear plant of an env, single or vector; ValueError where its scenario is not linear."""
     config = configs_of(env)[0]
     scenario, n = config.scenario, int(config.control_period)
-    _check(scenario, config.base, config.reference, config.steering, n)
+    _check(config)
     car, speed = config.base.nominal, config.base.held_speed
     assert speed is not None
     kind = REFERENCES.index(config.reference)
@@ -127,8 +128,9 @@ def plant_of(env: AnyEnv) -> Plant:
     return Plant(model, W, rest, np.diag(sd**2), round(scenario.duration / (n * TICK)))
 
 
-def _check(scenario: Scenario, base: Any, reference: str, steers: bool, n: int) -> None:
+def _check(config: EnvConfig) -> None:
     """ValueError, naming what, where no optimum is known."""
+    scenario, base, period = config.scenario, config.base, int(config.control_period) * TICK
     own = {key: getattr(scenario, key) for key in _MUST}
     wrong = [f"{key} {value!r}" for key, value in own.items() if value != _MUST[key]]
     wrong += [key for key in scenario.to_dict() if key not in _MAY | set(_MUST)]
@@ -137,15 +139,17 @@ def _check(scenario: Scenario, base: Any, reference: str, steers: bool, n: int) 
         for name, least in _SILENT.items()
         if not scenario.noise.get(name, 0.0) >= least
     ]
-    if base.vehicle != base.nominal or base.vehicle.motor_lag or base.vehicle.steering_lag:
-        wrong.append("a car with lags or of unknown parameters")
+    wrong += [f"noise of {name}" for name in scenario.noise if name.endswith("_bias")]
+    car = base.vehicle
+    if car != base.nominal or any(getattr(car, name) for name in _ZERO):
+        wrong.append(f"a car of unknown parameters or with {', '.join(_ZERO)}")
     ranges = [scenario.range(name) for name in ("amplitude", "frequency", "hold")]
     if base.held_speed is None or any(low != high for low, high in ranges):
         wrong.append("quantities that are drawn")
-    if abs(ranges[2][0] - n * TICK) > 1e-9:
-        wrong.append(f"hold {ranges[2][0]:g} s at control periods of {n * TICK:g} s")
-    if reference != "zero-slip" or steers:
-        wrong.append("another task than the yaw moment's at zero slip")
+    if abs(ranges[2][0] - period) > 1e-9:
+        wrong.append(f"hold {ranges[2][0]:g} s at control periods of {period:g} s")
+    if config.reference != "zero-slip" or config.steering or config.vision == "image":
+        wrong.append("another task than zero slip by the yaw moment, or pictures")
     if wrong:
         raise ValueError(f"scenario {scenario.name!r} has no known optimum: {', '.join(wrong)}")
 
