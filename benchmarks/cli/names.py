@@ -18,6 +18,8 @@ _ENVIRONMENTS = {
     "YawGps": "GPS (course, speed, position) every 200 ms",
     "YawFusion": "the uneven camera and the GPS",
     "AfsYawFusion": "the same; the action may steer too",
+    "LinearYawVision": "the first on a linear car whose best policy is known",
+    "LinearYawGps": "the same with the GPS",
     "Highway": "camera and GPS on highway-env's roads; a driver swerves around one that brakes",
     "Outside": "camera and GPS around CommonRoad's single-track, drift and multi-body models",
 }

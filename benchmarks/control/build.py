@@ -28,6 +28,7 @@ from .contests import STEERING
 
 STEPS = 200  # of a decision's time
 
+_PUSHES = ("force_sd", "moment_sd")
 _DISTURBANCES = {"forces": ("F_d", "N_d"), "walk": ("d1", "d2"), "walk-all": ("d1", "d2")}
 
 
@@ -87,6 +88,8 @@ def estimate_options(cell: Cell) -> dict[str, Any]:
             options = options | {"slow": slow_sensors(cell.contest.env_id)}
         if name in (FILTER, CURVED):
             levels = levels_of(scenario_from(cell.env_options["scenario"]))
+            # where nothing pushes, the filter's own level
+            levels = {key: x for key, x in levels.items() if key not in _PUSHES or x > 0.0}
             own = name == FILTER or cell.controller == ADAPTIVE.get(cell.estimator)
             options = levels | (cell.best["filter"] if own else {}) | options
             unused = set() if "gps" in options["slow"] else {"hdop_table"}

@@ -49,7 +49,7 @@ SHARED = {
 its filter's levels are the scenario's."""
 SLOW_CONTROLLERS = ("mpc", "nmpc", "adaptive-nmpc", ORACLES[STATE][1], ORACLES[PARAMETERS][1])
 
-EPISODES, QUICK_EPISODES, SLOW_EPISODES = 1000, 8, 128
+EPISODES, QUICK_EPISODES, SLOW_EPISODES = 256, 8, 64
 QUICK_CONTESTS = 2
 """Of each tier, in a quick run."""
 

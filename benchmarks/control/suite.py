@@ -50,7 +50,7 @@ def run(
 ) -> Suite:
     """All tiers, the ladder, the price of delay, and pictures.
 
-    episodes: a cell (slow controllers have at most 128). keep: a folder in which finished cases
+    episodes: a cell (slow controllers have at most 64). keep: a folder in which finished cases
     stay, so that a run that was stopped goes on. quick: a few contests, without the slow
     contestants and the price of delay. clairvoyant: a file of `sideslip calibrate`, None: the
     package's, if there is one.

@@ -79,11 +79,12 @@ def test_recovery_names_who_saves_most_and_what_the_oracles_do() -> None:
     levels = {"none": 0.2, "two-dof": 0.3, "esc": 0.7, "lqr": 0.5}
     levels |= dict(zip(recovery.ORACLES, (0.8, 0.9), strict=True))
     cars = {"a car": {name: shares(level) for name, level in levels.items()}}
+    cars["a car"][recovery.CLAIRVOYANT] = np.full((5, 5, 8), 0.95)
     cars["another"] = cars["a car"] | {"lqr": cars["a car"]["esc"]}
     _, first, second, why, _ = fits(recovery.answer(cars))
     assert first == "a car: esc 70 %; lqr 50 %, none 20 %."
     assert second.startswith("another: esc and lqr 70 %; two-dof 30 %")
-    assert "save 90 % and 90 %" in why
+    assert "saves 90 % and 90 %, foresight too 95 % and 95 %" in why
     assert len(fits(recovery.answer({"a car": {"none": shares(0.1)}}))) == 2  # nothing driven
 
 
