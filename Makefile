@@ -23,7 +23,7 @@ help: ## list the targets
 bench: .venv/ready-bench ## compare estimators and controllers on few seeds; writes report.html and results.json (LOG=file adds a recorded drive)
 	$(BIN)/sideslip bench --quick --html report.html --json results.json $(if $(LOG),--log "$(LOG)")
 
-bench-full: .venv/ready-bench ## the same on all seeds: about two CPU-hours; goes on where it was stopped
+bench-full: .venv/ready-bench ## the same on all seeds, hours on two cores; goes on where it was stopped
 	$(BIN)/sideslip bench --html report.html --json results.json --keep .bench $(if $(LOG),--log "$(LOG)")
 
 test: .venv/ready-all ## the tests, the examples in docstrings, and the marked tests without compilation
