@@ -86,15 +86,18 @@ _LINEAR = {
         "gps_position": 1e4,
     },
 }
-_OPTIMA = {"Vision": -0.021510993, "Gps": -0.014128621}
+_OPTIMA = {
+    "sideslip/LinearYawVision-v0": ("vision", -0.021510993),
+    "sideslip/LinearYawGps-v0": ("gps", -0.014128621),
+}
 _ENVIRONMENTS |= {
-    f"sideslip/LinearYaw{name}-v0": {
-        "sensors": name.lower(),
+    _id: {
+        "sensors": _sensors,
         "reference": "zero-slip",
         "fast": "all",
         "scenario": _LINEAR,
     }
-    for name in _OPTIMA
+    for _id, (_sensors, _) in _OPTIMA.items()
 }
 
 # This file runs again under the checkout's own name (pytest) and in every worker process, so the
@@ -106,7 +109,7 @@ for _id, _kwargs in _ENVIRONMENTS.items():
             entry_point="sideslip.envs.stability:StabilityEnv",
             vector_entry_point="sideslip.envs.vector:StabilityVectorEnv",
             kwargs=_kwargs,
-            reward_threshold=_OPTIMA.get(_id[len("sideslip/LinearYaw") : -len("-v0")]),
+            reward_threshold=_OPTIMA[_id][1] if _id in _OPTIMA else None,
         )
 for _id, _entry in {
     "sideslip/Highway-v0": "sideslip.envs.highway.env:HighwayEnv",

@@ -62,8 +62,8 @@ def levels_of(scenario: Scenario) -> dict[str, Any]:
     }
     if scenario.roll:
         options["fast"] = ["gyro", "accel_y"]
-        options["accel_bias_sd"] = _spread(scenario, "accel_y_bias")
-    options |= {"bias_sd": _spread(scenario, "gyro_bias"), "bank_sd": _spread(scenario, "bank")}
+        options["accel_bias_sd"] = spread_of(scenario, "accel_y_bias")
+    options |= {"bias_sd": spread_of(scenario, "gyro_bias"), "bank_sd": spread_of(scenario, "bank")}
     return options | {option: noise[key] for key, option in _NOISE.items() if key in noise}
 
 
@@ -73,7 +73,7 @@ def without_biases(scenario: Scenario) -> Scenario:
     return scenario.replace(noise=noise, gyro_bias=0.0, accel_y_bias=0.0)
 
 
-def _spread(scenario: Scenario, name: str) -> float:
+def spread_of(scenario: Scenario, name: str) -> float:
     """Root mean square of a quantity that is drawn evenly from its range."""
     low, high = scenario.range(name)
     return math.sqrt((low * low + low * high + high * high) / 3.0)

@@ -4,10 +4,12 @@
 rows.json` writes the tiers' rows to docs/control.json and the table into README.md.
 """
 
-import argparse
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Annotated
+
+import typer
 
 from .control.cells import REFERENCE_CONTROLLER, REFERENCE_FILTER
 from .control.contests import NOMINAL, PARAMETERS, STATE
@@ -75,15 +77,13 @@ def put(text: str, made: str) -> str:
     return pattern.sub(lambda _: made + "\n", text)
 
 
-def main() -> None:
-    """The command line."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("rows", type=Path, help="of sideslip bench control --json")
-    rows = tier_rows(parser.parse_args().rows)
-    readme = put(README.read_text(encoding="utf-8"), table(rows))
-    write_json(ROWS, rows)
+def main(rows: Annotated[Path, typer.Argument(help="Of sideslip bench control --json.")]) -> None:
+    """Write the tiers' rows and the README's table, in the repository's root."""
+    found = tier_rows(rows)
+    readme = put(README.read_text(encoding="utf-8"), table(found))
+    write_json(ROWS, found)
     write_text(README, readme)
 
 
 if __name__ == "__main__":
-    main()
+    typer.run(main)

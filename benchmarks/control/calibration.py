@@ -20,13 +20,12 @@ from rich.console import Console
 
 from ... import __version__
 from ...envs.arguments import is_finite
-from ...envs.backend.cache import source_stamp
 from ..harness.parallel import run_cases
 from ..harness.results import made_of, read_objects, write_text
 from .cells import Cell
 from .contests import NOMINAL, STATE, Contest, oracle_of
 from .episodes import Array
-from .run import Results, measure
+from .run import Results, measure, sources
 from .scores import gains, survived
 
 FILE = Path(__file__).with_name("clairvoyant.json")
@@ -46,7 +45,7 @@ class Case:
     @property
     def path(self) -> Path:
         """The file of the finished case; other sources or another question give another name."""
-        asked = [asdict(self.contest), self.seed, source_stamp("agents"), __version__]
+        asked = [asdict(self.contest), self.seed, sources(), __version__]
         digest = hashlib.sha256(json.dumps(asked).encode()).hexdigest()
         return Path(self.folder) / f"{digest[:24]}.json"
 

@@ -10,6 +10,7 @@ from rich.console import Console
 from scipy.stats import norm
 
 from ...agents.rollout import steps_of
+from ...agents.rungs import spread_of
 from ...envs.record import Array, Log, Record, concatenate
 from ...envs.vehicle.vehicle import Vehicle
 from ...estimators.analysis.bound import Change, Gust, bound
@@ -146,9 +147,9 @@ def _bound(base: Any, log: Log, cars: tuple[Vehicle, Vehicle]) -> Array:
     if scene.tyre_change_time is not None:
         passing["change"] = Change(scene.tyre_change_time, cars[1])
     if scene.wind_force != 0.0:
-        low, high = scene.range("wind_force")
-        size = np.sqrt((low * low + low * high + high * high) / 3.0)
         end = scene.wind_start + scene.wind_length
-        passing["gust"] = Gust(size, scene.wind_arm, scene.wind_start, end)
+        passing["gust"] = Gust(
+            spread_of(scene, "wind_force"), scene.wind_arm, scene.wind_start, end
+        )
     facts = facts_of(base) | {"vehicle": cars[0]} | _levels(scene)
     return bound(record=log.record, **facts, **passing)

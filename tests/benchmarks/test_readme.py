@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from sideslip.benchmarks import readme
-from sideslip.benchmarks.control.contests import TITLES
+from sideslip.benchmarks.control.contests import STATE, TITLES
 from sideslip.benchmarks.harness.results import Row
 
 ROOT = Path(readme.__file__ or "").resolve().parents[1]
@@ -17,6 +17,8 @@ def test_the_table_in_the_readme_is_made_from_the_file() -> None:
     assert readme.put(text, readme.table(rows)) == text
     other = [replace(row, value=1.5 * row.value) for row in rows]
     assert readme.put(text, readme.table(other)) != text
+    kept = {row.scenario: row.n for row in rows if row.controller == STATE}
+    assert all(f" {n}" in text for n in kept.values()), kept  # what its prose says of the episodes
 
 
 def test_a_line_has_every_tier_with_cost_interval_and_failures() -> None:

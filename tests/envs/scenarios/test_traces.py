@@ -13,7 +13,7 @@ from sideslip.envs.device.env import DeviceVectorEnv
 from sideslip.envs.record import FAST
 from sideslip.envs.scenarios.traces import trace_from
 
-from ..helpers import bits
+from ..helpers import bits, drive_alike
 from ..recordings.drives import drive, saved
 
 VISION = "sideslip/YawVision-v0"
@@ -90,16 +90,7 @@ def test_rows_of_a_batch_are_the_environment_alone() -> None:
     rows: list[Any] = [TRACE, {"base": "slalom", "duration": 0.3}, longer, "car-iso-3888-1"] * 6
     together = gym.make_vec(VISION, len(rows), scenario=rows, control_period=7)
     alone = [StabilityEnv(scenario=each, control_period=7) for each in rows]
-    obs, _ = together.reset(seed=5)
-    over = np.zeros(len(rows), np.bool_)
-    assert bits(list(obs)) == bits([env.reset(seed=5 + i)[0] for i, env in enumerate(alone)])
-    for step in range(100):
-        action = np.random.default_rng(step).uniform(-1, 1, (len(rows), 1)).astype(np.float32)
-        obs, _, terminated, truncated, _ = together.step(action)
-        for i, env in enumerate(alone):
-            expected = env.reset()[0] if over[i] else env.step(action[i])[0]
-            assert bits(obs[i]) == bits(expected), (step, i)
-        over = terminated | truncated
+    drive_alike(together, alone, 100)
 
 
 def test_a_reset_option_may_bring_a_trace_and_take_it_away() -> None:

@@ -11,7 +11,7 @@ from sideslip.envs import StabilityEnv
 from sideslip.envs.device.env import DeviceVectorEnv
 from sideslip.envs.record import FAST
 
-from ..helpers import bits
+from ..helpers import bits, drive_alike
 
 WANDER: dict[str, Any] = {
     "steering": "wander",
@@ -61,16 +61,7 @@ def test_rows_of_a_batch_are_the_environment_alone() -> None:
     rows: list[Any] = [WANDER, {"base": "slalom", "duration": 0.3}, WANDER | {"hold": 0.05}] * 8
     together = gym.make_vec("sideslip/YawVision-v0", len(rows), scenario=rows, control_period=7)
     alone = [StabilityEnv(scenario=each, control_period=7) for each in rows]
-    obs, _ = together.reset(seed=5)
-    over = np.zeros(len(rows), np.bool_)
-    assert bits(list(obs)) == bits([env.reset(seed=5 + i)[0] for i, env in enumerate(alone)])
-    for step in range(90):
-        action = np.random.default_rng(step).uniform(-1, 1, (len(rows), 1)).astype(np.float32)
-        obs, _, terminated, truncated, _ = together.step(action)
-        for i, env in enumerate(alone):
-            expected = env.reset()[0] if over[i] else env.step(action[i])[0]
-            assert bits(obs[i]) == bits(expected), (step, i)
-        over = terminated | truncated
+    drive_alike(together, alone, 90)
 
 
 def test_a_forecast_knows_the_angles_and_a_device_refuses_them() -> None:
