@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from .agents.rollout import rollout
     from .estimators import make_estimator, register_estimator
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 __all__ = [
     "__version__",
     "make_agent",

@@ -12,7 +12,8 @@ from ...envs.task.cost import cost_rate
 from ...envs.task.reference import LAGGED, reference
 from ...envs.ticks import TICK
 from ...envs.vehicle.actuators import lagged, yaw_moment
-from ...envs.vehicle.dynamics import Motion, Push, rk4, sideslip_angle
+from ...envs.vehicle.dynamics import Motion, Push, sideslip_angle
+from ...envs.vehicle.integration import rk4
 from .foresight import Fixed, Known, State
 
 _rk4, _load_at, _torques = symbolic(rk4), symbolic(load_at), symbolic(torques)
@@ -65,7 +66,7 @@ def node_cost(fixed: Fixed, errors: tuple[Any, Any], known: Known) -> Any:
 
 
 def advance(fixed: Fixed, x: State, action: Any, known: Known) -> Step:
-    """One step of the plan: the env's own Runge-Kutta step over `fixed.ticks` ticks.
+    """One step of the plan: a Runge-Kutta step of the env's own plant over `fixed.ticks` ticks.
 
     action: shares of full scale, as the env takes them. The driver's acceleration is that of the
     step's start; added steering acts by its mean over the step.

@@ -14,7 +14,8 @@ from ...envs.backend.primitives import maximum, minimum, select
 from ...envs.engine.tick import load_at
 from ...envs.ticks import TICK
 from ...envs.vehicle.actuators import distribute, lagged, slewed, torque_limit, within_stop
-from ...envs.vehicle.dynamics import Motion, Push, rk4, sideslip_angle
+from ...envs.vehicle.dynamics import Motion, Push, sideslip_angle
+from ...envs.vehicle.integration import rk4
 from .prediction_model import Model, Start
 
 RESIDUALS = 6  # of a step: slip, yaw rate, moment and steering with the spread of each in the step

@@ -16,7 +16,8 @@ from scipy.stats import t as student
 
 from ...envs.backend.decorators import jit
 from ...envs.record import FAST, Array, Log
-from ...envs.vehicle.dynamics import Car, Motion, Push, Road, derivative, frame_of, rk4
+from ...envs.vehicle.dynamics import Car, Motion, Push, Road, derivative
+from ...envs.vehicle.integration import rk4
 from ...envs.vehicle.tyres import LINEAR, TYRE_LAWS, Inputs, load_of
 from ...envs.vehicle.vehicle import GRAVITY, Vehicle
 from .emulate import ground_speed
@@ -141,7 +142,7 @@ def _drive(
             motion = rk4(motion, loads, push, car, road, h, 0, law, roll)
             v_y, gamma, phi, phi_dot = motion.v_y, motion.gamma, motion.phi, motion.phi_dot
             motion = Motion(V, v_y, gamma, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, phi, phi_dot)
-            slope = derivative(motion, after, push, car, road, frame_of(motion), 0, law, roll)
+            slope = derivative(motion, after, push, car, road, 0, law, roll)
             out[0, w, k], out[1, w, k] = gamma, slope.v_y + V * gamma + GRAVITY * phi
 
 

@@ -1,7 +1,7 @@
 """Cost of a tick of the plant alone: ours, and the same in C.
 
 A tick is a millisecond of one car of `YawFusion-v0`: actuators that lag, the loads at the tick's
-middle and end, Fiala tyres, roll, and Runge-Kutta's four stages; no sensors, no driver.
+middle and end, Fiala tyres, roll, and Kutta's three stages; no sensors, no driver.
 """
 
 from collections.abc import Callable
@@ -17,7 +17,8 @@ from ...envs.backend.simd import LANES
 from ...envs.engine.layout import P, Z
 from ...envs.ticks import TICK
 from ...envs.vehicle.actuators import lagged
-from ...envs.vehicle.dynamics import Car, Motion, Push, Road, rk4
+from ...envs.vehicle.dynamics import Car, Motion, Push, Road
+from ...envs.vehicle.integration import kutta3
 from ...envs.vehicle.tyres import FIALA, Inputs, load_of, shifts
 from ..harness.results import Suite
 from .c_plant import c_plant
@@ -108,7 +109,7 @@ def tick(
     )
     shifting = shifts(0, FIALA, 1)
     middle, last = load_of(between, car, 0, shifting), load_of(acting, car, 0, shifting)
-    return last, rk4(motion, (first, middle, last), push, car, road, TICK, 0, FIALA, 1), acting
+    return last, kutta3(motion, (first, middle, last), push, car, road, TICK, 0, FIALA, 1), acting
 
 
 @jit
@@ -175,7 +176,7 @@ def add(suite: Suite, effort: Effort) -> tuple[dict[str, Taken], dict[str, str]]
     field.add(OURS, lambda: _many(ours, cars))
     field.add(C, lambda: _many(in_c(), cars))
     note = (
-        f"One car, one millisecond: lag, load, Fiala tyres, roll, Runge-Kutta; {CARS} cars at "
+        f"One car, one millisecond: lag, load, Fiala tyres, roll, Kutta's rule; {CARS} cars at "
         "once. The C is the same text in blocks of as many cars, compiled on the spot "
         "(-O3 -march=native, no fused multiply-add), with the same numbers."
     )

@@ -19,7 +19,8 @@ from ..task.cost import cost_rate
 from ..task.reference import followed, reference
 from ..ticks import TICK
 from ..vehicle.actuators import distribute, lagged, slewed, torque_limit, within_stop, yaw_moment
-from ..vehicle.dynamics import Car, Push, Road, curvature_beside, rk4, sideslip_angle
+from ..vehicle.dynamics import Car, Push, Road, curvature_beside, sideslip_angle
+from ..vehicle.integration import kutta3
 from ..vehicle.tyres import Inputs, load_of
 from .layout import Drive
 
@@ -292,7 +293,7 @@ def advance(
     control = command(fixed, N_z, turn, now, tick, chance)
     loads = _loads(fixed, control, now, kind)
     before, car, road = now.motion, now.car, fixed.road
-    motion = rk4(before, loads, control.push, car, road, TICK, small_angle, law, roll)
+    motion = kutta3(before, loads, control.push, car, road, TICK, small_angle, law, roll)
     accel = specific_force(before, motion, road, small_angle, roll)
     driver, seen = sense(fixed, motion, accel, control.acted, now.refs, ahead, chance, kind)
     return Moving(motion, control.drive, loads[2], driver, car, seen.refs, lead), seen

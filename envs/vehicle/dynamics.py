@@ -123,32 +123,14 @@ class Push(NamedTuple):
     N_x: Any = 0.0  # N m, roll moment on the body
 
 
-class Frame(NamedTuple):
-    """The headings at the start of a tick; within the tick they turn by a small angle."""
+class Velocity(NamedTuple):
+    """The part of a Motion that forces change, and that forces depend on."""
 
-    psi: Any
-    theta: Any
-    sin_t: Any  # of the road's direction
-    cos_t: Any
-    sin_r: Any  # of the heading relative to the road
-    cos_r: Any
-
-
-@jit
-def frame_of(motion: Any) -> Any:
-    """The Frame of a Motion."""
-    sin_t, cos_t = sincos(motion.theta)
-    sin_r, cos_r = sincos(motion.psi - motion.theta)
-    return Frame(motion.psi, motion.theta, sin_t, cos_t, sin_r, cos_r)
-
-
-@jit
-def _turned(sine: Any, cosine: Any, angle: Any) -> Any:
-    """(sin, cos) after a further turn by a small angle; error below 1e-13 for 0.02 rad."""
-    z = angle * angle
-    s = angle * (1.0 - z * (1.0 / 6.0 - z * (1.0 / 120.0)))
-    c = 1.0 - z * (0.5 - z * (1.0 / 24.0 - z * (1.0 / 720.0)))
-    return sine * c + cosine * s, cosine * c - sine * s
+    v_x: Any
+    v_y: Any
+    gamma: Any
+    phi: Any
+    phi_dot: Any
 
 
 @inlined
@@ -163,128 +145,69 @@ def _roll_acceleration(motion: Any, F_y: Any, N_x: Any, car: Any, per_m: Any) ->
 
 
 @inlined
+def rates(
+    now: Any, load: Any, push: Any, car: Any, gravity: Any, small_angle: int, law: int, roll: int
+) -> Any:
+    """d(now)/dt as a Velocity. gravity: (x, y) in m/s2 of `gravity_felt`."""
+    per_m, per_I = 1.0 / car.m, 1.0 / car.I
+    v_x, v_y, gamma = now.v_x, now.v_y, now.gamma
+    g_x, g_y = gravity
+    F_yf, F_yr, F_x, N_z = tyre_forces(now, load, car, g_y, small_angle, law, roll)
+    F_yc = F_yf if small_angle else F_yf * load.cos_d
+    F_y = F_yc + F_yr + push.F_d
+    phi_dot, phi_ddot = 0.0, 0.0
+    if roll:
+        phi_dot = now.phi_dot
+        phi_ddot = _roll_acceleration(now, F_y, push.N_x, car, per_m)
+        F_y = F_y + car.S * phi_ddot  # double-layer-gps (1)
+    if not small_angle:
+        F_x = F_x - F_yf * load.sin_d
+    dv_x = F_x * per_m - g_x
+    if roll or not small_angle:
+        dv_x = dv_x + v_y * gamma  # double-layer-gps (4)
+    dv_y = F_y * per_m - v_x * gamma - g_y  # tie-vision (1)
+    dgamma = (car.l_f * F_yc - car.l_r * F_yr + N_z + push.N_d) * per_I  # (2)
+    return Velocity(dv_x, dv_y, dgamma, phi_dot, phi_ddot)
+
+
+@inlined
+def course(motion: Any, v_x: Any, v_y: Any, road: Any, small_angle: int) -> Any:
+    """(dX, dY, ds, dy, dtheta)/dt at a Motion's place and heading, with these velocities."""
+    kappa = curvature_at(road, motion.s)
+    if small_angle:
+        dY = v_x * motion.psi + v_y  # tie-vision (5), V_x (psi + beta)
+        dy = v_x * (motion.psi - motion.theta) + v_y
+        return v_x, dY, v_x, dy, v_x * kappa + road.turn
+    sin_t, cos_t = sincos(motion.theta)
+    sin_r, cos_r = sincos(motion.psi - motion.theta)
+    along = v_x * cos_r - v_y * sin_r  # in road axes
+    across = v_x * sin_r + v_y * cos_r
+    ds = along
+    if anywhere(road.curvature != 0.0):
+        ds = along / maximum(1.0 - kappa * motion.y, 0.1)
+    dX = along * cos_t - across * sin_t
+    dY = along * sin_t + across * cos_t
+    return dX, dY, ds, across, ds * kappa + road.turn
+
+
+@inlined
 def derivative(
     motion: Any,
     load: Any,
     push: Any,
     car: Any,
     road: Any,
-    frame: Any,
     small_angle: int,
     law: int,
     roll: int = 0,
 ) -> Any:
-    """d(motion)/dt as a Motion; `frame` is that of the tick's start (`frame_of`)."""
-    per_m, per_I = 1.0 / car.m, 1.0 / car.I
-    v_x, v_y, gamma = motion.v_x, motion.v_y, motion.gamma
-    kappa = curvature_at(road, motion.s)
-    phi_dot, phi_ddot = 0.0, 0.0
-    if small_angle:
-        g_x, g_y = gravity_felt(road, motion.s, 0.0, 1.0)
-        F_yf, F_yr, F_x, N_z = tyre_forces(motion, load, car, g_y, 1, law, roll)
-        F_y = F_yf + F_yr + push.F_d
-        dv_x = F_x * per_m - g_x
-        if roll:
-            dv_x = dv_x + v_y * gamma  # double-layer-gps (4)
-            phi_dot = motion.phi_dot
-            phi_ddot = _roll_acceleration(motion, F_y, push.N_x, car, per_m)
-            F_y = F_y + car.S * phi_ddot  # double-layer-gps (1)
-        dv_y = F_y * per_m - v_x * gamma - g_y  # tie-vision (1)
-        dgamma = (car.l_f * F_yf - car.l_r * F_yr + N_z + push.N_d) * per_I  # (2)
-        dY = v_x * motion.psi + v_y  # tie-vision (5), V_x (psi + beta)
-        dy = v_x * (motion.psi - motion.theta) + v_y
-        turns = v_x * kappa + road.turn
-        return Motion(dv_x, dv_y, dgamma, gamma, v_x, dY, v_x, dy, turns, phi_dot, phi_ddot)
-    turn, g_x, g_y = 0.0, 0.0, 0.0
-    s_t, c_t = frame.sin_t, frame.cos_t
-    if anywhere(road.curvature != 0.0) or anywhere(road.turn != 0.0):
-        turn = motion.theta - frame.theta
-        s_t, c_t = _turned(s_t, c_t, turn)
-    s_r, c_r = _turned(frame.sin_r, frame.cos_r, motion.psi - frame.psi - turn)
-    if anywhere((road.across != 0.0) | (road.along != 0.0)):
-        g_x, g_y = gravity_felt(road, motion.s, s_r, c_r)
-    F_yf, F_yr, F_x, N_z = tyre_forces(motion, load, car, g_y, 0, law, roll)
-    F_yc = F_yf * load.cos_d
-    F_y = F_yc + F_yr + push.F_d
-    if roll:
-        phi_dot = motion.phi_dot
-        phi_ddot = _roll_acceleration(motion, F_y, push.N_x, car, per_m)
-        F_y = F_y + car.S * phi_ddot  # double-layer-gps (1)
-    dv_x = (F_x - F_yf * load.sin_d) * per_m + v_y * gamma - g_x
-    dv_y = F_y * per_m - v_x * gamma - g_y
-    dgamma = (car.l_f * F_yc - car.l_r * F_yr + N_z + push.N_d) * per_I
-    along = v_x * c_r - v_y * s_r  # in road axes
-    across = v_x * s_r + v_y * c_r
-    ds = along
-    if anywhere(road.curvature != 0.0):
-        ds = along / maximum(1.0 - kappa * motion.y, 0.1)
-    dX = along * c_t - across * s_t
-    dY = along * s_t + across * c_t
-    turns = ds * kappa + road.turn
-    return Motion(dv_x, dv_y, dgamma, gamma, dX, dY, ds, across, turns, phi_dot, phi_ddot)
-
-
-@jit
-def _ahead(motion: Any, h: Any, d: Any) -> Any:
-    """motion + h d, written out so that it compiles for every number type."""
+    """d(motion)/dt as a Motion."""
+    gravity = gravity_at(motion, road, small_angle)
+    rate = rates(motion, load, push, car, gravity, small_angle, law, roll)
+    dX, dY, ds, dy, turns = course(motion, motion.v_x, motion.v_y, road, small_angle)
     return Motion(
-        motion.v_x + h * d.v_x,
-        motion.v_y + h * d.v_y,
-        motion.gamma + h * d.gamma,
-        motion.psi + h * d.psi,
-        motion.X + h * d.X,
-        motion.Y + h * d.Y,
-        motion.s + h * d.s,
-        motion.y + h * d.y,
-        motion.theta + h * d.theta,
-        motion.phi + h * d.phi,
-        motion.phi_dot + h * d.phi_dot,
-    )
-
-
-@jit
-def _weighted(a: Any, b: Any, c: Any, d: Any) -> Any:
-    return (a + 2.0 * (b + c) + d) * (1.0 / 6.0)
-
-
-@inlined
-def rk4(
-    motion: Any,
-    load: tuple[Any, Any, Any],
-    push: Any,
-    car: Any,
-    road: Any,
-    h: Any,
-    small_angle: int,
-    law: int,
-    roll: int = 0,
-) -> Any:
-    """One step of h seconds of the classical Runge-Kutta method.
-
-    load: the Load at the start, the middle and the end of the step.
-    """
-    frame = frame_of(motion)
-    half = 0.5 * h
-    a = derivative(motion, load[0], push, car, road, frame, small_angle, law, roll)
-    middle = _ahead(motion, half, a)
-    b = derivative(middle, load[1], push, car, road, frame, small_angle, law, roll)
-    middle = _ahead(motion, half, b)
-    c = derivative(middle, load[1], push, car, road, frame, small_angle, law, roll)
-    d = derivative(_ahead(motion, h, c), load[2], push, car, road, frame, small_angle, law, roll)
-    slope = Motion(
-        _weighted(a.v_x, b.v_x, c.v_x, d.v_x),
-        _weighted(a.v_y, b.v_y, c.v_y, d.v_y),
-        _weighted(a.gamma, b.gamma, c.gamma, d.gamma),
-        _weighted(a.psi, b.psi, c.psi, d.psi),
-        _weighted(a.X, b.X, c.X, d.X),
-        _weighted(a.Y, b.Y, c.Y, d.Y),
-        _weighted(a.s, b.s, c.s, d.s),
-        _weighted(a.y, b.y, c.y, d.y),
-        _weighted(a.theta, b.theta, c.theta, d.theta),
-        _weighted(a.phi, b.phi, c.phi, d.phi),
-        _weighted(a.phi_dot, b.phi_dot, c.phi_dot, d.phi_dot),
-    )
-    return _ahead(motion, h, slope)
+        rate.v_x, rate.v_y, rate.gamma, motion.gamma, dX, dY, ds, dy, turns, rate.phi, rate.phi_dot
+    )  # fmt: skip
 
 
 @jit

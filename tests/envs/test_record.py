@@ -19,7 +19,8 @@ from sideslip.envs.record import (
 )
 from sideslip.envs.sensors.slow import SLOW, VALUES
 from sideslip.envs.ticks import TICK
-from sideslip.envs.vehicle.dynamics import Motion, Push, Road, rk4
+from sideslip.envs.vehicle.dynamics import Motion, Push, Road
+from sideslip.envs.vehicle.integration import kutta3
 from sideslip.envs.vehicle.tyres import LINEAR as LINEAR_TYRES
 from sideslip.envs.vehicle.tyres import Inputs, load_of
 
@@ -87,7 +88,7 @@ def test_inputs_of_the_rows_and_the_wind_replay_the_drive_bit_for_bit() -> None:
             load = load_of(inputs, car, 1)
             blows = 100 < tick <= 250  # it acts from tick 100 to tick 250
             push = Push(200.0, 0.2 * 200.0) if blows else Push(0.0, 0.0)
-            state = rk4(state, (load, load, load), push, car, road, TICK, 1, LINEAR_TYRES)
+            state = kutta3(state, (load, load, load), push, car, road, TICK, 1, LINEAR_TYRES)
         assert (state.gamma, state.psi) == (moment.info["gamma"], moment.info["psi"])
     truth = env.get_state()["state"][[*Z.motion]]
     assert bits(np.array(state)) == bits(truth)

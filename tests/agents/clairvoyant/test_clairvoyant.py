@@ -39,7 +39,8 @@ def make(
 @pytest.mark.parametrize("small_angle", [False, True])
 @pytest.mark.parametrize("scenario", ["lane-change", "gust"])
 def test_a_symbolic_tick_is_the_envs(scenario: str, small_angle: bool, lags: bool) -> None:
-    """From each state of a hard run in the env, one step of the plan's plant is the env's tick."""
+    """From each state of a hard run in the env, one step of the plan's plant, by a rule of one
+    order more, is the env's tick."""
     changes: dict[str, Any] = {
         "small_angle": small_angle,
         "lags": lags,
@@ -57,7 +58,7 @@ def test_a_symbolic_tick_is_the_envs(scenario: str, small_angle: bool, lags: boo
     run = drive(env, 2, actions).trajectory
     for k in range(200):
         after = tick(run.states[k], run.actions[k], forecast.known[:, k]).full()[:, 0]
-        np.testing.assert_allclose(after, run.states[k + 1], rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(after, run.states[k + 1], rtol=1e-9, atol=2e-8)
 
 
 @pytest.mark.parametrize(
@@ -94,7 +95,7 @@ def test_a_symbolic_tick_is_the_envs_where_the_road_the_tyres_or_the_driver_act(
     run = drive(env, 2, actions).trajectory
     for k in range(200):
         after = tick(run.states[k], run.actions[k], forecast.known[:, k]).full()[:, 0]
-        np.testing.assert_allclose(after, run.states[k + 1], rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(after, run.states[k + 1], rtol=1e-9, atol=2e-8)
 
 
 def test_the_forecast_is_what_the_car_meets() -> None:

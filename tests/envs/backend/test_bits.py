@@ -16,7 +16,7 @@ from sideslip.envs.engine import step as kernel
 from sideslip.envs.engine.packing import car_of
 from sideslip.envs.scenarios import steering as programme
 from sideslip.envs.ticks import FOREVER
-from sideslip.envs.vehicle import dynamics, tyres
+from sideslip.envs.vehicle import dynamics, integration, tyres
 from sideslip.envs.vehicle.dynamics import Motion, Push, Road
 from sideslip.envs.vehicle.tyres import TYRE_LAWS, Inputs
 
@@ -70,17 +70,18 @@ def test_plant(car: str, small_angle: int, law: int, roll: int) -> None:
     def load_of(function: Any, inputs: Any) -> Any:
         return function(inputs, CARS[car], small_angle)
 
-    def derivative(function: Any, motion: Any, load: Any, frame: Any) -> Any:
-        return function(motion, load, PUSH, CARS[car], ROAD, frame, small_angle, law, roll)
+    def derivative(function: Any, motion: Any, load: Any) -> Any:
+        return function(motion, load, PUSH, CARS[car], ROAD, small_angle, law, roll)
 
-    def rk4(function: Any, motion: Any, a: Any, b: Any, c: Any) -> Any:
+    def step(function: Any, motion: Any, a: Any, b: Any, c: Any) -> Any:
         return function(motion, (a, b, c), PUSH, CARS[car], ROAD, 1e-3, small_angle, law, roll)
 
     state = motions()
     load = agree(tyres.load_of, [inputs()], load_of)
-    frames = agree(dynamics.frame_of, [state], lambda function, motion: function(motion))
-    agree(dynamics.derivative, [state, load, frames], derivative)
-    agree(dynamics.rk4, [state, load, load[1:] + load[:1], load[2:] + load[:2]], rk4)
+    agree(dynamics.derivative, [state, load], derivative)
+    loads = [load, load[1:] + load[:1], load[2:] + load[:2]]
+    for rule in (integration.kutta3, integration.rk4):
+        agree(rule, [state, *loads], step)
 
 
 @pytest.mark.parametrize("small_angle", [0, 1])

@@ -14,7 +14,8 @@ from sideslip.envs import FAILURES
 from sideslip.envs.backend.arrays import read
 from sideslip.envs.engine.layout import Z
 from sideslip.envs.sensors.inertial import specific_force
-from sideslip.envs.vehicle.dynamics import Car, Motion, Push, Road, rk4
+from sideslip.envs.vehicle.dynamics import Car, Motion, Push, Road
+from sideslip.envs.vehicle.integration import kutta3
 from sideslip.envs.vehicle.tyres import FIALA, Inputs, load_of
 from sideslip.estimators import EstimateObservation
 
@@ -89,7 +90,7 @@ class OwnPlant(OutsidePlant):
         car = self.car._replace(mu=self.p.tire.p_dy1, mu_r=self.p.tire.p_dy1)
         load = load_of(Inputs(*acting[:3]), car, 0, 1)
         before, push, road = self.motion, Push(*acting[3:]), Road(0.0, 0.0, 1.0)
-        after = rk4(before, (load, load, load), push, car, road, h, 0, FIALA, 1)
+        after = kutta3(before, (load, load, load), push, car, road, h, 0, FIALA, 1)
         self.specific_force = specific_force(before, after, road, 0, 1)
         self.x = np.array(after)
 

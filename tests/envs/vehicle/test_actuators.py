@@ -166,8 +166,8 @@ def test_without_a_lag_the_torque_acts_at_once(lags: dict[str, float]) -> None:
     assert moment.record.fast[0, FAST.torque_right] == pytest.approx(100.0, rel=1e-15)
     _, H = bicycle(COMS, 25.0 / 3.6).discrete(TICK)
     exact = H[1, 1] * COMS.yaw_moment_limit
-    # Runge-Kutta's error: (12.7 / s x 1 ms)^4 / 120 = 2e-10 of it; a late torque misses a sixth
-    assert moment.info["gamma"] == pytest.approx(exact, rel=3e-10)
+    # Kutta's error: (14 / s x 1 ms)^3 / 24 = 1.14e-7 of it; a late torque misses a sixth
+    assert moment.info["gamma"] == pytest.approx(exact, rel=1.2e-7)
 
 
 def test_lags_false_is_the_vehicle_without_lags() -> None:

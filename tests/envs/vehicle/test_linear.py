@@ -14,7 +14,7 @@ from sideslip.envs.sensors.camera import camera_sample
 from sideslip.envs.sensors.gps import gps_sample
 from sideslip.envs.sensors.noise import Noise
 from sideslip.envs.task.reference import target_of
-from sideslip.envs.vehicle.dynamics import Motion, Push, Road, derivative, frame_of
+from sideslip.envs.vehicle.dynamics import Motion, Push, Road, derivative
 from sideslip.envs.vehicle.linear import (
     LinearModel,
     bicycle,
@@ -55,7 +55,7 @@ def seen(
     state = Motion(v_x, v_y, gamma, psi, 0.0, 0.0, 0.0, y_l - l_pre * psi + bend, 0.0)
     T = 0.5 * N_z * car.r / (0.5 * car.d_r)
     load = load_of(Inputs(delta_f, -T, T), car, small_angle)
-    rate = derivative(state, load, Push(0.0, 0.0), car, road, frame_of(state), small_angle, LINEAR)
+    rate = derivative(state, load, Push(0.0, 0.0), car, road, small_angle, LINEAR)
     if small_angle:  # the held speed: tie-vision (1)
         dbeta = rate.v_y / v
     else:
@@ -202,7 +202,7 @@ def second_layer(x: Any, u: Any, gamma: float, vehicle: Vehicle) -> Any:
     T = 0.5 * car.r * u[0]
     load = load_of(Inputs(0.0, T, T), car, 1)
     road, push = Road(0.0, 0.0, 1.0), Push(u[1], 0.0)
-    rate = derivative(state, load, push, car, road, frame_of(state), 1, LINEAR, 1)
+    rate = derivative(state, load, push, car, road, 1, LINEAR, 1)
     a_x = rate.v_x - gamma * x[1]  # double-layer-gps (4)
     a_y = rate.v_y + gamma * x[0] + 9.81 * x[2]  # (5)
     return np.array([rate.v_x, rate.v_y, rate.phi, rate.phi_dot, a_x, a_y])

@@ -10,7 +10,7 @@ import pytest
 from sideslip.envs import COMS, PASSENGER_CAR
 from sideslip.envs.engine.packing import car_of
 from sideslip.envs.scenarios.manoeuvres import scenario_from
-from sideslip.envs.vehicle.dynamics import Motion, Push, Road, derivative, frame_of
+from sideslip.envs.vehicle.dynamics import Motion, Push, Road, derivative
 from sideslip.envs.vehicle.tyres import LINEAR, Inputs, load_of
 from sideslip.envs.vehicle.vehicle import GRAVITY
 from sideslip.estimators import EstimateObservation, make_estimator, vector
@@ -29,9 +29,7 @@ def slope(x: Any, steer: float, F_d: float, vehicle: Any, V: float) -> Any:
     car = car_of(vehicle)
     at = Motion(V, V * beta, gamma, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, phi, phi_rate)
     load = load_of(Inputs(steer, 0.0, 0.0), car, 1)
-    rate = derivative(
-        at, load, Push(F_d, 0.0), car, Road(0.0, 0.0, 1.0), frame_of(at), 1, LINEAR, 1
-    )
+    rate = derivative(at, load, Push(F_d, 0.0), car, Road(0.0, 0.0, 1.0), 1, LINEAR, 1)
     a_y = rate.v_y + V * gamma + GRAVITY * phi
     return np.array([rate.v_y / V, rate.gamma, rate.phi, rate.phi_dot, a_y])
 
