@@ -40,8 +40,7 @@ LEARNED: tuple[tuple[str, str], ...] = (("", "ppo-yaw-vision"),)
 """(estimator, policy), a policy by its shipped name or path; in tier 1, whose car it knows. One
 that was trained on fewer sensors reads what it knows by name."""
 SHARED = {
-    "adaptive-lqr": (NOMINAL, {"grip", "disturbance_time", "steer_weight"}),
-    ORACLES[PARAMETERS][0]: (NOMINAL, {"grip", "steer_weight"}),
+    ORACLES[PARAMETERS][0]: ("adaptive-lqr", {"grip", "steer_weight"}),
     ORACLES[PARAMETERS][1]: ("adaptive-nmpc", {"horizon", "grip", "steer_weight"}),
     ORACLES[STATE][1]: ("adaptive-nmpc", {"horizon", "steer_weight"}),
 }
