@@ -10,6 +10,7 @@ import numpy.typing as npt
 from gymnasium.error import ResetNeeded
 
 from .arguments import action_of
+from .backend.decorators import entry_of
 from .engine.arrays import Row
 from .engine.config import EnvConfig
 from .engine.layout import FLAGS, PARAMS_WIDTH, STATE_WIDTH, Z
@@ -30,6 +31,8 @@ from .vehicle.dynamics import Motion
 from .vehicle.vehicle import Vehicle
 from .vehicle.vehicles import VehicleSource, vehicle_from
 from .vision import Seeing
+
+_STEP: list[Any] = []  # `step_vehicle` for the types of an env's arrays, once one has stepped
 
 
 class StabilityEnv(Seeing, DrawnOne, gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
@@ -185,7 +188,7 @@ class StabilityEnv(Seeing, DrawnOne, gym.Env[npt.NDArray[np.float32], npt.NDArra
 
     def _advance(self, force: npt.NDArray[np.float32], obs: npt.NDArray[np.float32]) -> int:
         """One control period; what `step_vehicle` returns."""
-        return step_vehicle(
+        arguments = (
             self._params,
             self._state,
             self._switches,
@@ -198,6 +201,10 @@ class StabilityEnv(Seeing, DrawnOne, gym.Env[npt.NDArray[np.float32], npt.NDArra
             self._bounds,
             self._window,
         )
+        if not _STEP:
+            _STEP.append(entry_of(step_vehicle, *arguments))
+        done: int = _STEP[0](*arguments)
+        return done
 
     def _row(self, obs: npt.NDArray[np.float32]) -> Row:
         """The arrays of this episode."""
@@ -287,7 +294,7 @@ class StabilityEnv(Seeing, DrawnOne, gym.Env[npt.NDArray[np.float32], npt.NDArra
             )
         if snapshot["layout"] != self.layout:
             raise ValueError("the snapshot is of an env with other sensors or another observation")
-        self._params = np.array(snapshot["params"])
+        self._params = np.array(snapshot["params"], np.float64)
         self._state[:] = snapshot["state"]
         self._switches[:] = snapshot["switches"]
         self._now = snapshot["config"]

@@ -54,6 +54,15 @@ def apart(function: F) -> F:
     return _compiled(function, apart=True)
 
 
+def entry_of(function: F, *arguments: Any) -> F:
+    """A compiled function for arguments of these types and no others: numba looks at the types of
+    what it is called with, which takes as long as a hundred lines of what it compiled."""
+    compiled: Any = function
+    if config.DISABLE_JIT:
+        return function
+    return cast(F, compiled.compile(tuple(map(numba.typeof, arguments))))
+
+
 def _compiled(function: F, apart: bool = False, **more: bool) -> F:
     if config.DISABLE_JIT:
         return function
