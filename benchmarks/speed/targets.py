@@ -44,7 +44,7 @@ TARGETS = (
         "full-covariance filter in the loop, 1024 at once, Pendulum over ours",
         env_steps.PENDULUMS,
         env_steps.FILTERED,
-        2.5,
+        4.5,
     ),
     Target("learned env-step, PPO on Pendulum over ours", learning.PENDULUM, learning.OURS, 15.0),
     Target(first_use.FIRST, "", first_use.FIRST, most=0.5),

@@ -7,6 +7,9 @@ that go with it. Single numbers mix with lanes as they do with arrays. The arith
 single numbers, in the order written and without fused operations: a lane holds the very bits that
 the number alone would have. Sixteen are two of AVX-512's registers: while one waits for a result
 the other is computed, a third faster than eight. Narrower machines take more of theirs.
+
+Eight neighbours of a matrix's row are a type of their own, `EIGHT`: with it the sums of one
+filter's small matrices are taken for eight columns at once, in the order of each column alone.
 """
 
 import operator
@@ -28,8 +31,10 @@ _DOUBLE, _LONG, _BIT = ir.DoubleType(), ir.IntType(64), ir.IntType(1)
 class Lanes(types.Type):
     """As many of a kind: "float", "int" or "bool"."""
 
-    def __init__(self, kind: str, one: Any, single: Any, taken: tuple[Any, ...]) -> None:
-        self.value = ir.VectorType(one, LANES)
+    def __init__(
+        self, kind: str, one: Any, single: Any, taken: tuple[Any, ...], count: int = LANES
+    ) -> None:
+        self.value = ir.VectorType(one, count)
         self.single, self._taken = single, taken
         super().__init__(name=f"lanes({kind})")
 
@@ -45,6 +50,7 @@ class Lanes(types.Type):
 FLOATS = Lanes("float", _DOUBLE, types.float64, (types.Number, types.Boolean))
 INTS = Lanes("int", _LONG, types.int64, (types.Integer,))
 BOOLS = Lanes("bool", _BIT, types.boolean, (types.Boolean,))
+EIGHT = Lanes("eight", _DOUBLE, types.float64, (types.Number, types.Boolean), 8)
 
 
 @register_model(Lanes)
@@ -57,11 +63,12 @@ def splat(builder: Any, value: Any, of: Lanes) -> Any:
     """Lanes that are all equal to a machine value."""
     none = ir.Constant(of.value, ir.Undefined)
     one = builder.insert_element(none, value, ir.Constant(_LONG, 0))
-    zeros = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
+    zeros = ir.Constant(ir.VectorType(ir.IntType(32), of.value.count), [0] * of.value.count)
     return builder.shuffle_vector(one, none, zeros)
 
 
 @lower_cast(types.Number, FLOATS)
+@lower_cast(types.Number, EIGHT)
 @lower_cast(types.Boolean, FLOATS)
 @lower_cast(types.Integer, INTS)
 @lower_cast(types.Boolean, BOOLS)
@@ -73,6 +80,8 @@ def meet(args: tuple[Any, ...]) -> Any:
     """The kind that numbers and lanes meet in, single if none of them is lanes; None for others."""
     if not all(isinstance(each, Lanes | types.Number | types.Boolean) for each in args):
         return None
+    if EIGHT in args:
+        return EIGHT
     floats = any(each is FLOATS or isinstance(each, types.Float) for each in args)
     ints = any(each is INTS or isinstance(each, types.Integer) for each in args)
     kind = FLOATS if floats else INTS if ints else BOOLS
@@ -109,7 +118,7 @@ def compare(sign: str) -> dict[Lanes, Any]:
 
 
 def _of(floats: str | None, ints: str | None = None, bools: str | None = None) -> dict[Lanes, Any]:
-    names = {FLOATS: floats, INTS: ints, BOOLS: bools}
+    names = {FLOATS: floats, EIGHT: floats, INTS: ints, BOOLS: bools}
     return {
         kind: lambda builder, x, y, name=name: getattr(builder, name)(x, y)
         for kind, name in names.items()

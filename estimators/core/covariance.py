@@ -1,15 +1,17 @@
 """The covariance and its gains in compiled code: `design.kalman`'s equations on a filter's memory.
 
-Only the first n of N = `total` states move; the others are clones. Measurements come one scalar at
+Only the first n of N = `total` states move; the others are clones. Rows are computed by eights of
+their columns: beyond N all is zero and stays so. Measurements come one scalar at
 a time, so that a gain is a division and not a matrix inverse.
 """
 
 from math import log
 from typing import Any
 
-from ...envs.backend.decorators import jit
+from ...envs.backend.arrays import at, eight, mirror, put_eight, scratch
+from ...envs.backend.decorators import inlined, jit
 from ...envs.backend.primitives import absolute, sqrt
-from .memory import Memory, Row
+from .memory import CORE, WIDTH, Memory, Row
 
 
 @jit
@@ -28,63 +30,58 @@ def expected(f: Memory, s: int, i: int) -> Any:
     return value + f.road_turn if f.ground[s, i] == 1 else value
 
 
-@jit
-def _plus(a: Any, g: Any, v: Row, j: int) -> Any:
-    """a + g v[j : j + 8] of eight numbers a, at once: compiled, they stay in registers."""
-    return (
-        a[0] + g * v[j],
-        a[1] + g * v[j + 1],
-        a[2] + g * v[j + 2],
-        a[3] + g * v[j + 3],
-        a[4] + g * v[j + 4],
-        a[5] + g * v[j + 5],
-        a[6] + g * v[j + 6],
-        a[7] + g * v[j + 7],
-    )
-
-
-@jit
-def _predict_rows(f: Memory) -> None:
-    """f.FP (CORE, WIDTH) = F P for the dense states, clones' columns included, by whole eights."""
-    G, P, T = f.G, f.P, f.FP
-    for i in range(f.dense):
-        for j in range(0, f.total, 8):
-            a = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-            for k in range(f.n):
-                a = _plus(a, G[i, k], P[k], j)
-            for m in range(8):
-                T[i, j + m] = a[m]
+@inlined
+def times(M: Row, i: int, V: Row, n: int, j: int, a: Any, b: Any, c: Any, d: Any) -> Any:
+    """a, b, c, d and rows i to i + 3 of M (., n) times V (n, .), eight columns from j on."""
+    for k in range(n):
+        v = eight(V, k, j)
+        a, b = a + at(M, i, k) * v, b + at(M, i + 1, k) * v
+        c, d = c + at(M, i + 2, k) * v, d + at(M, i + 3, k) * v
+    return a, b, c, d
 
 
 @jit
 def predict_covariance(f: Memory) -> None:
-    """P <- F P F^T + Q with F = [[G, 0], [0, diag(decay)]] on the states, I on the clones."""
+    """P <- F P F^T + Q with F = [[G, 0], [0, diag(decay)]] on the states, I on the clones.
+
+    The rows of the dense states are computed by fours, what stands above the diagonal counts.
+    """
     n, dense, N = f.n, f.dense, f.total
-    G, P, Q, T, decay = f.G, f.P, f.Q, f.FP, f.decay
-    _predict_rows(f)
-    for i in range(dense):
-        for j in range(i, dense):
-            total = Q[i, j]
-            for k in range(n):
-                total += T[i, k] * G[j, k]
-            P[i, j] = total
-            P[j, i] = total
-        for j in range(dense, n):
-            value = T[i, j] * decay[j] + Q[i, j]
-            P[i, j] = value
-            P[j, i] = value
-        for c in range(n, N):  # the clones' covariance with the states
-            P[i, c] = T[i, c]
-            P[c, i] = T[i, c]
-    for i in range(dense, n):
-        for j in range(i, n):
-            value = decay[i] * P[i, j] * decay[j] + Q[i, j]
-            P[i, j] = value
-            P[j, i] = value
-        for c in range(n, N):
-            value = decay[i] * P[i, c]
-            P[i, c] = value
-            P[c, i] = value
+    P, Q, GT, keep = f.P, f.Q, f.GT, f.keep
+    FP = scratch(CORE, WIDTH)
+    states = (n + 7) // 8 * 8  # columns with a state among them
+    for j in range(0, N, 8):
+        for i in range(0, dense, 4):
+            a, b, c, d = times(f.G, i, P, n, j, 0.0, 0.0, 0.0, 0.0)
+            put_eight(FP, a, i, j)
+            put_eight(FP, b, i + 1, j)
+            put_eight(FP, c, i + 2, j)
+            put_eight(FP, d, i + 3, j)
+    for j in range(0, states, 8):
+        own = eight(keep, j)
+        for i in range(0, dense, 4):
+            a = eight(Q, i, j) + eight(FP, i, j) * own
+            b = eight(Q, i + 1, j) + eight(FP, i + 1, j) * own
+            c = eight(Q, i + 2, j) + eight(FP, i + 2, j) * own
+            d = eight(Q, i + 3, j) + eight(FP, i + 3, j) * own
+            a, b, c, d = times(FP, i, GT, n, j, a, b, c, d)
+            put_eight(P, a, i, j)
+            if i + 1 < dense:
+                put_eight(P, b, i + 1, j)
+            if i + 2 < dense:
+                put_eight(P, c, i + 2, j)
+            if i + 3 < dense:
+                put_eight(P, d, i + 3, j)
+        for i in range(dense, n):
+            put_eight(P, at(f.decay, i) * eight(P, i, j) * own + eight(Q, i, j), i, j)
+    for j in range(states, N, 8):  # clones alone
+        for i in range(dense):
+            put_eight(P, eight(FP, i, j), i, j)
+        for i in range(dense, n):
+            put_eight(P, at(f.decay, i) * eight(P, i, j), i, j)
+    for i in range(0, n, 8):
+        for j in range(i, N, 8):
+            mirror(P, i, j)
 
 
 @jit
@@ -102,26 +99,31 @@ def _condition(f: Memory, variance: Any, residual: Any) -> None:
         size = absolute(residual) * sqrt(per)
         if size > f.robust:
             per *= f.robust / size
-    for i in range(N):
-        gain[i] = PC[i] * per
-        x[i] += gain[i] * residual
-    for i in range(N):
-        for j in range(N):
-            P[i, j] -= per * (PC[i] * PC[j])
+    for j in range(0, N, 8):
+        own = eight(PC, j)
+        put_eight(gain, own * per, j)
+        put_eight(x, eight(x, j) + own * per * residual, j)
+        for i in range(N):
+            put_eight(P, eight(P, i, j) - per * (at(PC, i) * own), i, j)
 
 
 @jit
 def project(f: Memory, row: Row) -> Any:
     """f.PC = P C^T of a measurement `row` (n,) of the states; returns C P C^T."""
     n, N, P, PC = f.n, f.total, f.P, f.PC
-    for i in range(N):
-        PC[i] = 0.0
+    for j in range(0, N, 8):
+        total = 0.0
+        for k in range(n):
+            h = at(row, k)
+            if h != 0.0:
+                total = total + h * eight(P, k, j)
+        put_eight(PC, total, j)
+    own = 0.0
     for k in range(n):
-        h = row[k]
-        if h != 0.0:
-            for i in range(N):
-                PC[i] += h * P[k, i]
-    return dot(row, PC, n)
+        h = at(row, k)
+        if h != 0.0:  # no sum waits for nothing
+            own += h * at(PC, k)
+    return own
 
 
 @jit

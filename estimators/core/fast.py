@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from ...envs.backend.arrays import at, eight, put, put_eight, scratch
 from ...envs.backend.decorators import jit
 from ...envs.backend.primitives import maximum, minimum
 from ...envs.record import FAST
@@ -16,7 +17,7 @@ from .intersample import (
     share_between,
     share_fast,
 )
-from .memory import COUNTERS, SLOW, Gains, Memory, Row
+from .memory import CORE, COUNTERS, SLOW, Gains, Memory, Row
 from .speed import cell_of, finite, measured_speed, moved, step_row
 from .transition import BETA, KINEMATIC, LINEAR, VELOCITY_ROLL, build
 from .tyres import AGAIN, linearise
@@ -25,7 +26,7 @@ from .tyres import AGAIN, linearise
 @jit
 def _sum(row: Row, column: Row, factor: Row) -> Any:
     """A signal of a fast row (FAST_WIDTH,): the sum of two of its columns times their factors."""
-    return factor[0] * row[column[0]] + factor[1] * row[column[1]]
+    return at(factor, 0) * at(row, at(column, 0)) + at(factor, 1) * at(row, at(column, 1))
 
 
 @jit
@@ -77,16 +78,14 @@ def read(f: Memory, row: Row, now: float) -> None:
 @jit
 def _predict(f: Memory, v: Row) -> None:
     """v <- F v on the states of a vector (n,) or longer."""
-    n, dense, G, T = f.n, f.dense, f.G, f.work[0, 0]
-    for i in range(dense):
-        total = 0.0
+    n, new = f.n, scratch(1, CORE)
+    for j in range(0, n, 8):
+        total = eight(f.keep, j) * eight(v, j)
         for k in range(n):
-            total += G[i, k] * v[k]
-        T[i] = total
-    for i in range(dense):
-        v[i] = T[i]
-    for i in range(dense, n):
-        v[i] *= f.decay[i]
+            total = total + at(v, k) * eight(f.GT, k, j)
+        put_eight(new, total, 0, j)
+    for j in range(0, n, 8):
+        put_eight(v, eight(new, 0, j), j)
 
 
 @jit
@@ -114,12 +113,14 @@ def advance_state(f: Memory, u: Row) -> None:
         linearise(f, u[0])
         build(f, f.model_speed, f.turning)
     _predict(f, f.x)
-    for i in range(f.dense):
-        for j in range(f.inputs):
-            f.x[i] += f.H[i, j] * u[j]
+    for j in range(0, f.dense, 8):
+        total = eight(f.x, j)
+        for k in range(f.inputs):
+            total = total + at(u, k) * eight(f.HT, k, j)
+        put_eight(f.x, total, j)
     if f.kind == LINEAR or f.tyres > 0:
-        for i in range(f.n):
-            f.x[i] += f.drift[i]
+        for j in range(0, f.n, 8):
+            put_eight(f.x, eight(f.x, j) + eight(f.drift, j), j)
     if f.between == PSEUDO:
         _predict(f, f.e)
     if f.periodic == 0:
@@ -134,11 +135,11 @@ def advance_state(f: Memory, u: Row) -> None:
 @jit
 def _residual(f: Memory, i: int) -> Any:
     """The residual of the fast measurement i."""
-    residual = f.y[i] - f.rest_fast[i]
+    residual = at(f.y, i) - at(f.rest_fast, i)
     for k in range(f.n):
-        residual -= f.C_fast[i, k] * f.x[k]
+        residual -= at(f.C_fast, i, k) * at(f.x, k)
     for j in range(f.inputs):
-        residual -= f.D_fast[i, j] * f.u[j]
+        residual -= at(f.D_fast, i, j) * at(f.u, j)
     return residual
 
 
@@ -174,13 +175,13 @@ def correct_fast(f: Memory, gains: Gains) -> None:
             f.eps[i] = 0.0
             continue
         if f.periodic == 1:
-            K = gains[f.cell, step_row(f) + i]
+            step = step_row(f) + i
             for j in range(f.total):
-                f.x[j] += K[j] * residual
+                put(f.x, at(f.x, j) + at(gains, f.cell, step, j) * residual, j)
             continue
         measure_state(f, f.C_fast[i], f.r_fast[i], residual)
-        for j in range(f.total):
-            f.share[i, j] = f.gain[j]
+        for j in range(0, f.total, 8):
+            put_eight(f.share, eight(f.gain, j), i, j)
         if f.between == PSEUDO:
             share_fast(f, i, residual)
         if f.late == LARSEN:

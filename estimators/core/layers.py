@@ -12,6 +12,7 @@ with a bank is the mixture's mean and covariance, which nothing measures; its me
 from math import exp
 from typing import Any
 
+from ...envs.backend.arrays import eight, put_eight
 from ...envs.backend.decorators import apart, copied, jit
 from ...envs.backend.elementary import sincos
 from ...envs.backend.primitives import maximum
@@ -120,18 +121,19 @@ def mix(layers: Filters) -> None:
         total += _share(layers, m, best)
     for i in range(n):
         front.x[i] = 0.0
-        for j in range(n):
-            front.P[i, j] = 0.0
+        for j in range(0, n, 8):
+            put_eight(front.P, 0.0, i, j)
     for m in range(1, len(layers)):
         share = _share(layers, m, best) / total
         for i in range(n):
             front.x[i] += share * layers[m].x[i]
     for m in range(1, len(layers)):
         share, f = _share(layers, m, best) / total, layers[m]
-        for i in range(n):
-            for j in range(n):
-                off = (f.x[i] - front.x[i]) * (f.x[j] - front.x[j])
-                front.P[i, j] += share * (f.P[i, j] + off)
+        for j in range(0, n, 8):
+            off = eight(f.x, j) - eight(front.x, j)
+            for i in range(n):
+                spread = eight(f.P, i, j) + (f.x[i] - front.x[i]) * off
+                put_eight(front.P, eight(front.P, i, j) + share * spread, i, j)
     front.tick, front.speed, front.nis = out.tick, out.speed, layers[1].nis
     for i in range(len(front.counts)):
         front.counts[i] = layers[1].counts[i]

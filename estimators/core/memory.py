@@ -18,9 +18,10 @@ import numpy.typing as npt
 from ...envs.record import PACKET_WIDTH
 from ...envs.sensors.slow import SLOW_NAMES
 
-CORE = 16  # states of a model
+CORE = 16  # states of a model; in whole eights, as `WIDTH`
 INPUTS = 4  # that drive it
 FASTS = 3  # measurements of a fast row
+WIDE = CORE + 8  # columns of all that drives a state
 SLOW = len(SLOW_NAMES)  # sensors
 ROWS = 4  # of C, of one slow sensor
 FRAMES = 8  # of one slow sensor, captured and not here yet
@@ -102,12 +103,15 @@ _MODEL = [  # dx = A x + B u on the first `dense` states; those behind them deca
     ("step", _FLOAT),  # s, the filter's own step
     ("relax", _FLOAT),  # share by which the delayed states follow in a step
     ("A", _FLOAT, (CORE, CORE)),
-    ("B", _FLOAT, (CORE, INPUTS + CORE)),  # inputs, then disturbances
+    ("B", _FLOAT, (CORE, WIDE)),  # inputs, then disturbances
     ("push", _FLOAT, (CORE,)),  # what `rest` adds to dx
     ("G", _FLOAT, (CORE, CORE)),  # tie-vision (9), rows of the dense states
     ("H", _FLOAT, (CORE, INPUTS)),
     ("drift", _FLOAT, (CORE,)),  # known part of a step, dual-rate (7) u_d, or of tyres
     ("decay", _FLOAT, (CORE,)),  # share of a state that is left after a step
+    ("GT", _FLOAT, (CORE, CORE)),  # G and H transposed; zeros beyond the dense states
+    ("HT", _FLOAT, (INPUTS, CORE)),
+    ("keep", _FLOAT, (WIDTH,)),  # left after a step: 0 of dense states, 1 of clones
     ("Q", _FLOAT, (CORE, CORE)),  # of one step
     ("prior", _FLOAT, (CORE, CORE)),  # P at the start
     ("first", _FLOAT, (CORE,)),  # x at the start
@@ -244,8 +248,6 @@ _SCRATCH = [
     ("S", _FLOAT, (ROWS, ROWS)),  # its covariance, then the Cholesky factor
     ("white", _FLOAT, (ROWS,)),  # the residual by that factor
     ("e_seen", _FLOAT, (FASTS,)),  # C G e of the fast rows
-    ("FP", _FLOAT, (CORE, WIDTH)),
-    ("work", _FLOAT, (3, CORE, INPUTS + CORE)),
 ]
 _WINDOW = [  # history: of tick k in row k % WINDOW
     ("predicted", _FLOAT, (WINDOW, CORE)),  # states; `store_predictions`

@@ -76,6 +76,8 @@ def begin(f: Memory, first: int) -> None:
     for i in range(len(f.counts)):
         f.counts[i] = 0
     forget(f)
+    for i in range(WIDTH):
+        f.keep[i] = 0.0 if i < f.dense else f.decay[i] if i < f.n else 1.0
     f.weight = 0.0
     if f.r_share > 0.0:
         f.r_fast[f.accel_row] = f.r_told

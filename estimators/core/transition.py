@@ -2,11 +2,13 @@
 
 from typing import Any
 
+from ...envs.backend.arrays import at, eight, put, put_eight, scratch
 from ...envs.backend.decorators import apart, jit
 from ...envs.backend.primitives import absolute, maximum
 from ...envs.vehicle.linear import write_kinematic, write_lateral, write_roll
 from ...envs.vehicle.vehicle import GRAVITY
-from .memory import CAR, CORE, INPUTS, SLOW, Memory
+from .covariance import times
+from .memory import CAR, CORE, INPUTS, SLOW, WIDE, Memory, Row
 
 LATERAL, ROLL, KINEMATIC, VELOCITY_ROLL, YAW, FORCES, LINEAR = range(7)
 """Kinds of models; LINEAR is any linear system, whose matrices are arguments."""
@@ -102,11 +104,11 @@ def _write_tyres(f: Memory, V: Any) -> None:
 def continuous(f: Memory, V: Any, turning: Any) -> None:
     """f.A and f.B = [inputs, disturbances] at a speed V in m/s and a yaw rate in rad/s."""
     A, B = f.A, f.B
-    for i in range(CORE):
-        for j in range(CORE):
-            A[i, j] = 0.0
-        for j in range(INPUTS + CORE):
-            B[i, j] = 0.0
+    for i in range(f.dense):
+        for j in range(0, CORE, 8):
+            put_eight(A, 0.0, i, j)
+        for j in range(0, WIDE, 8):
+            put_eight(B, 0.0, i, j)
     if f.forces == 0:
         for j in range(f.n - f.dense):
             if f.pushed[j] >= 0:
@@ -129,14 +131,15 @@ def continuous(f: Memory, V: Any, turning: Any) -> None:
 
 
 @jit
-def _product(a: Any, b: Any, c: Any, n: int, m: int) -> None:
+def _product(a: Row, b: Row, c: Row, n: int, m: int) -> None:
     """c = a b for a (n, n) and b (n, m), in the corners of larger arrays."""
-    for i in range(n):
-        for j in range(m):
-            c[i, j] = 0.0
-        for k in range(n):
-            for j in range(m):
-                c[i, j] += a[i, k] * b[k, j]
+    for j in range(0, m, 8):
+        for i in range(0, n, 4):
+            first, second, third, fourth = times(a, i, b, n, j, 0.0, 0.0, 0.0, 0.0)
+            put_eight(c, first, i, j)
+            put_eight(c, second, i + 1, j)
+            put_eight(c, third, i + 2, j)
+            put_eight(c, fourth, i + 3, j)
 
 
 @jit
@@ -147,12 +150,13 @@ def discretise(f: Memory) -> None:
     ||A h|| <= 1/2 and doubling back; G = I + A Phi. Accurate to rounding (relative 1e-14).
     """
     n, m = f.dense - f.delayed, INPUTS + f.n - f.dense
-    E, Phi, T = f.work[0], f.work[1], f.work[2]
+    E, Phi, T = scratch(CORE, WIDE), scratch(CORE, WIDE), scratch(CORE, WIDE)
+    one = scratch(CORE, CORE)  # h I
     norm = 0.0
     for i in range(n):
         total = 0.0
         for j in range(n):
-            total += absolute(f.A[i, j])
+            total += absolute(at(f.A, i, j))
         norm = maximum(norm, total * f.step)
     h, doublings = f.step, 0
     while norm > 0.5:
@@ -160,35 +164,48 @@ def discretise(f: Memory) -> None:
         h *= 0.5
         doublings += 1
     for i in range(n):
-        for j in range(n):
-            Phi[i, j] = 0.0
-        Phi[i, i] = h
+        for j in range(0, n, 8):
+            put_eight(one, 0.0, i, j)
+        put(one, h, i, i)
+        for j in range(0, n, 8):
+            put_eight(Phi, eight(one, i, j), i, j)
     for order in range(15 if norm > 0.05 else 9, 1, -1):  # Horner: h (I + A h / 2 (I + ...))
         _product(f.A, Phi, T, n, n)
+        share = h / order
         for i in range(n):
-            for j in range(n):
-                Phi[i, j] = T[i, j] * (h / order)
-            Phi[i, i] += h
+            for j in range(0, n, 8):
+                put_eight(Phi, eight(T, i, j) * share + eight(one, i, j), i, j)
     for _ in range(doublings):  # the integral over 2 h is (I + e^(A h)) times that over h
         _product(f.A, Phi, E, n, n)
         for i in range(n):
-            E[i, i] += 2.0
+            put(E, at(E, i, i) + 2.0, i, i)
         _product(E, Phi, T, n, n)
         for i in range(n):
-            for j in range(n):
-                Phi[i, j] = T[i, j]
+            for j in range(0, n, 8):
+                put_eight(Phi, eight(T, i, j), i, j)
     _product(f.A, Phi, E, n, n)
     _product(Phi, f.B, T, n, m)
     for i in range(n):
-        E[i, i] += 1.0
-        f.drift[i] = 0.0
+        put(E, at(E, i, i) + 1.0, i, i)
+        drift = 0.0
         for j in range(n):
-            f.G[i, j] = E[i, j]
-            f.drift[i] += Phi[i, j] * f.push[j]
+            put(f.G, at(E, i, j), i, j)
+            drift += at(Phi, i, j) * at(f.push, j)
+        put(f.drift, drift, i)
         for j in range(f.inputs):
-            f.H[i, j] = T[i, j]
+            put(f.H, at(T, i, j), i, j)
         for j in range(f.n - f.dense):
-            f.G[i, f.dense + j] = T[i, INPUTS + j]
+            put(f.G, at(T, i, INPUTS + j), i, f.dense + j)
+
+
+@jit
+def _transpose(f: Memory) -> None:
+    """f.GT and f.HT, by which states and covariance are predicted."""
+    for i in range(f.dense):
+        for k in range(f.n):
+            put(f.GT, at(f.G, i, k), k, i)
+        for k in range(f.inputs):
+            put(f.HT, at(f.H, i, k), k, i)
 
 
 @jit
@@ -220,6 +237,7 @@ def build(f: Memory, speed: Any, turning: Any) -> None:
         continuous(f, V, turning)
         discretise(f)
         _lagging(f)
+    _transpose(f)
     for s in range(SLOW):
         for i in range(f.rows[s]):
             f.r[s, i] = variance(f, s, i, V)
