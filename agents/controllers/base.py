@@ -108,6 +108,9 @@ class Controller(ABC):
     def _not_finite(self, rows: Any, state: Array) -> None:  # noqa: B027
         """Note the rows (N,) whose inputs are not finite, in the state (N, memory) or elsewhere."""
 
+    def acted(self, state: Array, action: npt.NDArray[np.float32]) -> None:  # noqa: B027
+        """Note in the state (N, memory) that the action taken (N, width) is not the own one."""
+
     def predict(
         self,
         observation: npt.NDArray[np.float32],

@@ -165,6 +165,21 @@ class Lqr(Controller):
         interpolated(self.table, self.axes, float(speed), float(front), float(rear), KS)
         return KS[:, : len(self.purpose.states)]
 
+    def curvature(self, speed: float) -> Array:
+        """S (width, width) at a speed in m/s: an action that differs by e from the best one adds
+        e' S e to the cost of what follows, while the car is linear and nothing limits it."""
+        KS = np.empty(self.table.shape[3:])
+        car, per = self.vehicle, np.array([1.0, self.authority])[: self.width]
+        interpolated(
+            self.table, self.axes, float(speed), car.front_stiffness, car.rear_stiffness, KS
+        )
+        return np.asarray(KS[:, len(self.purpose.states) :] * np.outer(per, per))
+
+    def acted(self, state: Array, action: Any) -> None:
+        """The steering that the rate limit goes by is what was added."""
+        if self.width == 2:
+            state[:, 0] = action[:, 1] * self.authority
+
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
         limits = self._most(inputs), self._slides(inputs)
         _lqr_law(inputs, state, action, *limits, *self._design)

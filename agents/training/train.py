@@ -8,12 +8,11 @@ stable-baselines3's format) and `curve.jsonl` (the evaluations).
 import json
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from gymnasium.vector import VectorEnv
 
 from ... import __version__
 from ...envs.backend.files import whole, write_whole
@@ -21,11 +20,12 @@ from ..controllers.base import NoControl
 from ..learned.card import Card
 from ..learned.files import save_policy
 from ..rollout import costs_of
-from ..vec_env.env import make_native_env, make_vec_env
+from ..vec_env.env import make_vec_env
 from .algorithms import algorithm_of
 from .checkpoint import load_parameters, read_state, save_checkpoint
 from .export import network_from_sb3
 from .normalise import PerSecond, measured
+from .task import Task as Task
 
 import torch  # isort: skip  # after ours, which say which extra is missing
 from stable_baselines3.common.base_class import BaseAlgorithm  # isort: skip
@@ -41,36 +41,6 @@ _MEASURED = 64  # environments whose observations make the scaling
 # No other seeds are as large: those of tests and of the calibration are below 2^63.
 _EVALUATION, _SCALING, _TRAINING = 2**64, 2**65, 2**66
 _ROOM = 2**40  # seeds of a training: it takes those from its steps on when it starts or goes on
-
-
-@dataclass(frozen=True)
-class Task:
-    """What is trained: it stays the same when a training goes on.
-
-    env_id: of a native vector env. algo: a name of `ALGORITHMS`. estimator: of
-    `EstimateObservation`, "" for none. env_options: of `gym.make`, JSON types. seed: of the
-    weights, the episodes and the exploration. num_envs: side by side.
-
-    Raises ValueError for an unknown algorithm, a negative seed or no environment.
-    """
-
-    env_id: str = "sideslip/YawVision-v0"
-    algo: str = "ppo"
-    estimator: str = ""
-    env_options: dict[str, Any] = field(default_factory=dict)
-    seed: int = 0
-    num_envs: int = 256
-
-    def __post_init__(self) -> None:
-        algorithm_of(self.algo)
-        if self.seed < 0:
-            raise ValueError(f"seed is at least 0, got {self.seed}")
-        if self.num_envs < 1:
-            raise ValueError(f"num_envs is at least 1, got {self.num_envs}")
-
-    def vector_env(self, num_envs: int) -> VectorEnv[Any, Any, Any]:
-        """Another vector env of the task, not the one that is trained on."""
-        return make_native_env(self.env_id, num_envs, self.estimator or None, self.env_options)
 
 
 class Evaluation(NamedTuple):
@@ -121,7 +91,8 @@ def train(
     the policy's card.
 
     Raises ValueError where the folder holds another training, FileNotFoundError where there is
-    none to go on with, and what `make_vec_env` raises.
+    none to go on with, FloatingPointError, with the step, where weights are not finite any more
+    (the folder holds the last evaluation's), and what `make_vec_env` raises.
     """
     if steps < 1:
         raise ValueError(f"steps is at least 1, got {steps}")
@@ -132,7 +103,11 @@ def train(
     model = keeper.build(checkpoint)
     done = model.num_timesteps
     if done < steps:
-        model.learn(steps - done, callback=keeper, reset_num_timesteps=done == 0)
+        try:
+            model.learn(steps - done, callback=keeper, reset_num_timesteps=done == 0)
+        except ValueError:  # torch's, of a distribution that is none
+            keeper.check()
+            raise
         keeper.evaluate()
     return Trained(model, tuple(keeper.evaluations))
 
@@ -140,12 +115,18 @@ def train(
 def task_in(folder: str | Path, **arguments: Any) -> Task:
     """The task of a folder's checkpoint; ValueError where an argument differs from it.
 
-    Raises FileNotFoundError where there is no checkpoint.
+    Raises FileNotFoundError where there is no checkpoint, ValueError for one of another version.
     """
     path = Path(folder) / CHECKPOINT
     if not path.is_file():
         raise FileNotFoundError(f"{folder} holds no training to go on with: no {CHECKPOINT}")
-    saved = read_state(path)["task"]
+    state = read_state(path)
+    saved, version = state["task"], state["sideslip"]
+    if version != __version__:
+        raise ValueError(
+            f"{path} was made by sideslip {version}, this is {__version__}, whose cars and costs "
+            "may be others: train anew, in another folder"
+        )
     missing = [each.name for each in fields(Task) if each.name not in saved]
     if missing:
         raise ValueError(f"{path}: the checkpoint's task lacks {', '.join(missing)}")
@@ -207,7 +188,7 @@ class _Keeper(BaseCallback):
             task.env_id,
             task.num_envs,
             estimator=task.estimator or None,
-            env_kwargs=task.env_options,
+            env_kwargs=task.options(task.num_envs),
         )
         period = self.period
         steps = 0 if checkpoint is None else int(checkpoint["steps"])
@@ -228,6 +209,7 @@ class _Keeper(BaseCallback):
         return True
 
     def _on_rollout_start(self) -> None:
+        self.check()
         last = self.evaluations[-1].steps if self.evaluations else -EVERY
         if self.model.num_timesteps - last >= EVERY:
             self.evaluate()
@@ -239,8 +221,17 @@ class _Keeper(BaseCallback):
             progress = Progress(self.model.num_timesteps, cost, tuple(self.evaluations))
             self.report(progress)
 
+    def check(self) -> None:
+        """FloatingPointError where the weights are not finite."""
+        if not all(bool(each.isfinite().all()) for each in self.model.policy.parameters()):
+            raise FloatingPointError(
+                f"the weights are not finite after step {self.model.num_timesteps}; "
+                f"{self.folder / CHECKPOINT} holds them as they were at the last evaluation"
+            )
+
     def evaluate(self) -> None:
         """Cost of the policy as it is; the best one so far and the checkpoint are written."""
+        self.check()
         self.spent += time.process_time() - self.since
         cost = self._cost(self.model)
         now = Evaluation(self.model.num_timesteps, round(self.spent, 3), cost, cost / self.none)
@@ -262,12 +253,15 @@ class _Keeper(BaseCallback):
 
     def _keep_best(self, now: Evaluation) -> None:
         task = self.task
+        described = algorithm_of(task.algo).described(self.period, task.num_envs)
+        mixture: dict[str, Any] = {"scenarios": task.scenarios} if task.scenarios else {}
+        first = {"scenario": task.scenarios[0]} if task.scenarios else {}
         card = Card.of(
             task.env_id,
-            task.env_options,
+            task.env_options | first,
             task.estimator,
             algorithm=task.algo,
-            algorithm_options=algorithm_of(task.algo).described(self.period, task.num_envs),
+            algorithm_options=described | mixture,
             command=self.command,
             seeds={"training": task.seed, "from": _TRAINING + task.seed * _ROOM},
             steps=now.steps,

@@ -24,7 +24,7 @@ from .live import live_command
 from .names import KINDS, complete
 from .output import check_files, options_of, show_episode, write_output, wrote
 from .recorded import Mapping, identify_command, replay_command
-from .train import train_command, train_estimator_command
+from .train import distill_command, train_command, train_estimator_command
 from .tune import tune_app
 
 app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False)
@@ -37,6 +37,7 @@ app.command("lane")(lane_command)
 app.command("live")(live_command)
 app.command("replay")(replay_command)
 app.command("train")(train_command)
+app.command("distill")(distill_command)
 app.command("train-estimator")(train_estimator_command)
 console = Console()
 

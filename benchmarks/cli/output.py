@@ -41,6 +41,7 @@ _ENDINGS = {
     "parquet": (".parquet",),
     "picture": (".png", ".pdf", ".svg"),
     "plot": (".png", ".pdf", ".svg"),
+    "policy": (".safetensors",),
     "toml": (".toml",),
 }
 _SHOWN = ("numpy", "scipy", "numba", "gymnasium", "control", "plotly")

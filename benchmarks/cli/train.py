@@ -1,4 +1,5 @@
-"""`sideslip train`: a policy learns, with a progress bar; a stopped training goes on. And
+"""`sideslip train`: a policy learns, with a progress bar; a stopped training goes on.
+`sideslip distill`: one learns from a teacher that sees more, over a class of contests.
 `sideslip train-estimator`: a network learns to correct a filter's sideslip angle."""
 
 import json
@@ -33,6 +34,9 @@ def train_command(
         list[str] | None,
         typer.Option(help="NAME=VALUE of the environment, as scenario=gust; repeatable."),
     ] = None,
+    scenarios: Annotated[
+        list[str] | None, typer.Option(help="Of a mixture: a name or a file; repeatable.")
+    ] = None,
     steps: Annotated[int, typer.Option(help="Control periods, all in all.")] = STEPS,
     seed: Annotated[int | None, typer.Option(help="Of weights and episodes (0).")] = None,
     num_envs: Annotated[int | None, typer.Option(help="Side by side (256).")] = None,
@@ -55,6 +59,7 @@ def train_command(
         "algo": algo,
         "estimator": estimator,
         "env_options": options_of(option) or None,
+        "scenarios": scenarios or None,
         "seed": seed,
         "num_envs": num_envs,
     }
@@ -79,6 +84,7 @@ def train_command(
 def _name_of(task: "Task") -> str:
     """The folder of a task without --out."""
     options = [each if isinstance(each, str) else name for name, each in task.env_options.items()]
+    options += ["mixture"] if task.scenarios else []
     words = [task.env_id.rpartition("/")[2], task.algo, task.estimator, *options]
     return "-".join(["train", *filter(None, words), str(task.seed)])
 
@@ -89,6 +95,7 @@ def _words(task: "Task", steps: int) -> list[str]:
     words += ["--estimator", task.estimator] if task.estimator else []
     for name, value in task.env_options.items():
         words += ["--option", f"{name}={value if isinstance(value, str) else json.dumps(value)}"]
+    words += [word for each in task.scenarios for word in ("--scenarios", str(each))]
     numbers = {"--steps": steps, "--seed": task.seed, "--num-envs": task.num_envs}
     return words + [word for name, value in numbers.items() for word in (name, str(value))]
 
@@ -122,6 +129,53 @@ def _table(trained: "Trained") -> Table:
         numbers = f"{each.steps:,}", f"{each.cpu_seconds:.1f}", f"{each.cost:.4g}"
         table.add_row(*numbers, f"{each.of_none:.3f}{mark}")
     return table
+
+
+def distill_command(
+    name: Annotated[str, typer.Argument(help="Of the file NAME.safetensors.")],
+    kind: Annotated[str, typer.Option("--class", help="Of contests, as coms-model.")],
+    teacher: Annotated[
+        str, typer.Option(help="A rung, or a controller of the matrix.")
+    ] = "oracle-state",
+    estimator: Annotated[
+        str, typer.Option(help="What the policy reads: joint, or nothing but the sensors.")
+    ] = "joint",
+    cars: Annotated[int, typer.Option(help="Of each contest and round.", min=1)] = 16,
+    rounds: Annotated[int, typer.Option(help="Of driving and learning.")] = 4,
+    epochs: Annotated[int, typer.Option(help="Passes over all drives in a round.")] = 6,
+    cells: Annotated[int, typer.Option(help="Of its GRU; 0: no memory.")] = 32,
+    hidden: Annotated[list[int] | None, typer.Option(help="Size of a dense layer (32).")] = None,
+    seed: Annotated[int, typer.Option(help="Of weights and episodes.")] = 0,
+    episodes: Annotated[int, typer.Option(help="Of each contest's test.", min=2)] = 32,
+    out: Annotated[Path | None, typer.Option(help="The file; default: NAME here.")] = None,
+) -> None:
+    """Distil a policy by DAgger; its card says what it costs in each contest, on unseen seeds."""
+    from ...agents.training.distill import Round, distill
+    from ...agents.training.student import Course
+    from ..distillation import card_of, judge, lessons_of
+
+    target, console = out or Path(f"{name}.safetensors"), Console()
+    check_files(policy=target)
+    course = Course(rounds, epochs, cells, tuple(hidden or (32,)), seed=seed)
+    about = {"class": kind, "teacher": teacher, "cars": cars, **course.described()}
+    options = {"algorithm": "distill", "algorithm_options": about, "seeds": {"training": seed}}
+    card = card_of(kind, estimator, command=command_line(), **options)
+
+    lessons = lessons_of(kind, teacher, estimator, cars)
+
+    def show(now: Round) -> None:
+        text = f"{now.steps:,} steps, mean cost {now.cost:.4g}, loss {now.loss:.3g}"
+        console.print(text, highlight=False)
+
+    distill(card, lessons, course, target, show)
+    table = Table("contest", "in % of nominal", "adaptive-nmpc", "better", "fails")
+    for contest, found in judge(target, kind, episodes)["cost in % of nominal"].items():
+        own, rival = found["policy"], found["adaptive-nmpc"]
+        better, fails = found["better than adaptive-nmpc"][0], found["fails"]
+        numbers = f"{own[0]:.0f} [{own[1]:.0f}, {own[2]:.0f}]", f"{rival[0]:.0f}"
+        table.add_row(contest, *numbers, f"{100.0 * better:.0f} %", f"{100.0 * fails:.0f} %")
+    console.print(table)
+    wrote(console, target)
 
 
 def train_estimator_command(

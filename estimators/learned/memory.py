@@ -1,4 +1,4 @@
-"""Recurrent cells of a policy's network: torch's GRU and LSTM, one observation at a time."""
+"""Recurrent cells of a policy's network: the numbers of torch's GRU and LSTM."""
 
 from dataclasses import dataclass
 
@@ -12,11 +12,6 @@ GATES = {"gru": 3, "lstm": 4}
 candidate, output."""
 PARTS = ("weight_in", "weight_state", "bias_in", "bias_state")
 """The arrays of a cell: torch's weight_ih, weight_hh, bias_ih and bias_hh."""
-
-
-def sigmoid(x: Array) -> Array:
-    """1 / (1 + exp(-x)), without overflow."""
-    return 0.5 * (1.0 + np.tanh(0.5 * x))
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,22 +50,6 @@ class Cell:
     def memory(self) -> int:
         """Numbers of the state: the output, and of an LSTM what the cells hold behind it."""
         return self.size * (2 if self.kind == "lstm" else 1)
-
-    def __call__(self, x: Array, state: Array) -> Array:
-        """(N, size) of inputs (N, inputs); the state (N, memory) is updated in place."""
-        hidden = state[:, : self.size]
-        taken = np.split(x @ self.weight_in.T + self.bias_in, GATES[self.kind], axis=1)
-        held = np.split(hidden @ self.weight_state.T + self.bias_state, GATES[self.kind], axis=1)
-        if self.kind == "gru":
-            reset, update = (sigmoid(a + b) for a, b in zip(taken[:2], held[:2], strict=True))
-            candidate = np.tanh(taken[2] + reset * held[2])
-            hidden[:] = (1.0 - update) * candidate + update * hidden
-        else:
-            enter, forget, candidate, leave = (a + b for a, b in zip(taken, held, strict=True))
-            inside = state[:, self.size :]
-            inside[:] = sigmoid(forget) * inside + sigmoid(enter) * np.tanh(candidate)
-            hidden[:] = sigmoid(leave) * np.tanh(inside)
-        return hidden.copy()
 
 
 def cell_shapes(kind: str, size: int, inputs: int) -> dict[str, tuple[int, ...]]:

@@ -1,22 +1,15 @@
-"""A policy's network: a normalised observation through cells and dense layers, by NumPy alone."""
+"""A policy's network: a normalised observation through cells and dense layers, without torch."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
 
-from .memory import PARTS, Array, Cell, sigmoid
-
-ACTIVATIONS: dict[str, Callable[[Array], Array]] = {
-    "tanh": np.tanh,
-    "relu": lambda x: np.maximum(x, 0.0),
-    "elu": lambda x: np.where(x > 0.0, x, np.expm1(np.minimum(x, 0.0))),
-    "leaky-relu": lambda x: np.maximum(x, 0.01 * x),
-    "silu": lambda x: x * sigmoid(x),
-}
-"""With torch's default arguments."""
-OUTPUTS: dict[str, Callable[[Array], Array]] = {"linear": lambda x: x, "tanh": np.tanh}
+from .forward import ACTIVATIONS as ACTIVATIONS
+from .forward import OUTPUTS, Packed, forward, packed
+from .memory import PARTS, Array, Cell
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,9 +139,11 @@ class Network:
             self, mean=self.mean[own], scale=self.scale[own], weights=weights, cells=cells
         )
 
-    def _normalised(self, x: Array) -> Array:
-        z = (x - self.mean) * self.scale
-        return z if self.clip is None else np.clip(z, -self.clip, self.clip)
+    @cached_property
+    def _packed(self) -> Packed:
+        scaling, kinds = (self.mean, self.scale, self.clip), (self.activation, self.output)
+        layers = list(zip(self.weights, self.biases, strict=True))
+        return packed(scaling, self.history, self.cells, layers, *kinds)
 
     def __call__(self, x: Array, state: Array | None = None) -> Array:
         """(N, width) of observations (N, inputs).
@@ -157,16 +152,6 @@ class Network:
         """
         if state is None:
             state = np.zeros((len(x), self.memory))
-        framewise = len(self.mean) == self.inputs
-        at = (self.history - 1) * self.inputs
-        z = np.concatenate([state[:, :at], self._normalised(x) if framewise else x], axis=1)
-        state[:, :at] = z[:, self.inputs :]
-        if not framewise:
-            z = self._normalised(z)
-        for cell in self.cells:
-            z = cell(z, state[:, at : at + cell.memory])
-            at += cell.memory
-        bend = ACTIVATIONS[self.activation]
-        for W, b in zip(self.weights[:-1], self.biases[:-1], strict=True):
-            z = bend(z @ W.T + b)
-        return OUTPUTS[self.output](z @ self.weights[-1].T + self.biases[-1])
+        out = np.empty((len(x), self.width))
+        forward(self._packed, x, state, out)
+        return out

@@ -10,10 +10,12 @@ pytest.importorskip("stable_baselines3")
 import torch
 from safetensors.torch import save
 
+from sideslip import __version__
 from sideslip.agents.training.checkpoint import FORMAT, STATE
 from sideslip.agents.training.train import CHECKPOINT, Task, task_in
 
-WHOLE = dict.fromkeys(sorted(STATE), 0) | {"format": FORMAT, "task": dataclasses.asdict(Task())}
+WHOLE: dict[str, object] = dict.fromkeys(sorted(STATE), 0)
+WHOLE |= {"format": FORMAT, "task": dataclasses.asdict(Task()), "sideslip": __version__}
 
 
 def without(key: str, values: dict[str, object]) -> dict[str, object]:
@@ -30,6 +32,7 @@ def without(key: str, values: dict[str, object]) -> dict[str, object]:
         ),
         (without("format", WHOLE), "is no checkpoint of this format"),
         ([1], "is no checkpoint of this format"),
+        (WHOLE | {"sideslip": "0.0.1"}, "was made by sideslip 0.0.1, this is"),
         ("cut", "is no checkpoint: its state is no JSON"),
     ],
 )

@@ -279,3 +279,22 @@ def test_ppo_passes_a_quarter_of_none_within_a_minute(
     monkeypatch.setattr(train, "EVERY", 250_000)
     found = train.train(Task(), 250_000, tmp_path).best
     assert found.of_none < 0.25
+
+
+def test_weights_of_nan_stop_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With the step; the checkpoint is that of the last evaluation."""
+    models, real = list[Any](), train._Keeper.build
+
+    def built(*arguments: Any) -> Any:
+        models.append(real(*arguments))
+        return models[0]
+
+    def spoil(now: Progress) -> None:
+        if now.steps == 2 * ROLLOUT:
+            with torch.no_grad():
+                models[0].policy.action_net.weight[0, 0] = float("nan")
+
+    monkeypatch.setattr(train._Keeper, "build", built)
+    with pytest.raises(FloatingPointError, match=f"after step {2 * ROLLOUT}; .*{CHECKPOINT}"):
+        train.train(TINY, 4 * ROLLOUT, tmp_path, report=spoil)
+    assert read_state(tmp_path / CHECKPOINT)["steps"] == ROLLOUT

@@ -71,6 +71,7 @@ def test_it_goes_on_with_what_the_folder_holds(
         (("--steps", "0"), "steps is at least 1, got 0"),
         (("--num-envs", "0"), "num_envs is at least 1, got 0"),
         (("--seed", "-1"), "seed is at least 0, got -1"),
+        (("--scenarios", "moon"), "scenario 0 of the mixture: unknown scenario 'moon'"),
     ],
 )
 def test_a_mistake_is_one_line_that_names_it(

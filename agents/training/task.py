@@ -1,0 +1,62 @@
+"""What a training is of: it stays the same when it goes on."""
+
+import itertools
+from dataclasses import dataclass, field
+from typing import Any
+
+from gymnasium.vector import VectorEnv
+
+from ...envs.scenarios.manoeuvres import scenario_from
+from ..vec_env.env import make_native_env
+from .algorithms import algorithm_of
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is trained: it stays the same when a training goes on.
+
+    env_id: of a native vector env. algo: a name of `ALGORITHMS`. estimator: of
+    `EstimateObservation`, "" for none. env_options: of `gym.make`, JSON types. seed: of the
+    weights, the episodes and the exploration. num_envs: side by side. scenarios: a mixture, which
+    the environments have in turn, each one for all its episodes.
+
+    Raises ValueError for an unknown algorithm or scenario, a negative seed, no environment, or
+    fewer of them than scenarios.
+    """
+
+    env_id: str = "sideslip/YawVision-v0"
+    algo: str = "ppo"
+    estimator: str = ""
+    env_options: dict[str, Any] = field(default_factory=dict)
+    seed: int = 0
+    num_envs: int = 256
+    scenarios: list[Any] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        algorithm_of(self.algo)
+        if self.seed < 0:
+            raise ValueError(f"seed is at least 0, got {self.seed}")
+        if self.num_envs < 1:
+            raise ValueError(f"num_envs is at least 1, got {self.num_envs}")
+        if self.num_envs < len(self.scenarios):
+            raise ValueError(
+                f"an environment has one scenario for all its episodes: {len(self.scenarios)} "
+                f"scenarios take as many environments, got {self.num_envs}"
+            )
+        for i, scenario in enumerate(self.scenarios):
+            try:
+                scenario_from(scenario)
+            except (TypeError, ValueError) as error:
+                raise ValueError(f"scenario {i} of the mixture: {error}") from None
+
+    def options(self, num_envs: int) -> dict[str, Any]:
+        """Options of a vector env of so many rows."""
+        if not self.scenarios:
+            return self.env_options
+        turns = itertools.islice(itertools.cycle(self.scenarios), num_envs)
+        return self.env_options | {"scenario": list(turns)}
+
+    def vector_env(self, num_envs: int) -> VectorEnv[Any, Any, Any]:
+        """Another vector env of the task, not the one that is trained on."""
+        options = self.options(num_envs)
+        return make_native_env(self.env_id, num_envs, self.estimator or None, options)

@@ -1,0 +1,109 @@
+"""What `sideslip distill` learns from, the contests of a class with their teacher, and what came
+of it in each of them."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import gymnasium as gym
+
+from ..agents.learned.card import Card, JsonMap
+from ..agents.learned.files import load_policy, save_policy
+from ..envs.arguments import check_choice
+from ..estimators.vector.estimate import EstimateObservation
+from .control.build import estimate_options, make_cars
+from .control.cells import ADAPTIVE, REFERENCE_FILTER, RUNGS, Cell
+from .control.contests import NOMINAL, ORACLES, PARAMETERS, Contest, contests
+from .control.episodes import Chunk, drive
+from .control.scores import gains
+from .control.seeds import salted_seeds
+from .harness.stats import Estimate, geometric_mean, won
+from .policies import enjoy, evaluation
+
+if TYPE_CHECKING:
+    from ..agents.training.distill import Lesson
+
+JOINT, RIVAL = "joint, friction", "adaptive-nmpc"
+OUTPUTS = ("beta", "gamma", "phi", "phi_rate", "F_d", "N_d", "bias", "front_tyres", "rear_tyres",
+           "inverse_friction")  # fmt: skip
+"""What a student on `joint` reads of it, with standard deviations."""
+_ALONE = (*RUNGS, *(name for names in ORACLES.values() for name in names))
+FILTERS = ("", "joint")
+
+
+def contests_of(kind: str) -> list[Contest]:
+    """The scored contests of a class; ValueError for an unknown one."""
+    check_choice("class of contests", kind, list(dict.fromkeys(each.kind for each in contests())))
+    return [each for each in contests() if each.kind == kind]
+
+
+def card_of(kind: str, estimator: str = "", **rest: Any) -> Card:
+    """The card of a policy for a class of contests, in the first one's env; rest: other fields."""
+    check_choice("estimator", estimator, FILTERS)
+    first = contests_of(kind)[0]
+    options = _options(first) if estimator else {}
+    return Card.of(first.env_id, first.env_options, estimator, options, **rest)
+
+
+def _options(contest: Contest) -> JsonMap:
+    """The rival's filter, which is the same in all contests of a class, and more of its states."""
+    own = estimate_options(Cell(contest, JOINT, RIVAL))["options"]
+    return {"outputs": list(OUTPUTS), "std": True, "options": own}
+
+
+def lessons_of(kind: str, teacher: str, estimator: str, cars: int) -> "list[Lesson]":
+    """A lesson for each contest of a class.
+
+    teacher: a rung, or a controller of the matrix, which reads its filter there. Raises ValueError
+    for another name, or where that observation lacks what the teacher needs.
+    """
+    from ..agents.training.distill import Lesson
+
+    reads = {who: name for name, who in ADAPTIVE.items()} | dict.fromkeys(_ALONE, "")
+    found = []
+    for contest in contests_of(kind):
+        cell = Cell(contest, reads.get(teacher, REFERENCE_FILTER), teacher)
+        twins, agent = make_cars(cell, cars)
+        env: Any = gym.make_vec(contest.env_id, num_envs=cars, **contest.env_options)
+        if estimator:
+            env = EstimateObservation(env, estimator, **_options(contest))
+        found.append(Lesson(env, twins, agent))
+    return found
+
+
+def judge(path: Path, kind: str, episodes: int) -> JsonMap:
+    """Drive a policy, `nominal`, the rival and oracle-parameters on seeds made from its weights,
+    and write into its card what it costs; what is written."""
+    policy, found = load_policy(path), enjoy(str(path), episodes)
+    driven = {each.scenario: _judged(path, each, episodes) for each in contests_of(kind)}
+    own = evaluation(found) | {"cost in % of nominal": driven}
+    save_policy(path, policy.network, replace(policy.card, evaluation=own))
+    return own
+
+
+def _judged(path: Path, contest: Contest, episodes: int) -> JsonMap:
+    policy = load_policy(path)
+    seeds = tuple(salted_seeds(policy.salt, episodes, json.dumps(asdict(contest))))
+    cells = {
+        "policy": Cell(contest, policy.card.estimator, str(path)),
+        NOMINAL: Cell(contest, "", NOMINAL),
+        RIVAL: Cell(contest, JOINT, RIVAL),
+        PARAMETERS: Cell(contest, "", PARAMETERS),
+    }
+    driven = {name: drive(Chunk(cell, seeds)) for name, cell in cells.items()}
+    costs = driven[NOMINAL].costs
+    shown: JsonMap = {
+        name: _rounded(geometric_mean(-gains(costs, each)), 100.0)
+        for name, each in driven.items()
+        if name != NOMINAL
+    }
+    beaten = {name: won(driven["policy"].costs, driven[name].costs) for name in (NOMINAL, RIVAL)}
+    fails = float((driven["policy"]["failure"] != 0.0).mean())
+    better = {f"better than {name}": _rounded(each, 1.0) for name, each in beaten.items()}
+    return shown | better | {"fails": fails}
+
+
+def _rounded(numbers: Estimate, unit: float) -> Sequence[float]:
+    return [round(unit * each, 3) for each in numbers]

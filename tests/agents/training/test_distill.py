@@ -1,0 +1,129 @@
+"""Distillation: the student's cars are the teacher's, torch's network is ours, and it learns."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+pytest.importorskip("torch")
+import torch
+
+from sideslip.agents.learned.card import Card
+from sideslip.agents.learned.files import load_policy
+from sideslip.agents.rungs import make_rung
+from sideslip.agents.training import distill as training
+from sideslip.agents.training.distill import Lesson, distill, drive
+from sideslip.agents.training.student import CLIP, Course, Student, fitted
+
+ID, CARS = "sideslip/YawFusion-v0", 16
+SHORT = {"base": "coms-step", "duration": 1.2, "onset": 0.1}
+OPTIONS: dict[str, Any] = {"scenario": SHORT, "reference": "zero-slip"}
+COURSE = Course(rounds=2, epochs=25, cells=8, hidden=(8,), learning_rate=1e-2)
+
+
+def lesson(**options: Any) -> Lesson:
+    cars = gym.make_vec(ID, num_envs=CARS, **OPTIONS)
+    return Lesson(cars, *make_rung("oracle-state-lqr", ID, CARS, **OPTIONS | options))
+
+
+@pytest.fixture(scope="module")
+def learned(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    path = tmp_path_factory.mktemp("distilled") / "student.safetensors"
+    return distill(Card.of(ID, OPTIONS), [lesson()], COURSE, path), path
+
+
+def test_a_student_comes_nearer_to_its_teacher_on_seeds_it_has_not_seen(learned: Any) -> None:
+    found, _ = learned
+    last, seeds = found.policy.network, range(900, 900 + CARS)
+    idle = replace(last, weights=[0.0 * each for each in last.weights])
+    ours, none = (
+        drive(lesson(), replace(found.policy, network=each), seeds, 0.0).costs.mean()
+        for each in (last, idle)
+    )
+    teachers = drive(lesson(), None, seeds, 0.0).costs.mean()
+    assert teachers < ours < teachers + 0.5 * (none - teachers)
+
+
+def rolled(network: Any, obs: Any) -> list[Any]:
+    """Actions of every step, each (N, width)."""
+    state = np.zeros((len(obs), network.memory))
+    return [network(each.astype(np.float64), state) for each in obs.swapaxes(0, 1)]
+
+
+def test_the_file_is_the_last_rounds_and_its_card_has_the_numbers(learned: Any) -> None:
+    found, path = learned
+    there = load_policy(path)
+    assert there.salt == found.policy.salt
+    assert there.card.steps == found.rounds[-1].steps == 2 * CARS * 120
+    assert there.card.cpu_seconds > 0.0
+
+
+@pytest.mark.parametrize("cells", [0, 7])
+def test_the_network_is_torchs(cells: int) -> None:
+    torch.manual_seed(0)
+    student, rng = Student(5, 2, Course(cells=cells, hidden=(9, 4))), np.random.default_rng(1)
+    mean, scale = rng.normal(size=5), rng.uniform(0.5, 2.0, 5)
+    x = rng.normal(size=(3, 150, 5)).astype(np.float32)
+    z = ((x - mean) * scale).clip(-CLIP, CLIP).astype(np.float32)
+    theirs = student(torch.from_numpy(z))[0].detach().numpy()
+    ours = np.stack(rolled(student.network(mean, scale), x), axis=1)
+    assert np.abs(ours - theirs).max() < 1e-6 < np.abs(np.diff(ours, axis=1)).max()
+
+
+def test_a_teacher_of_other_cars_is_refused() -> None:
+    with pytest.raises(ValueError, match="cars are others than the student's"):
+        drive(lesson(scenario=SHORT | {"friction": 0.5}), None, range(CARS), 0.0)
+
+
+def test_what_the_teachers_sensors_do_changes_no_car() -> None:
+    """`oracle-parameters` has sensors without biases: another record of the same motion."""
+    knowing = make_rung("oracle-parameters-lqr", ID, CARS, **OPTIONS)
+    seen = drive(lesson()._replace(teachers=knowing[0], teacher=knowing[1]), None, range(CARS), 0.1)
+    assert (seen.weights > 0.0).all() and np.ptp(seen.labels) > 0.0
+
+
+def test_a_training_that_diverges_stops_with_the_step_and_leaves_the_last_good_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, real = tmp_path / "student.safetensors", fitted
+    drives = [drive(lesson(), None, range(CARS), 0.0)]
+    names, model = len(drives[0].obs[0, 0]), Student(len(drives[0].obs[0, 0]), 1, COURSE)
+    with pytest.raises(FloatingPointError, match=r"the loss is nan at step \d+"):
+        mean = np.full(names, np.nan)
+        real(model, drives, mean, np.ones(names), COURSE)
+    calls: list[Any] = []
+
+    def second(*arguments: Any) -> float:
+        calls.append(arguments)
+        if len(calls) == 2:
+            raise FloatingPointError("the loss is nan at step 3")
+        return real(*arguments)
+
+    monkeypatch.setattr(training, "fitted", second)
+    quick = replace(COURSE, epochs=1)
+    with pytest.raises(FloatingPointError):
+        distill(Card.of(ID, OPTIONS), [lesson()], quick, path)
+    assert load_policy(path).card.steps == CARS * 120
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"rounds": 0}, "1 at least"),
+        ({"hidden": (0,)}, "1 at least"),
+        ({"seed": -1}, "1 at least"),
+        ({"learning_rate": float("nan")}, "learning_rate"),
+        ({"noise": -0.1}, "learning_rate is above zero, noise"),
+    ],
+)
+def test_a_course_out_of_range_is_refused(wrong: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Course(**wrong)
+
+
+def test_nothing_to_learn_from_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="no lessons"):
+        distill(Card.of(ID, OPTIONS), [], COURSE, tmp_path / "student.safetensors")

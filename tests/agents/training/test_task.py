@@ -1,0 +1,56 @@
+"""A mixture of scenarios: every row keeps its own, and what there is not is refused."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("stable_baselines3")
+from sideslip.agents.learned.files import load_policy
+from sideslip.agents.training import train
+from sideslip.agents.training.task import Task
+from sideslip.agents.training.train import POLICY, task_in
+
+TINY, ROLLOUT = Task(num_envs=8, seed=3), 256  # steps of 8 environments
+MIXTURE: list[Any] = ["coms-slalom", {"base": "coms-step", "duration": 0.3}]
+
+
+def test_a_mixture_survives_autoreset() -> None:
+    """Every row has its own scenario, in its first episode and in those after it."""
+    task = dataclasses.replace(TINY, scenarios=MIXTURE)
+    env = task.vector_env(5)
+    env.reset(seed=0)
+    base: Any = env.unwrapped
+    ended = np.zeros(5, int)
+    for _ in range(75):
+        _, _, terminated, truncated, _ = env.step(np.zeros((5, 1)))
+        ended += terminated | truncated
+    assert ended.tolist() == [0, 2, 0, 2, 0]
+    durations = [each.duration for each in base.scenario]
+    assert durations == [durations[0], 0.3, durations[0], 0.3, durations[0]] and durations[0] > 1.0
+
+
+def test_a_policy_of_a_mixture_names_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in {"EPISODES": 4, "EVERY": ROLLOUT, "_MEASURED": 8}.items():
+        monkeypatch.setattr(train, name, value)
+    task = dataclasses.replace(TINY, scenarios=MIXTURE)
+    train.train(task, ROLLOUT, tmp_path)
+    card = load_policy(tmp_path / POLICY).card
+    assert card.algorithm_options["scenarios"] == MIXTURE
+    assert card.env_options == {"scenario": MIXTURE[0]}
+    assert task_in(tmp_path) == task
+
+
+@pytest.mark.parametrize(
+    ("scenarios", "message"),
+    [
+        (["coms-slalom", "moon"], "scenario 1 of the mixture: unknown scenario 'moon'"),
+        ([7], "scenario 0 of the mixture: a scenario is a name"),
+        (["coms-slalom"] * 9, "9 scenarios take as many environments, got 8"),
+    ],
+)
+def test_a_mixture_of_what_there_is_not_is_refused(scenarios: list[Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        dataclasses.replace(TINY, scenarios=scenarios)
