@@ -3,12 +3,13 @@
 `python -m sideslip.benchmarks.control.choice --write` measures all candidates and writes the file.
 """
 
-import argparse
 import math
 from collections.abc import Sequence
 from dataclasses import asdict
+from typing import Annotated
 
 import numpy as np
+import typer
 from rich.console import Console
 from rich.table import Table
 
@@ -119,24 +120,16 @@ def choose(
     return [judged(results, contest) for contest in among]
 
 
-def main() -> None:
-    """The command line."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--write", action="store_true", help="replace the package's file")
-    parser.add_argument("--episodes", type=int, default=EPISODES)
-    parser.add_argument("--jobs", type=int)
-    arguments = parser.parse_args()
+def main(
+    write: Annotated[bool, typer.Option(help="Replace the package's file.")] = False,
+    episodes: Annotated[int, typer.Option(min=2, help="Tuning seeds a contest.")] = EPISODES,
+    jobs: Annotated[int | None, typer.Option(min=1, help="Processes.")] = None,
+) -> None:
+    """Which contests are scored: where the rungs of the ladder lie apart, on tuning seeds."""
     console = Console()
-    found = choose(None, arguments.episodes, arguments.jobs, console)
-    table = Table(
-        "tier",
-        "contest",
-        "oracle-parameters",
-        "oracle-state",
-        "gap",
-        "nominal fails / %",
-        "verdict",
-    )
+    found = choose(None, episodes, jobs, console)
+    columns = "tier", "contest", *ORACLES, "gap", "nominal fails / %", "verdict"
+    table = Table(*columns)
     for each in found:
         gap = f"{each.gap:.2f} [{each.low:.2f}, {each.high:.2f}]"
         failing = f"{100.0 * each.failing:.1f}"
@@ -144,9 +137,9 @@ def main() -> None:
             each.tier, each.contest.name, each.knowing, each.oracle, gap, failing, each.verdict
         )
     console.print(table)
-    if arguments.write:
+    if write:
         write_contests(found)
 
 
 if __name__ == "__main__":
-    main()
+    typer.run(main)

@@ -1,4 +1,4 @@
-"""Question: what do 10^9 episodes cost, and how many workers make them how fast?
+"""Question: what do 10^9 episodes and 10^12 env-steps cost, and how fast are many workers?
 
 `python -m sideslip.benchmarks.speed.scale --out docs/scale.md`
 """
@@ -7,6 +7,7 @@ import time
 from pathlib import Path
 from typing import Annotated
 
+import gymnasium as gym
 import numpy as np
 import typer
 from rich.console import Console
@@ -19,13 +20,17 @@ from ..harness.engines import cores
 from ..harness.parallel import run_cases
 from ..harness.results import check_writable, write_text
 
-MANY = 1e9
+MANY, STEPS = 1e9, 1e12
 SIZES = (10, 50, 250, 1000)
 """Episodes a case."""
 ROUNDS = 3
 _WHO = {"no control": ("", "none"), "lqr on exact-kf": (REFERENCE_FILTER, REFERENCE_CONTROLLER)}
+ENV_ID, COUNTS = "sideslip/YawFusion-v0", tuple(4**k for k in range(11))
+"""Of a batch of env-steps alone; 4^10 rows take 6 GB."""
+PRICE = 0.04
+"""Dollars for an hour of one core, about what clouds ask on demand in 2026: assumed."""
 _TEXT = """\
-# What a billion episodes cost
+# What a billion episodes and a trillion env-steps cost
 
 Made by `python -m sideslip.benchmarks.speed.scale --out docs/scale.md` on a machine with {workers}
 cores. A *case* is some episodes of a contest that drive side by side; cases are independent, so a
@@ -43,6 +48,17 @@ divided by W, as long as there are many more cases than cores: a case of 1000 la
 tried.
 
 {costs}
+
+## Env-steps alone
+
+CPU time of an env-step of 10 ms of `{env_id}` in a batch of N, in microseconds: the
+median of {rounds} rounds of at least a thousand env-steps, infos and records included.
+
+{steps}
+
+10^12 of them at N = {best} take {hours:,.0f} core-hours, and ${dollars:,.0f} at an assumed
+${price} a core-hour: {days:,.1f} days on one core, {minutes:,.0f} minutes on 1000. With a process
+on each of this machine's {workers} cores one takes {slower:.2f} times its time alone.
 """
 
 
@@ -76,8 +92,38 @@ def overhead(cell: Cell, cases: int, size: int, workers: int) -> tuple[float, fl
     return shares[0], shares[1]
 
 
+def step_seconds(count: int) -> float:
+    """CPU seconds of an env-step in a batch of `count`, the median of `ROUNDS`."""
+    env = gym.make_vec(ENV_ID, num_envs=count)
+    env.reset(seed=0)
+    actions, taken = np.zeros((count, 1), np.float32), []
+    repeats = max(1, 1024 // count)
+    for _ in range(ROUNDS + 1):  # the first touches memory
+        begun = time.thread_time()
+        for _ in range(repeats):
+            env.step(actions)
+        taken.append((time.thread_time() - begun) / (repeats * count))
+    return float(np.median(taken[1:]))
+
+
+def beside(workers: int) -> float:
+    """An env-step's time in each of `workers` processes at once over its time in one alone."""
+    counts = [1024] * workers
+    run_cases(step_seconds, counts, jobs=workers)
+    alone = run_cases(step_seconds, counts[:1], jobs=1)
+    return float(np.median(run_cases(step_seconds, counts, jobs=workers)) / alone[0])
+
+
 def report() -> str:
     """The page, measured now."""
+    times = {count: 1e6 * step_seconds(count) for count in COUNTS}
+    best = min(times, key=times.__getitem__)
+    hours = STEPS * times[best] * 1e-6 / 3600.0
+    steps = [
+        "| N | " + " | ".join(map(str, times)) + " |",
+        "|---" * (len(times) + 1) + "|",
+        "| us | " + " | ".join(f"{each:.3g}" for each in times.values()) + " |",
+    ]
     contest, workers = contests()[0], cores()
     head = "| | " + " | ".join(f"{size} episodes" for size in SIZES) + " | a / s | b / ms |"
     lines, costs = [head, "|---" * (len(SIZES) + 3) + "|"], []
@@ -104,13 +150,22 @@ def report() -> str:
         workers=workers,
         overhead=f"{100.0 * alone:.0f} and {100.0 * together:.0f} %",
         costs="\n".join(table),
+        env_id=ENV_ID,
+        steps="\n".join(steps),
+        best=best,
+        hours=hours,
+        price=PRICE,
+        dollars=hours * PRICE,
+        days=hours / 24.0,
+        minutes=hours * 60.0 / 1000.0,
+        slower=beside(workers),
     )
 
 
 def main(
     out: Annotated[Path | None, typer.Option(help="Write the page to this file.")] = None,
 ) -> None:
-    """What a billion episodes cost."""
+    """What a billion episodes and a trillion env-steps cost."""
     check_writable(out)
     text = report()
     Console().print(text, highlight=False, markup=False)

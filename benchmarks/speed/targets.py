@@ -34,10 +34,10 @@ class Target(NamedTuple):
 
 
 TARGETS = (
-    Target("gym.make step, lane-keeping over ours", env_steps.LANE, env_steps.FUSION, 25.0),
-    Target("gym.make step, CartPole over ours", env_steps.CARTPOLE, env_steps.FUSION, 1.2),
-    Target("1024 at once, lane-keeping over ours", env_steps.LANE, env_steps.AT_ONCE, 300.0),
-    Target("1024 at once, CartPole over ours", env_steps.CARTPOLES, env_steps.AT_ONCE, 0.2),
+    Target("gym.make step, lane-keeping over ours", env_steps.LANE, env_steps.FUSION, 30.0),
+    Target("gym.make step, CartPole over ours", env_steps.CARTPOLE, env_steps.FUSION, 1.4),
+    Target("1024 at once, lane-keeping over ours", env_steps.LANE, env_steps.AT_ONCE, 200.0),
+    Target("1024 at once, CartPole over ours", env_steps.CARTPOLES, env_steps.AT_ONCE, 0.1),
     Target("plant, C over ours", plant.C, plant.OURS, 0.85),
     Target("delay at the tick over none", env_steps.LATE, env_steps.NONE_LATE, most=1.1),
     Target(
