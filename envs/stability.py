@@ -32,6 +32,7 @@ from .vehicle.vehicle import Vehicle
 from .vehicle.vehicles import VehicleSource, vehicle_from
 from .vision import Seeing
 
+_FLOAT32 = np.dtype(np.float32)
 _STEP: list[Any] = []  # `step_vehicle` for the types of an env's arrays, once one has stepped
 
 
@@ -157,7 +158,10 @@ class StabilityEnv(Seeing, DrawnOne, gym.Env[npt.NDArray[np.float32], npt.NDArra
         reset_vehicle(config.start, key & 0xFFFFFFFF, key >> 32, self._bounds, self._row(obs))
         self._over = False
         self._begin()
-        self.annotations, info = {}, self._info(1)
+        self.ticks_done, self.annotations = 1, {}
+        info, self.delivered = info_of(self._report)
+        if self.eye is not None:
+            info |= self.eye.marks
         if self._traces:
             self._seen()
         return obs, info
@@ -169,18 +173,21 @@ class StabilityEnv(Seeing, DrawnOne, gym.Env[npt.NDArray[np.float32], npt.NDArra
         if self._over:
             raise ResetNeeded("the episode is over or was never started: call reset() first")
         force = action_of(action, self._width, self._fails)
-        obs = np.empty(self._entries, np.float32)
-        before = None if self.eye is None else self._state.copy()
+        obs = np.empty(self._entries, _FLOAT32)
+        eye = self.eye
+        before = None if eye is None else self._state.copy()
         done = self._advance(force, obs)
         if done <= 0:
             if done == REFUSED:
                 raise ValueError(f"action {force.tolist()} is not finite; nothing was stepped")
             obs = np.zeros_like(obs)
-        elif self.eye is not None:
-            self.eye.look(before, self._row(obs), done, self._bounds, self._window)
-        info = self._info(done)
-        terminated = info["failure"] != RUNNING
-        truncated = info["is_success"]
+        elif eye is not None:
+            eye.look(before, self._row(obs), done, self._bounds, self._window)
+        self.ticks_done = done
+        info, self.delivered = info_of(self._report)
+        if eye is not None:
+            info |= eye.marks
+        terminated, truncated = info["failure"] != RUNNING, info["is_success"]
         self._over = terminated or truncated
         if self._traces:
             self._seen()
@@ -210,11 +217,6 @@ class StabilityEnv(Seeing, DrawnOne, gym.Env[npt.NDArray[np.float32], npt.NDArra
         """The arrays of this episode."""
         record = self.rows, self.packets, self._report
         return Row(self._params, self._state, self._switches, obs, *record)
-
-    def _info(self, done: int) -> dict[str, Any]:
-        self.ticks_done = done
-        info, self.delivered = info_of(self._report)
-        return info if self.eye is None else info | self.eye.marks
 
     @property
     def record(self) -> Record:

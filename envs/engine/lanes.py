@@ -13,7 +13,7 @@ from ..task.info import REPORT
 from .arrays import Rows, row_of
 from .layout import PARAMS_WIDTH, STATE_WIDTH, Z
 from .step import conclude, drive_on, kind_of, shares_of
-from .window import follow, foresee_lanes, window_of
+from .window import follow, follows_another, foresee_lanes, window_of
 
 _REPORT = len(REPORT)
 _MOVING = Z.slow[0].frames  # what a tick changes comes first in a state, but for the driver's angle
@@ -64,9 +64,10 @@ def step_block(count: int, rows: Rows, actions: Any, n: int, bounds: Any, block:
     first = block.members[0]
     kind = kind_of(params[first], rows.switches[first])
     foresee_lanes(block.params, block.states, n, kind.follows, block.window)
-    for lane in range(lane_count()):
-        i = block.members[lane if lane < count else 0]
-        follow(params[i], states[i], n, block.window[:, :, lane])
+    if follows_another(block.params, params.shape[1]):
+        for lane in range(lane_count()):
+            i = block.members[lane if lane < count else 0]
+            follow(params[i], states[i], n, block.window[:, :, lane])
     done = drive_on(
         block.params,
         block.states,

@@ -8,9 +8,9 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
-from ..backend.arrays import lane_count, offsets, put, ramp, read, write
+from ..backend.arrays import at, lane_count, offsets, put, ramp, read, write
 from ..backend.decorators import jit
-from ..backend.primitives import to_float, whole
+from ..backend.primitives import anywhere, to_float, whole
 from ..backend.random import CHANNELS, normals
 from ..backend.simd import LANES
 from ..record import Array
@@ -61,6 +61,13 @@ def follow(p: Any, z: Any, n: int, window: Any) -> None:
                 fresh = normals(key_low, key_high, tick, CHANNELS.steering)[0]
                 angle = p[_KEEP] * angle + p[_FRESH] * fresh
             window[WINDOW.ahead, j] = angle
+
+
+@jit
+def follows_another(p: Any, width: int) -> bool:
+    """Whether `follow` has something to write for one of a block's vehicles at least; p has a
+    column for each, `width` is that of their parameters."""
+    return width > PARAMS_WIDTH or bool(anywhere(at(p, _HOLD) > 0.0))
 
 
 @jit
