@@ -175,8 +175,9 @@ def forget(cases: Sequence[Case]) -> None:
         folder.rmdir()
 
 
-def read_calibration(path: str | Path = FILE) -> dict[Contest, Entry]:
-    """The entries of a file by contest.
+def read_calibration(path: str | Path = FILE, stale: bool = False) -> dict[Contest, Entry]:
+    """The entries of a file by contest. stale: those of another version or of other seeds are left
+    out instead of refused.
 
     Raises FileNotFoundError where there is none, ValueError, with file, entry and field, for one
     that is cut short or lacks something, of another version or of other seeds.
@@ -189,18 +190,21 @@ def read_calibration(path: str | Path = FILE) -> dict[Contest, Entry]:
             raise ValueError(f"{where}: episodes is no list")
         made = (made_of(Episode, one, f"{where}, episode {k}") for k, one in enumerate(episodes, 1))
         entry = made_of(Entry, each | {"episodes": tuple(made)}, where)
-        name = f"{where}, {entry.contest.name},"
+        seeds, why = [one.seed for one in entry.episodes], ""
         if entry.env_version != __version__:
-            raise ValueError(f"{name} is stale: of version {entry.env_version}, not {__version__}")
-        if [one.seed for one in entry.episodes] != seeds_of(entry.contest, len(entry.episodes)):
-            raise ValueError(f"{name} is stale: its seeds are not this contest's")
-        entries[entry.contest] = entry
+            why = f"of version {entry.env_version}, not {__version__}"
+        elif seeds != seeds_of(entry.contest, len(seeds)):
+            why = "its seeds are not this contest's"
+        if why and not stale:
+            raise ValueError(f"{where}, {entry.contest.name}, is stale: {why}")
+        if not why:
+            entries[entry.contest] = entry
     return entries
 
 
 def update(path: str | Path, made: Sequence[Entry]) -> None:
-    """Replace or add entries of a file, which is made if it is not there."""
-    entries = read_calibration(path) if Path(path).exists() else {}
+    """Replace or add entries of a file, which is made if it is not there; its stale ones go."""
+    entries = read_calibration(path, stale=True) if Path(path).exists() else {}
     entries |= {entry.contest: entry for entry in made}
     ordered = sorted(entries.values(), key=lambda entry: entry.contest.name)
     write_text(path, json.dumps([asdict(entry) for entry in ordered], indent=1) + "\n")

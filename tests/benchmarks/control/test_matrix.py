@@ -95,19 +95,19 @@ def test_a_filter_drives_a_car_that_does_not_roll(estimator: str) -> None:
 
 
 def test_who_is_not_tuned_takes_over_what_means_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The oracles' plans are the adaptive controller's, which knows nearly as much."""
+    """The oracles' numbers are those of the adaptive controllers, which know nearly as much."""
     found = {
-        "nominal": {"filter": {"force_sd": 7.0}, "controller": {"grip": 0.4, "steer_weight": 3.0}},
+        "adaptive-lqr": {"filter": {}, "controller": {"grip": 0.4, "steer_weight": 3.0}},
         "adaptive-nmpc": {"filter": {"force_sd": 9.0}, "controller": {"grip": 0.6, "horizon": 0.3}},
     }
     nothing: dict[str, Any] = {"filter": {}, "controller": {}}
     monkeypatch.setattr(
         "sideslip.benchmarks.control.cells.tuned", lambda _, name: found.get(name, nothing)
     )
-    contest = next(each for each in contests() if oracle_of(each, PARAMETERS).endswith("nmpc"))
+    one = {oracle_of(each, PARAMETERS)[-4:]: each for each in contests()}
+    contest = one["nmpc"]
     assert Cell(contest, "joint, friction", "adaptive-nmpc").best == found["adaptive-nmpc"]
-    lqr = Cell(contest, "joint", "adaptive-lqr").best
-    assert lqr == {"filter": {}, "controller": found["nominal"]["controller"]}
+    assert Cell(one["-lqr"], "", PARAMETERS).best == found["adaptive-lqr"]
     parameters, state = (Cell(contest, "", each).best for each in (PARAMETERS, STATE))
     assert parameters == {"filter": {}, "controller": {"grip": 0.6, "horizon": 0.3}}
     assert state == {"filter": {}, "controller": {"horizon": 0.3}}
