@@ -128,7 +128,7 @@ def _measured_by_others(f: Memory, s: int, state: int) -> bool:
 
 
 @jit
-def _forget(f: Memory, state: int, variance: Any) -> None:
+def loosen(f: Memory, state: int, variance: Any) -> None:
     """Add a variance to a state, now and in what was captured of it."""
     v = f.PC
     for i in range(f.total):
@@ -156,7 +156,7 @@ def _begin_anew(f: Memory, s: int) -> bool:
             if f.C[s, i, k] != 0.0:
                 state = k
         if not _measured_by_others(f, s, state):
-            _forget(f, state, f.residual[i] * f.residual[i])
+            loosen(f, state, f.residual[i] * f.residual[i])
             forgot = True
     return forgot
 

@@ -4,8 +4,10 @@ The second layer has velocities and roll, measured by the GPS and the first laye
 
 A bank: a filter that has settled on its tyres takes seconds to believe that they changed. Every
 half second the least likely member becomes a copy of the likeliest that has forgotten the tyres, at
-the odds of such a change; what is measured makes one or the other likelier. Where members differ in
-the level of their disturbances, a place in the bank stays at its own. Layer 0 of an estimator
+the odds of such a change, and whose tyres walk until the next one begins, since the change may come
+later; what is measured makes one or the other likelier. Members that would be twins of others at
+the start come with next to no weight, so that they begin anew first. Where members differ in the
+level of their disturbances, a place in the bank stays at its own. Layer 0 of an estimator
 with a bank is the mixture's mean and covariance, which nothing measures; its members follow.
 """
 
@@ -17,7 +19,7 @@ from ...envs.backend.decorators import apart, copied, jit
 from ...envs.backend.elementary import sincos
 from ...envs.backend.primitives import maximum
 from ...envs.record import PACKET
-from .innovation import dilution
+from .innovation import dilution, loosen
 from .memory import COUNTERS, WINDOW, Filters, Gains, Memory, Row
 from .packets import receive, receive_sample
 from .speed import finite
@@ -92,7 +94,7 @@ def respawn(layers: Filters) -> None:
     best = _likeliest(layers)
     top, worst = layers[best].weight, 1
     for m in range(1, len(layers)):
-        layers[m].weight = maximum(layers[m].weight - top, LEAST)
+        layers[m].weight, layers[m].fresh = maximum(layers[m].weight - top, LEAST), 0.0
         if layers[m].weight <= layers[worst].weight and m != best:
             worst = m
     f = layers[worst]
@@ -102,8 +104,8 @@ def respawn(layers: Filters) -> None:
         _set_level(f, 0, force)
         _set_level(f, 1, moment)
     for i in range(2):
-        f.P[f.tyres + i, f.tyres + i] += f.spread
-    f.weight = f.hazard
+        loosen(f, f.tyres + i, f.spread)
+    f.weight, f.fresh = f.hazard, f.alert
 
 
 @jit

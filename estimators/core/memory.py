@@ -120,10 +120,13 @@ _MODEL = [  # dx = A x + B u on the first `dense` states; those behind them deca
 _BANK = [  # several filters beside each other, of which the first record is the mixture
     ("members", _INT),  # records behind the mixture; 0: no bank
     ("weight", _FLOAT),  # of a member: the logarithm of its likelihood
+    ("odds", _FLOAT),  # its weight at the start
     ("respawn", _INT),  # ticks after which the least likely member begins anew
     ("hazard", _FLOAT),  # log of the probability of a change within them
     ("level", _FLOAT, (2,)),  # of a member: its force's and moment's variance over that configured
     ("spread", _FLOAT),  # variance by which a new member forgets the tyres
+    ("fresh", _FLOAT),  # variance of a step of a new member's tyres, until the next one begins
+    ("alert", _FLOAT),  # what `fresh` is then
 ]
 _FAST = [  # inputs and fast measurements: sums of two columns of the fast row
     ("inputs", _INT),

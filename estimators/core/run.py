@@ -78,7 +78,7 @@ def begin(f: Memory, first: int) -> None:
     forget(f)
     for i in range(WIDTH):
         f.keep[i] = 0.0 if i < f.dense else f.decay[i] if i < f.n else 1.0
-    f.weight = 0.0
+    f.weight, f.fresh = f.odds, 0.0
     if f.r_share > 0.0:
         f.r_fast[f.accel_row] = f.r_told
         _fill(f.y_past, np.nan)

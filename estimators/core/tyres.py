@@ -40,11 +40,13 @@ def axle_force(stiffness: Any, load: Any, alpha: Any, factor: Any, grip: Any) ->
 
 @jit
 def _walk(f: Memory, moves: bool) -> None:
-    """Tyres walk while the car moves, and no further than they were unknown at the start."""
+    """Tyres walk while the car moves, and no further than they were unknown at the start; a new
+    member's walk more."""
     for i in range(3 if f.grip > 0 else 2):
         at = f.tyres + i if i < 2 else f.grip
         walks = moves and f.P[at, at] < f.prior[at, at]
-        f.Q[at, at] = f.q_tyres[i] if walks else 0.0
+        more = f.fresh if i < 2 else 0.0
+        f.Q[at, at] = f.q_tyres[i] + more if walks else 0.0
 
 
 @jit

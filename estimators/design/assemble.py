@@ -12,6 +12,7 @@ from ...envs.sensors.slow import SLOW_NAMES
 from ...envs.vehicle.vehicle import GRAVITY, Vehicle
 from ..core.delay import CONSTANT, STORED
 from ..core.intersample import DUAL_RATE, NONE, PSEUDO
+from ..core.layers import LEAST
 from ..core.memory import FILTER, ROWS, Memory
 from ..core.transition import KINEMATIC, SLOWEST, VELOCITY_ROLL
 from .config import FilterConfig
@@ -25,8 +26,9 @@ SMOOTHING_TIME = 0.015  # s, of the measured speed
 FASTEST = 80.0  # m/s, of the tables of gains
 SPACING = 0.5  # m/s between them
 RESPAWN = 0.5  # s between two members of a bank that begin anew
-HAZARD = 0.05  # 1/s, of tyres that change
+HAZARD = 0.2  # 1/s, of tyres that change
 FORGOTTEN = 0.06  # variance of their factors
+ALERT = 0.02  # 1/s, of the factors of a new member until the next one: the change may be later
 
 
 def assemble(
@@ -81,9 +83,10 @@ def _members(layers: Any, config: FilterConfig, dt: float) -> Any:
         return layers
     f = layers[0]
     f.members, f.respawn, f.spread = config.members, round(RESPAWN / dt), FORGOTTEN
-    f.hazard, f.level[:] = math.log(HAZARD * RESPAWN), 1.0
+    f.hazard, f.level[:], f.alert = math.log(HAZARD * RESPAWN), 1.0, ALERT * f.step
     bank = np.repeat(layers, 1 + config.members).view(np.recarray)
     for m, f in enumerate(bank[1:]):
+        f.odds = LEAST if m >= len(config.levels) else 0.0  # a twin of another begins anew first
         f.level[:] = np.square(config.levels[m % len(config.levels)])
         if f.forces:
             both = range(f.dense, f.dense + 2)

@@ -117,14 +117,39 @@ def test_the_factors_are_found() -> None:
             assert abs(found.x[-1, at] - true) < 4.0 * found.std[-1, at] < 0.4
 
 
-def test_a_bank_believes_a_change_sooner_and_costs_nothing_without_one() -> None:
-    base, made = drives(6, **CHANGED)
-    late = 4000 + 500
-    single, bank = (
-        [squares(built(base, log, members=count), log, late)[0] for log, _ in made]
-        for count in (1, 4)
-    )
-    assert np.sqrt(np.mean(bank) / np.mean(single)) < 0.8
+def test_a_bank_believes_a_change_sooner() -> None:
+    """Whenever it comes between two members that begin anew."""
+    for changed in (4.0, 4.3):
+        base, made = drives(6, **CHANGED | {"tyre_change_time": changed})
+        late = round(1000 * changed) + 500
+        single, bank = (
+            [squares(built(base, log, members=count), log, late)[0] for log, _ in made]
+            for count in (1, 4)
+        )
+        assert np.sqrt(np.mean(bank) / np.mean(single)) < 0.7
+
+
+def test_what_a_member_remembers_of_its_tyres_is_forgotten_too() -> None:
+    """Or a late sample, for which the past is filtered anew, brings them back."""
+    base, ((log, _), *_) = drives(1)
+    filter_ = built(base, log, members=2, delay="buffer")
+    record = filter_.accept(log)
+    filter_.reset(log.slow, record.first)
+    due = record.packets[:, PACKET.arrived] <= record.first + 4500
+    filter_.step(record.fast[:4501], record.packets[due])
+    (new,) = (f for f in filter_.filters[1:] if f.fresh > 0.0)
+    assert (new.snapshot_P[:-1, new.tyres, new.tyres] > new.spread).all()
+
+
+def test_no_member_of_a_bank_is_another_s_twin() -> None:
+    base, ((log, _), *_) = drives(1)
+    filter_ = built(base, log, members=4)
+    filter_.run(log)
+    factors = [f.P[f.tyres, f.tyres] for f in filter_.filters[1:]]
+    assert len(set(factors)) == len(factors)
+
+
+def test_a_bank_costs_nothing_without_a_change() -> None:
     base, made = drives(4)
     single, bank = (
         [squares(built(base, log, members=count), log)[0] for log, _ in made] for count in (1, 4)
