@@ -189,7 +189,7 @@ def test_a_price_is_met_from_below() -> None:
     price = next(target for target in targets.TARGETS if target.most == 1.1)
     assert price.met(1.05) and not price.met(1.15)
     goal = targets.TARGETS[0]
-    assert goal.met(26.0) and not goal.met(24.0)
+    assert goal.met(31.0) and not goal.met(29.0)
 
 
 def test_rounds_are_interleaved_and_the_first_calls_do_not_count() -> None:
