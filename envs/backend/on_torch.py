@@ -35,6 +35,14 @@ def numbers(dtype: torch.dtype) -> dict[str, Callable[..., Any]]:
     def to_float(a: Any) -> Any:
         return a.to(dtype) if isinstance(a, torch.Tensor) else a * 1.0
 
+    def sqrt(a: Any) -> Any:
+        if not isinstance(a, torch.Tensor):
+            return math.sqrt(a)
+        if not a.requires_grad:
+            return torch.sqrt(a)
+        none = a == 0.0  # where the slope is infinite, and 0 times it no number: here it is 0
+        return torch.where(none, 0.0, torch.sqrt(torch.where(none, 1.0, a)))
+
     def read(array: Any, where: Any) -> Any:
         return getattr(where, "_make", tuple)(array[where[0] : where[-1] + 1].unbind(0))
 
@@ -43,7 +51,7 @@ def numbers(dtype: torch.dtype) -> dict[str, Callable[..., Any]]:
         "maximum": lambda a, b: select(a > b, a, b),
         "absolute": lambda a: torch.abs(a) if isinstance(a, torch.Tensor) else abs(a),
         "floor": lambda a: torch.floor(a) if isinstance(a, torch.Tensor) else math.floor(a) * 1.0,
-        "sqrt": lambda a: torch.sqrt(a) if isinstance(a, torch.Tensor) else math.sqrt(a),
+        "sqrt": sqrt,
         "select": select,
         "to_float": to_float,
         "whole": lambda a: a.to(torch.int64) if isinstance(a, torch.Tensor) else int(a),

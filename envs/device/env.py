@@ -21,7 +21,9 @@ from ..task.failures import RUNNING
 from ..task.info import REPORT, Report
 from ..vector import StabilityVectorEnv
 from .cuda_graph import Graphed
+from .gradient import NOTHING, inputs_of
 from .packets import Capacity, capacity_of
+from .start import Start
 from .state import actions_on, compiles, device_of, dtype_of
 from .step import Outcome, State, Step
 from .transfer import DeviceRows
@@ -45,7 +47,7 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
     "float32". autoreset_mode: "NextStep", "SameStep" or "Disabled", as of `StabilityVectorEnv`.
     compile: a tick and what follows the ticks go through `torch.compile`, which takes minutes
     once, and on the CPU needs a C++ compiler (without one it warns and does not). graph: a step is
-    the launch of one CUDA graph.
+    the launch of one CUDA graph. grad: what a step returns has gradients, below.
 
     ## Tensors
     Observations are (N, k) float32, rewards (N,), `terminated` and `truncated` (N,) of bool.
@@ -61,6 +63,15 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
     Options are those of `StabilityVectorEnv`, but all rows have a plant of one kind: tyres, roll,
     lags, small angles and whether a driver reacts to the car are those of the env's own scenario.
 
+    ## Gradients
+    With `grad=True` observations (then of `dtype`, and actions are not rounded), rewards, infos,
+    `rows`, `packets` and `motion` have gradients to actions and to tensors () or (N,) in `reset`'s
+    options: `state`, by the names of a `Motion`, and `parameters`, by those of a `Vehicle`, true
+    ones in the place of what the seed drew. A row that is reset starts a graph of its own. At a
+    limit (actuators, grip, actions, the cost's cap) they are those of one side; they know nothing
+    of when something happens: failures, ends, arrivals. An env-step in which a row's numbers
+    overflow has none.
+
     Raises TypeError or ValueError for an argument out of place and a device that is not there.
     """
 
@@ -72,15 +83,18 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         compile: bool = False,
         graph: bool = False,
+        grad: bool = False,
         **arguments: Any,
     ) -> None:
         self.num_envs = count_of("num_envs", num_envs, "environments")
         self._mode = mode_of(autoreset_mode)
         self.device, self.dtype = device_of(device), dtype_of(dtype)
         self._compiled = compiles(compile, self.device)
-        self._graphed = graph
+        self._graphed, self._grad = graph, grad
         if graph and self.device.type != "cuda":
             raise ValueError(f"graph=True needs a CUDA device, got {self.device}")
+        if graph and grad:
+            raise ValueError("a CUDA graph holds no gradients: graph=True or grad=True")
         self._host = host = StabilityVectorEnv(num_envs, **arguments)  # it resets the rows
         self.layout, self.control_period = host.layout, host.control_period
         self.reference = host.reference
@@ -130,11 +144,13 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
         """The step with these capacities, and all rows on the device."""
         host = self._host
         all_samples = bool(host.config.base.start.switches[FLAGS.all_samples])
-        how = self.dtype, self.device, self._compiled
+        obs_dtype = self.dtype if self._grad else torch.float32
+        how = self.dtype, obs_dtype, self.device, self._compiled
         n, bounds = self.control_period, host.config.bounds
         step = Step(self._kind, n, most, all_samples, bounds, *how)
         self._step = Graphed(step) if self._graphed else step
-        self._rows = DeviceRows(host, most, self.device, self.dtype)
+        start = Start(step, tuple(most)) if self._grad else None
+        self._rows = DeviceRows(host, most, self.device, self.dtype, start)
 
     def reset(
         self, *, seed: Any = None, options: Mapping[str, Any] | None = None
@@ -145,16 +161,20 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
         if isinstance(mask, torch.Tensor):
             mask = asked["reset_mask"] = mask.cpu().numpy()
         chosen = np.flatnonzero(mask_of(mask, self.num_envs))
+        inputs = NOTHING
+        if self._grad:
+            like = self._rows.params
+            asked, inputs = inputs_of(asked, host.config.base, self.num_envs, like)
         free = {name: value for name, value in asked.items() if name != "reset_mask"}
         configs, _ = host.with_options(free, chosen.tolist())
         most = self._capacities(configs)
         if most == self._rows.most:
             host.reset(seed=seed, options=asked)
-            self._rows.take_over(host, chosen)
         else:
             self._rows.give_back(host)
             host.reset(seed=seed, options=asked)
             self._build(most)
+        self._rows.take_over(host, chosen, inputs)
         self._started, self._waiting = True, bool(self._rows.state.over.any())
         return self._rows.outcome.obs, self._infos()
 
@@ -170,9 +190,9 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
         config, rows = self._host.config, self._rows
         fail = config.on_bad_action == "fail"
         asked = actions_on(
-            actions, self.num_envs, config.action_width, fail, self.device, self.dtype
+            actions, self.num_envs, config.action_width, fail, self.device, self.dtype, self._grad
         )
-        with torch.no_grad():
+        with torch.set_grad_enabled(self._grad and torch.is_grad_enabled()):
             state, outcome = self._step(rows.params, rows.keys, rows.state, asked)
         flags = torch.stack((outcome.refused.any(), state.over.any()))
         refused, ended = flags.tolist()  # the one time the device is waited for
@@ -194,6 +214,13 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
             self._waiting = False
         infos |= self._infos()
         return rows.outcome.obs, outcome.rewards, outcome.terminated, outcome.truncated, infos
+
+    def detach(self) -> None:
+        """Cut the graph at the state: what follows has no gradients to actions and states before.
+
+        Parameters stay attached, by a graph of their own and with the values that they have now.
+        """
+        self._rows.detach()
 
     def _restart(self, over: Tensor) -> None:
         """Reset these rows (N,) without options."""

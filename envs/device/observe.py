@@ -1,4 +1,4 @@
-"""The float32 observation and the report of an env-step, on tensors."""
+"""The observation and the report of an env-step, on tensors."""
 
 from typing import Any
 
@@ -23,9 +23,15 @@ class Observer:
     """Observations and reports of a batch: `sensors` are the slow ones present."""
 
     def __init__(
-        self, sensors: tuple[int, ...], all_samples: bool, bounds: Tensor, dtype: torch.dtype
+        self,
+        sensors: tuple[int, ...],
+        all_samples: bool,
+        bounds: Tensor,
+        dtype: torch.dtype,
+        obs_dtype: torch.dtype,
     ) -> None:
-        """bounds: (2, k), of the observation's entries."""
+        """bounds: (2, k), of the observation's entries. obs_dtype: of the observations."""
+        self._obs_dtype = obs_dtype
         self._sensors, self._all_samples = sensors, all_samples
         self._bounds = bounds[:, :, None]
         self._clip, self._select, self._rest_of_cost = on_tensors(dtype, clip, select, rest_of_cost)
@@ -33,7 +39,7 @@ class Observer:
     def observe(
         self, rows: Tensor, done: Tensor, now: Now, slow: Tensor, delivered: Delivered
     ) -> Tensor:
-        """The summary (N, k), float32.
+        """The summary (N, k).
 
         rows: (n, FAST_WIDTH, N), of which the first `done` (N,) count. slow: as in `Under`.
         """
@@ -53,7 +59,7 @@ class Observer:
         entries += [shown.beta_ref, shown.gamma_ref]
         low, high = self._bounds.unbind(0)
         clipped: Tensor = self._clip(torch.stack(entries), low, high)
-        return clipped.T.to(torch.float32).contiguous()
+        return clipped.T.to(self._obs_dtype).contiguous()
 
     def _sensor(
         self, sensor: int, tick: Tensor, slow: Tensor, delivered: Delivered

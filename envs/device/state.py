@@ -65,9 +65,16 @@ def dtype_of(dtype: Any) -> torch.dtype:
 
 
 def actions_on(
-    actions: Any, count: int, width: int, fail: bool, device: torch.device, dtype: torch.dtype
+    actions: Any,
+    count: int,
+    width: int,
+    fail: bool,
+    device: torch.device,
+    dtype: torch.dtype,
+    grad: bool,
 ) -> Tensor:
-    """Actions (count, width) rounded to float32 as the other engines take them.
+    """Actions (count, width) rounded to float32 as the other engines take them; with `grad` a
+    tensor's are not rounded, and have their graph.
 
     Of a tensor the shape and the device must be right, else ValueError; with `fail` a wrong shape
     is NaN. Anything else is brought to the device as the vector env takes it.
@@ -86,8 +93,10 @@ def actions_on(
                 "nothing was stepped"
             )
         actions = torch.full((count, width), torch.nan, device=device)
-    rounded = actions.detach().to(torch.float32)
-    return rounded.to(dtype)
+    if not grad:
+        actions = actions.detach().to(torch.float32)
+    taken: Tensor = actions.to(dtype)
+    return taken
 
 
 def state_of(

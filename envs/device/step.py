@@ -9,8 +9,9 @@ from ..backend.primitives import select
 from ..engine.layout import P
 from ..engine.tick import Kind
 from ..record import Array
-from ..task.failures import BAD_ACTION, RUNNING
+from ..task.failures import BAD_ACTION, NOT_FINITE, RUNNING
 from ..task.info import REPORT
+from .gradient import Gate
 from .observe import Observer
 from .packets import Capacity, SlowSensors, SlowState, Window
 from .ticks import Now, Ticks, start_of
@@ -42,7 +43,7 @@ class State(NamedTuple):
 class Outcome(NamedTuple):
     """The outcome of an env-step."""
 
-    obs: Tensor  # (N, k), float32; zeros where the row had no tick
+    obs: Tensor  # (N, k); zeros where the row had no tick
     rewards: Tensor  # (N,)
     terminated: Tensor
     truncated: Tensor
@@ -57,7 +58,7 @@ class Step:
     """The env-steps of rows of one kind.
 
     kind: what chooses the plant's text. most: the slow sensors present, each with its
-    capacity. compile: through `torch.compile`.
+    capacity. obs_dtype: of the observations. compile: through `torch.compile`.
     """
 
     def __init__(
@@ -68,16 +69,17 @@ class Step:
         all_samples: bool,
         bounds: Array,
         dtype: torch.dtype,
+        obs_dtype: torch.dtype,
         device: torch.device,
         compile: bool,
     ) -> None:
-        self._n = n
+        self.kind, self.n, self.dtype = kind, n, dtype
         self._ticks = Ticks(kind, dtype, compile)
         self._slow = SlowSensors(most, kind.small_angle, dtype)
         limits = torch.as_tensor(bounds, dtype=dtype, device=device)
-        self._observer = Observer(tuple(most), all_samples, limits, dtype)
+        self._observer = Observer(tuple(most), all_samples, limits, dtype, obs_dtype)
         self._clip, self._select = on_tensors(dtype, clip, select)
-        self._conclude: Any = compiled(self._concluded) if compile else self._concluded
+        self.conclude: Any = compiled(self._concluded) if compile else self._concluded
 
     def __call__(
         self, p: Tensor, keys: Tensor, state: State, actions: Tensor
@@ -88,15 +90,19 @@ class Step:
         whose action is not finite fail. Rows that are over stand still.
         """
         finite = torch.isfinite(actions).all(1)
+        gate = Gate()
+        p, state = gate(p), State(*map(gate, state))
         shares = self._clip(torch.where(finite[:, None], actions, 0.0), -1.0, 1.0)
-        turn = shares[:, 1] if actions.shape[1] > 1 else torch.zeros_like(state.tick)
+        share, *turns = map(gate, shares.unbind(1))
+        turn = turns[0] if turns else torch.zeros_like(state.tick)
         running = finite & ~state.over
         where = state.motion, state.drive, state.driver, state.refs, state.lead, state.tick
         start = start_of(*where, running)
-        now, rows, track = self._ticks.drive_on(p, keys, start, shares[:, 0], turn, self._n)
+        now, rows, track = self._ticks.drive_on(p, keys, start, share, turn, self.n)
         refused = ~finite & ~state.over
         after: State
-        after, outcome = self._conclude(p, keys, state, now, rows, track, running, refused)
+        after, outcome = self.conclude(p, keys, state, now, rows, track, running, refused)
+        gate.open = after.failure != NOT_FINITE
         return after, outcome
 
     def _concluded(

@@ -7,7 +7,9 @@ import numpy as np
 from ..backend.on_torch import torch
 from ..engine.episodes import Episodes, Whole
 from ..record import PACKET_WIDTH
+from .gradient import NOTHING, Attached, Inputs, with_motion
 from .packets import Capacity
+from .start import Start
 from .state import state_of, write_states
 from .step import Outcome, State
 
@@ -18,7 +20,8 @@ _RECORD = Outcome._fields.index("rows")  # from here on the rows are the last ax
 class DeviceRows:
     """Parameters, keys, state and last outcome of episodes, as tensors on a device.
 
-    most: the slow sensors present and each one's capacity.
+    most: the slow sensors present and each one's capacity. start: tick 0 on tensors, for
+    gradients; without one parameters stay where they are, for a graph that reads them there.
     """
 
     def __init__(
@@ -27,43 +30,61 @@ class DeviceRows:
         most: dict[int, Capacity],
         device: torch.device,
         dtype: torch.dtype,
+        start: Start | None = None,
     ) -> None:
         self.most, self._device, self._dtype = most, device, dtype
+        self._start, self._attached = start, Attached()
+        self._obs_dtype = dtype if start else torch.float32
         self._capacity = sum(each.under_way for each in most.values())
         self._packets = self._capacity + sum(each.frames * each.copies for each in most.values())
         everything = np.arange(len(episodes.params))
-        self.params, self.keys, self.state, self.outcome = self._of(episodes, everything)
+        self._numbers, self.keys, self.state, self.outcome = self._of(episodes, everything)
+        self.params = self._numbers
 
-    def take_over(self, episodes: Episodes, rows: Whole) -> None:
-        """Bring rows of the episodes that were reset to the device."""
+    def take_over(self, episodes: Episodes, rows: Whole, inputs: Inputs = NOTHING) -> None:
+        """Bring rows of the episodes that were reset to the device, and with them the inputs."""
         params, keys, state, outcome = self._of(episodes, rows)
+        place = torch.as_tensor(rows, device=self._device)
+        if self._start is None:
+            self.params.index_copy_(-1, place, params)
+        else:
+            self._numbers = self._numbers.index_copy(-1, place, params)
+            self._attached.put(place, episodes.configs, inputs.parameters)
+            self.params = self._attached.into(self._numbers)
+            state = state._replace(motion=with_motion(state.motion, inputs.state, place))
+            state, outcome = self._start(self.params[:, place], keys, state)
         if len(rows) == len(episodes.params):
-            self.params.copy_(params)  # in place: a graph reads them where they are
             self.keys.copy_(keys)
             self.state, self.outcome = state, outcome
             return
-        place = torch.as_tensor(rows, device=self._device)
 
         def merged(old: Tensor, new: Tensor, axis: int = -1) -> Tensor:
             return old.index_copy(axis, place, new)
 
-        self.params.index_copy_(-1, place, params)
         self.keys.index_copy_(-1, place, keys)
         self.state = State(*map(merged, self.state, state))
         before = self.outcome
         record = map(merged, before[_RECORD:], outcome[_RECORD:])
         self.outcome = Outcome(merged(before.obs, outcome.obs, 0), *before[1:_RECORD], *record)
 
+    def detach(self) -> None:
+        """State and outcome without their graph, and the parameters with a new one."""
+        self.state = State(*(each.detach() for each in self.state))
+        self.outcome = Outcome(*(each.detach() for each in self.outcome))
+        self.params = self._attached.into(self._numbers)
+
     def give_back(self, episodes: Episodes) -> None:
-        """Write state and outcome into the episodes."""
-        write_states(self.state, episodes.states)
-        outcome = Outcome(*(each.cpu() for each in self.outcome))
+        """Write state, outcome and the inputs' numbers into the episodes."""
+        self._attached.write(self.params, episodes.params)
+        state = State(*(each.detach() for each in self.state))
+        write_states(state, episodes.states)
+        outcome = Outcome(*(each.detach().cpu() for each in self.outcome))
         packets = outcome.packets.permute(2, 0, 1)
         width = min(packets.shape[1], episodes.packets.shape[1])
         episodes.packets[:, :width] = packets[:, :width]
         episodes.rows[:] = outcome.rows.permute(2, 0, 1)
-        episodes.over[:] = self.state.over.cpu()
-        episodes.reports[:] = self.state.report.T.cpu()
+        episodes.over[:] = state.over.cpu()
+        episodes.reports[:] = state.report.T.cpu()
         episodes.obs[:] = outcome.obs
         episodes.ticks_done[:], episodes.delivered[:] = outcome.done, outcome.delivered
 
@@ -87,7 +108,7 @@ class DeviceRows:
         packets[:, :width] = episodes.packets[rows, :width]
         none = torch.zeros(len(rows), dtype=torch.bool, device=device)
         outcome = Outcome(
-            torch.as_tensor(episodes.obs[rows]).to(device),
+            torch.as_tensor(episodes.obs[rows]).to(device, self._obs_dtype),
             torch.zeros(len(rows), dtype=dtype, device=device),
             none,
             none,

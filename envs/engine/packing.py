@@ -77,6 +77,20 @@ def car_of(vehicle: Vehicle) -> Car:
     )
 
 
+def task_of(vehicle: Vehicle, scenario: Scenario, yaw_first: bool) -> Task:
+    """The episode's length and limits."""
+    return Task(
+        duration=ticks(scenario.duration),
+        half_width=scenario.half_width,
+        yaw_scale=vehicle.yaw_moment_limit,
+        yaw_first=float(yaw_first),
+        spin=SPIN_ANGLE,
+        authority=vehicle.steering_authority,
+        slew=vehicle.steering_rate * TICK,
+        stop=vehicle.steering_stop,
+    )
+
+
 def _pace_of(scenario: Scenario) -> Pace:
     """The driver's work along the road; the speed itself is drawn."""
     pace = Pace(speed=0.0, hold=1.0, acceleration=0.0, start=0.0, end=FOREVER, k_p=2.0, k_i=0.5)
@@ -179,16 +193,7 @@ def episode_config(
             keep=keep,
             fresh=math.sqrt(1.0 - keep * keep),
         ),
-        task=Task(
-            duration=ticks(scenario.duration),
-            half_width=scenario.half_width,
-            yaw_scale=vehicle.yaw_moment_limit,
-            yaw_first=float(yaw_first),
-            spin=SPIN_ANGLE,
-            authority=vehicle.steering_authority,
-            slew=vehicle.steering_rate * TICK,
-            stop=vehicle.steering_stop,
-        ),
+        task=task_of(vehicle, scenario, yaw_first),
         programme=(0.0,) * STEERING_WIDTH,  # drawn
         sky=_sky_of(scenario, links["gps"]),
         driver=Driver(

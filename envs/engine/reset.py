@@ -76,6 +76,16 @@ def _write_motion(z: Any, d: Any, start: Any, small_angle: int) -> None:
             z[Z.motion[i]] = start[i]
 
 
+@jit
+def first_row(
+    motion: Any, steer: Any, road: Any, d_f: Any, noise: Any, chance: Any, small_angle: int
+) -> Any:
+    """The fast sensors at tick 0, columns as in `Fast`: nothing has acted yet but the steering."""
+    acted = (steer, 0.0, 0.0, steer, 0.0, curvature_beside(motion, road))
+    g_x, g_y = gravity_at(motion, road, small_angle)
+    return fast_row(motion, (g_x, g_y + GRAVITY * motion.phi), acted, d_f, noise, chance)
+
+
 @apart
 def reset_vehicle(start: Start, key_low: int, key_high: int, bounds: Any, row: Row) -> None:
     """Draw the episode from a key, two words of 32 bits, and deliver tick 0."""
@@ -124,11 +134,9 @@ def reset_vehicle(start: Start, key_low: int, key_high: int, bounds: Any, row: R
     beta = sideslip_angle(motion.v_x, motion.v_y, small_angle)
     fast = normals(key_low, key_high, 0, CHANNELS.inertial)
     wheels = normals(key_low, key_high, 0, CHANNELS.wheels)
-    acted = (steer, 0.0, 0.0, steer, 0.0, curvature_beside(motion, road))
-    g_x, g_y = gravity_at(motion, road, small_angle)
-    accel = (g_x, g_y + GRAVITY * motion.phi)
     chance, noise = Chance(fast, wheels), read(p, P.noise)
-    write(rows[0], fast_row(motion, accel, acted, p[P.car.d_f], noise, chance), FAST)
+    row_0 = first_row(motion, steer, road, p[P.car.d_f], noise, chance, small_angle)
+    write(rows[0], row_0, FAST)
     count = sense_slow(row, motion, 0.0, 0)
     v = 0.5 * (rows[0, FAST.wheel_left] + rows[0, FAST.wheel_right])
     refs = reference(steer, v, target, switches[FLAGS.reference])
