@@ -94,6 +94,10 @@ def mirror(array: Any, i: int, j: int) -> None:
     array[j : j + 8, i : i + 8] = np.where(np.tri(8, k=-1), block.T, block) if i == j else block.T
 
 
+def prefetch(array: Any, *index: int) -> None:
+    """Have the cache line of a number fetched that is soon read; it may lie beyond the array."""
+
+
 def scratch(rows: int, columns: int) -> Any:
     """A matrix to work in, of constant shape and with any numbers in it, until the function ends.
 
@@ -311,6 +315,24 @@ def _lower_mirror(context, builder, sig, args):
     for k in range(8):
         lower = mixed(turned[k], above[k], [m if m < k else m + 8 for m in range(8)])
         builder.store(builder.select(diagonal, lower, turned[k]), row(j, k, i), align=8)
+    return context.get_dummy_value()
+
+
+@infer_global(prefetch)
+class _Prefetch(AbstractTemplate):
+    def generic(self, args, kws):
+        array, *index = args
+        return signature(types.none, array, *_whole(index)) if _is_row(array, len(index)) else None
+
+
+@lower_builtin(prefetch, types.Array, types.VarArg(types.Any))
+def _lower_prefetch(context, builder, sig, args):
+    byte, flag = ir.IntType(8).as_pointer(), ir.IntType(32)
+    kind = ir.FunctionType(ir.VoidType(), [byte, flag, flag, flag])
+    function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
+    where = _place(context, builder, sig.args[0], args[0], args[1:])
+    flags = [ir.Constant(flag, each) for each in (1, 3, 1)]  # to be written, to all caches, data
+    builder.call(function, [builder.bitcast(where, byte), *flags])
     return context.get_dummy_value()
 
 

@@ -10,11 +10,14 @@ uses depends on four codes, and the comments name them:
 `design.assemble` writes the blocks from the model to the gains once; `run.begin` sets the rest.
 """
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from ...envs.backend.arrays import prefetch
+from ...envs.backend.decorators import jit
 from ...envs.record import PACKET_WIDTH
 from ...envs.sensors.slow import SLOW_NAMES
 
@@ -268,10 +271,37 @@ _WINDOW = [  # history: of tick k in row k % WINDOW
     ("replay", _INT, (RECENT,)),  # scratch: those that are used again
 ]
 
+_FIELDS = _MODEL + _BANK + _FAST + _SLOW + _DELAY + _GAINS + _SPEED + _NOW + _BETWEEN + _SCRATCH
+_SMALL = 64  # numbers
+
+
+def _size(field: Any) -> int:
+    """Numbers of a field."""
+    return math.prod(field[2]) if len(field) > 2 else 1
+
+
 FILTER = np.dtype(
     [
-        *(_MODEL + _BANK + _FAST + _SLOW + _DELAY + _GAINS),
-        *(_SPEED + _NOW + _BETWEEN + _SCRATCH + _WINDOW),
+        ("ahead", _FLOAT, (1,)),  # where the small fields begin
+        *sorted(_FIELDS, key=_size),  # those that a tick reads lie next to each other
+        *_WINDOW,
     ],
     align=True,
 )
+HEAD = sum(_size(field) for field in _FIELDS if _size(field) <= _SMALL)
+"""Numbers of the small fields, which come first in a record."""
+
+
+@jit
+def fetch(f: Memory, like: Memory) -> None:
+    """Have the caches fetch what a tick reads of a filter, whose states are as many as `like`'s."""
+    for i in range(0, HEAD, 8):
+        prefetch(f.ahead, i)
+    for j in range(0, like.total, 8):
+        for i in range(like.total):
+            prefetch(f.P, i, j)
+    for j in range(0, like.n, 8):
+        for i in range(like.n):
+            prefetch(f.Q, i, j)
+            prefetch(f.G, i, j)
+            prefetch(f.GT, i, j)

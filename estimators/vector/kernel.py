@@ -10,7 +10,7 @@ import numpy as np
 
 from ...envs.backend.decorators import counted
 from ...envs.backend.primitives import maximum
-from ..core.memory import FILTER
+from ..core.memory import FILTER, fetch
 from ..entry import entry
 from ..wrappers.kernel import observe
 
@@ -52,6 +52,8 @@ def observe_batch(
         if done[i] < rows[i]:
             f, gains, start = filters[i], gains_of(pool, places[i]), maximum(done[i], 0)
             own = obs[i], inner, plan, limits, beta[i], gamma[i], out[i], summary[i]
+            for layer in range(len(f) if i + 1 < len(filters) else 0):
+                fetch(filters[i + 1, layer], f[layer])
             done[i] = observe(f, gains, fast[i], rows[i], packets[i], counts[i], start, *own)
             waiting += 1 if done[i] < rows[i] else 0
     return waiting
