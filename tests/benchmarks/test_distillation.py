@@ -31,7 +31,7 @@ def test_every_contest_is_in_one_class() -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("--class", "coms"), "unknown class of contests 'coms'; did you mean"),
+        (("--class", "coms"), "unknown class of contests 'coms'; known: coms-model"),
         (("--class", "coms-model", "--estimator", "dakf"), "unknown estimator 'dakf'"),
         (("--class", "coms-model", "--teacher", "oracle"), "unknown agent 'oracle'"),
         (("--class", "coms-model", "--teacher", "lane-keeping"), "needs psi_hat, y_l_hat"),
