@@ -25,7 +25,8 @@ from ..make import make_estimator
 
 Array = npt.NDArray[np.float64]
 
-_MODEL = ("car", "A", "B", "G", "H", "C_fast", "D_fast")  # of a filter's memory, at a held speed
+# of a filter's memory, at a held speed
+_MODEL = ("car", "A", "B", "G", "GT", "H", "HT", "C_fast", "D_fast")
 
 
 class Change(NamedTuple):
@@ -96,6 +97,7 @@ def _push(filter_: Any, arm: float) -> None:
     gust, force, moment = (names.index(name) for name in ("bank", "F_d", "N_d"))
     for matrix in (f.G, f.C_fast):
         matrix[:, gust] = matrix[:, force] + arm * matrix[:, moment]
+    f.GT[gust] = f.G[:, gust]
 
 
 def _become(filter_: Any, later: Any) -> None:
