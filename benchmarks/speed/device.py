@@ -1,15 +1,16 @@
 """Question: how many env-steps a second does the device engine take, and what bounds it?
 
-`python -m sideslip.benchmarks.speed.device --device cuda --compile --out table.md`
+`python -m sideslip.benchmarks.speed.device --device cuda --out table.md`
 """
 
+import itertools
 import shlex
 import statistics
 import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import typer
 from rich.console import Console
@@ -28,6 +29,7 @@ class Measured(NamedTuple):
     """What a batch of `size` rows did."""
 
     size: int
+    dtype: str
     rate: float  # env-steps a second of wall time: median, least and largest of the rounds
     least: float
     largest: float
@@ -51,16 +53,16 @@ def bandwidth(device: torch.device) -> float:
     return 2.0 * _COPIED / min(taken[1:])
 
 
-def bytes_of(env: DeviceVectorEnv) -> float:
+def bytes_of(env: Any) -> float:
     """The least that a step of one row moves: its parameters and its state are read, the state,
     the observation and the record are written."""
     held, brought = env.tensors()
     read = sum(each.nbytes for each in held) + env.num_envs * PARAMS_WIDTH * env.dtype.itemsize
     written = sum(each.nbytes for each in (*held, *brought))
-    return (read + written) / env.num_envs
+    return float((read + written) / env.num_envs)
 
 
-def measure(env: DeviceVectorEnv, copied: float, rounds: int, steps: int) -> Measured:
+def measure(env: Any, copied: float, rounds: int, steps: int) -> Measured:
     """Rounds of `steps` steps each, after one that does not count."""
     env.reset(seed=0)
     actions = torch.zeros(env.action_space.shape or (), device=env.device)
@@ -71,24 +73,24 @@ def measure(env: DeviceVectorEnv, copied: float, rounds: int, steps: int) -> Mea
 
     taken = [_seconds(several, env.device) for _ in range(rounds + 1)][1:]
     rates = [env.num_envs * steps / each for each in taken]
-    return Measured(
-        env.num_envs, statistics.median(rates), min(rates), max(rates), bytes_of(env), copied
-    )
+    middle, dtype = statistics.median(rates), str(env.dtype).removeprefix("torch.")
+    return Measured(env.num_envs, dtype, middle, min(rates), max(rates), bytes_of(env), copied)
 
 
 def table(found: Sequence[Measured]) -> str:
     """The measurements as Markdown."""
     lines = [
-        "| N | env-steps/s | range | us a step of all | bytes a row, at least | of a copy's "
-        "bandwidth |",
-        "|---|---|---|---|---|---|",
+        "| N | floats | env-steps/s | range | us a step of all | bytes a row, at least "
+        "| of a copy's bandwidth |",
+        "|---|---|---|---|---|---|---|",
     ]
     for each in found:
         share = each.rate * each.bytes_a_step / each.bandwidth
+        microseconds = 1e6 * each.size / each.rate
         lines.append(
-            f"| {each.size} | {each.rate:.3g} | {each.least:.3g} .. {each.largest:.3g} "
-            f"| {1e6 * each.size / each.rate:.4g} | {each.bytes_a_step:.0f} "
-            f"| {100.0 * share:.2g} % |"
+            f"| {each.size} | {each.dtype} | {each.rate:.3g} "
+            f"| {each.least:.3g} .. {each.largest:.3g} | {microseconds:.4g} "
+            f"| {each.bytes_a_step:.0f} | {100.0 * share:.2g} % |"
         )
     return "\n".join(lines)
 
@@ -102,33 +104,35 @@ def name_of(device: torch.device) -> str:
 
 def main(
     device: Annotated[str, typer.Option(help="cpu, cuda, cuda:1, ...")] = "cpu",
-    dtype: Annotated[str, typer.Option(help="float32 or float64.")] = "float32",
+    dtype: Annotated[list[str] | None, typer.Option(help="float32, float64; both.")] = None,
     env: Annotated[str, typer.Option(help="An environment's id.")] = "sideslip/YawFusion-v0",
     count: Annotated[list[int] | None, typer.Option(help="Rows of a batch; repeatable.")] = None,
+    engine: Annotated[str, typer.Option(help="cuda, or torch: on a GPU, else torch.")] = "",
     compiled: Annotated[bool, typer.Option("--compile", help="By torch.compile.")] = False,
-    graph: Annotated[bool, typer.Option("--graph", help="A step is one CUDA graph.")] = False,
     steps: Annotated[int, typer.Option(min=1, help="Steps of a round.")] = 20,
     rounds: Annotated[int, typer.Option(min=1, help="Rounds that count.")] = ROUNDS,
     out: Annotated[Path | None, typer.Option(help="Write the table as Markdown.")] = None,
 ) -> None:
-    """Measure env-steps per second against the size of the batch.
+    """Measure env-steps per second against the size of the batch; ValueError without the device.
 
     Episodes end and start anew where the steps are many enough; the resets are then part of it.
     """
     check_writable(out)
     console, found = Console(), []
     copied = 0.0
-    for each in count or COUNTS:
+    engine = engine or ("cuda" if device.startswith("cuda") else "torch")
+    how: dict[str, Any] = {"engine": engine} | ({"compile": True} if compiled else {})
+    for kind, each in itertools.product(dtype or ("float32", "float64"), count or COUNTS):
         batch = DeviceVectorEnv.make(
-            env, each, device=device, dtype=dtype, compile=compiled, graph=graph
+            env, each, device=device, dtype=kind, on_bad_action="fail", **how
         )
         copied = copied or bandwidth(batch.device)
         found.append(measure(batch, copied, rounds, steps))
-        console.print(f"{each}: {found[-1].rate:.3g} env-steps/s", highlight=False)
+        console.print(f"{each}, {kind}: {found[-1].rate:.3g} env-steps/s", highlight=False)
         del batch
     text = (
         f"`{shlex.join(['python', '-m', 'sideslip.benchmarks.speed.device', *sys.argv[1:]])}`\n\n"
-        f"{name_of(torch.device(device))}, torch {torch.__version__}; {env}, {dtype}, "
+        f"{name_of(torch.device(device))}, torch {torch.__version__}; {env}, engine {engine}, "
         f"{'compiled' if compiled else 'not compiled'}. Median and range of {rounds} rounds of "
         f"{steps} steps, wall time. A copy on the device moves {copied / 1e9:.3g} GB/s.\n\n"
         f"{table(found)}\n"

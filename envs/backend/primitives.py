@@ -59,6 +59,16 @@ def whole(a: Any) -> Any:
     return int(a)
 
 
+def word(a: Any) -> Any:
+    """The 32-bit word that a float stands for: its value; where floats have 32 bits, its bits."""
+    return int(a)
+
+
+def from_word(a: Any) -> Any:
+    """The float that stands for a 32-bit word."""
+    return a * 1.0
+
+
 def anywhere(condition: Any) -> Any:
     """Whether a condition holds for any of the cars that are computed together."""
     return condition
@@ -181,6 +191,8 @@ _teach(sqrt, _of_float, _machine("sqrt"))
 _teach(select, _of_choice, lambda builder, sig, args: builder.select(*args))
 _teach(to_float, _converted(types.float64, FLOATS), _as_float)
 _teach(whole, _converted(types.int64, INTS), _as_whole)
+_teach(word, _converted(types.int64, INTS), _as_whole)
+_teach(from_word, _converted(types.float64, FLOATS), _as_float)
 _teach(
     anywhere,
     lambda a: signature(types.boolean, BOOLS if a is BOOLS else types.boolean),

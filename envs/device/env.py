@@ -8,23 +8,21 @@ import numpy as np
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, VectorEnv
 
-from ..arguments import count_of, mask_of, mode_of, named
+from ..arguments import check_choice, count_of, mask_of, mode_of, named
 from ..backend.arrays import read
 from ..backend.on_torch import torch
+from ..cuda.tensors import device_of, dtype_of, infos_in
 from ..engine.layout import FLAGS, P
 from ..engine.packing import EpisodeConfig
 from ..engine.step import kind_of
 from ..engine.tick import Kind
 from ..sensors.link import Link
 from ..sensors.slow import SLOW_NAMES
-from ..task.failures import RUNNING
-from ..task.info import REPORT, Report
 from ..vector import StabilityVectorEnv
-from .cuda_graph import Graphed
 from .gradient import NOTHING, inputs_of
 from .packets import Capacity, capacity_of
 from .start import Start
-from .state import actions_on, compiles, device_of, dtype_of
+from .state import actions_on, compiles
 from .step import Outcome, State, Step
 from .transfer import DeviceRows
 
@@ -46,8 +44,9 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
     arguments: those of `StabilityEnv`. device: "cpu", "cuda", "cuda:1", ... dtype: "float64" or
     "float32". autoreset_mode: "NextStep", "SameStep" or "Disabled", as of `StabilityVectorEnv`.
     compile: a tick and what follows the ticks go through `torch.compile`, which takes minutes
-    once, and on the CPU needs a C++ compiler (without one it warns and does not). graph: a step is
-    the launch of one CUDA graph. grad: what a step returns has gradients, below.
+    once, and on the CPU needs a C++ compiler (without one it warns and does not). engine: "torch",
+    or "cuda", which makes a `CudaVectorEnv`: one kernel a step. grad: what a step returns has
+    gradients, below.
 
     ## Tensors
     Observations are (N, k) float32, rewards (N,), `terminated` and `truncated` (N,) of bool.
@@ -75,6 +74,15 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
     Raises TypeError or ValueError for an argument out of place and a device that is not there.
     """
 
+    def __new__(cls, *arguments: Any, engine: str = "torch", **named: Any) -> Any:
+        """The environments of another engine where it is chosen."""
+        check_choice("engine", engine, ("torch", "cuda"))
+        if engine == "torch":
+            return super().__new__(cls)
+        from ..cuda.env import CudaVectorEnv
+
+        return CudaVectorEnv(*arguments, **named)
+
     def __init__(
         self,
         num_envs: int = 1,
@@ -82,7 +90,7 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
         dtype: Any = "float64",
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         compile: bool = False,
-        graph: bool = False,
+        engine: str = "torch",
         grad: bool = False,
         **arguments: Any,
     ) -> None:
@@ -90,11 +98,7 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
         self._mode = mode_of(autoreset_mode)
         self.device, self.dtype = device_of(device), dtype_of(dtype)
         self._compiled = compiles(compile, self.device)
-        self._graphed, self._grad = graph, grad
-        if graph and self.device.type != "cuda":
-            raise ValueError(f"graph=True needs a CUDA device, got {self.device}")
-        if graph and grad:
-            raise ValueError("a CUDA graph holds no gradients: graph=True or grad=True")
+        self._grad = grad
         self._host = host = StabilityVectorEnv(num_envs, **arguments)  # it resets the rows
         self.layout, self.control_period = host.layout, host.control_period
         self.reference = host.reference
@@ -147,8 +151,7 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
         obs_dtype = self.dtype if self._grad else torch.float32
         how = self.dtype, obs_dtype, self.device, self._compiled
         n, bounds = self.control_period, host.config.bounds
-        step = Step(self._kind, n, most, all_samples, bounds, *how)
-        self._step = Graphed(step) if self._graphed else step
+        self._step = step = Step(self._kind, n, most, all_samples, bounds, *how)
         start = Start(step, tuple(most)) if self._grad else None
         self._rows = DeviceRows(host, most, self.device, self.dtype, start)
 
@@ -231,11 +234,7 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
 
     def _infos(self) -> Infos:
         """The numbers of `info` of every row, (N,) each."""
-        report = self._rows.state.report
-        infos: Infos = dict(zip(Report._fields, report[: REPORT.failure].unbind(0), strict=False))
-        infos["failure"] = failure = report[REPORT.failure].to(torch.int64)
-        infos["is_success"] = (report[REPORT.ended] == 1.0) & (failure == RUNNING)
-        return infos
+        return infos_in(self._rows.state.report)
 
     @property
     def rows(self) -> Tensor:

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..arguments import actions_of
-from ..backend.on_torch import DTYPES, torch
+from ..backend.on_torch import torch
 from ..engine.layout import Z
 from ..record import Array
 from .packets import read_packed, write_packed
@@ -22,23 +22,6 @@ _MOTION, _DRIVE, _REFS, _LEAD = (
 )
 _PACKED = _MOTION, _DRIVE, Z.driver, _REFS, _LEAD, Z.clock.tick, Z.clock.failure
 """Where the first fields of a `State` lie in the packed state."""
-
-
-def device_of(device: Any) -> torch.device:
-    """The device of a name or itself; ValueError for an unknown one and one that is not there."""
-    try:
-        made = torch.device(device)
-    except (RuntimeError, TypeError):
-        made = None
-    if made is None or made.type not in ("cpu", "cuda"):
-        raise ValueError(f"unknown device {device!r}; known: 'cpu', 'cuda', 'cuda:0', ...")
-    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
-    if made.type == "cuda" and (made.index or 0) >= count:
-        there = ", ".join(["cpu", *(f"cuda:{i}" for i in range(count))])
-        raise ValueError(
-            f"device {str(device)!r} is not there: torch {torch.__version__} finds {there}"
-        )
-    return made
 
 
 def compiles(wanted: bool, device: torch.device) -> bool:
@@ -54,14 +37,6 @@ def compiles(wanted: bool, device: torch.device) -> bool:
         )
         return False
     return wanted
-
-
-def dtype_of(dtype: Any) -> torch.dtype:
-    """The type of floats of a name or itself; ValueError for another."""
-    known = DTYPES | {each: each for each in DTYPES.values()}
-    if dtype not in known:
-        raise ValueError(f"dtype is 'float64' or 'float32', got {dtype!r}")
-    return known[dtype]
 
 
 def actions_on(

@@ -74,13 +74,18 @@ def step_rows(
             continue
         report = reports[i]
         delivered[i] = int(report[REPORT.packets])
-        rewards[i] = -report[REPORT.cost]
-        terminated[i] = report[REPORT.failure] != RUNNING
-        truncated[i] = report[REPORT.ended] == 1.0 and not terminated[i]
+        rewards[i], terminated[i], truncated[i] = ends_of(report)
         over[i] = terminated[i] or truncated[i]
         if over[i]:
             ended += 1
     return ended
+
+
+@jit
+def ends_of(report: Any) -> tuple[float, bool, bool]:
+    """(reward, terminated, truncated) of a step's report."""
+    terminated = report[REPORT.failure] != RUNNING
+    return -report[REPORT.cost], terminated, report[REPORT.ended] == 1.0 and not terminated
 
 
 @jit

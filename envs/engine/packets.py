@@ -7,7 +7,7 @@ from typing import Any
 
 from ..backend.arrays import read
 from ..backend.decorators import jit
-from ..backend.primitives import minimum
+from ..backend.primitives import minimum, word
 from ..record import PACKET, PACKET_WIDTH
 from ..sensors.link import arrivals
 from ..sensors.slow import BLOCKS, SEES, VALUES, Scene, sample
@@ -112,7 +112,7 @@ def sense_slow(row: Any, motion: Any, tick: Any, count: int) -> int:
     Returns how many packets there are then.
     """
     p, z, small_angle = row.p, row.z, row.switches[FLAGS.small_angle]
-    key = (int(z[Z.clock.key_low]), int(z[Z.clock.key_high]))
+    key = (word(z[Z.clock.key_low]), word(z[Z.clock.key_high]))
     for sensor in range(len(Z.slow)):
         at = Z.slow[sensor]
         if tick == z[at.next_capture]:

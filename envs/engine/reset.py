@@ -5,7 +5,7 @@ from typing import Any
 from ..backend.arrays import read, write
 from ..backend.decorators import apart, copied, jit
 from ..backend.elementary import sincos
-from ..backend.primitives import select
+from ..backend.primitives import from_word, select
 from ..backend.random import CHANNELS, normals
 from ..record import FAST
 from ..scenarios.draws import DRAWS, DRAWS_WIDTH, realise
@@ -123,7 +123,7 @@ def reset_vehicle(start: Start, key_low: int, key_high: int, bounds: Any, row: R
     z[Z.driver] = steer
     z[Z.drive.F_d] = p[P.disturbance.force] * n[0]
     z[Z.drive.N_d] = p[P.disturbance.moment] * n[1]
-    z[Z.clock.key_low], z[Z.clock.key_high] = key_low, key_high
+    z[Z.clock.key_low], z[Z.clock.key_high] = from_word(key_low), from_word(key_high)
     z[Z.clock.redraws], z[Z.clock.next_due] = redraws, FAR
     for sensor in range(len(Z.slow)):
         link, at = read(p, P.slow[sensor]), Z.slow[sensor]

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..backend.arrays import at, lane_count, offsets, put, ramp, read, write
 from ..backend.decorators import jit
-from ..backend.primitives import anywhere, to_float, whole
+from ..backend.primitives import anywhere, to_float, whole, word
 from ..backend.random import CHANNELS, normals
 from ..backend.simd import LANES
 from ..record import Array
@@ -54,7 +54,7 @@ def follow(p: Any, z: Any, n: int, window: Any) -> None:
             window[WINDOW.ahead, j] = trace_at(z[Z.clock.tick] + (j + 1), p[PARAMS_WIDTH:])
     hold = p[_HOLD]
     if hold > 0.0:
-        angle, key_low, key_high = z[Z.driver], int(z[Z.clock.key_low]), int(z[Z.clock.key_high])
+        angle, key_low, key_high = z[Z.driver], word(z[Z.clock.key_low]), word(z[Z.clock.key_high])
         for j in range(n):
             tick = int(z[Z.clock.tick]) + (j + 1)
             if tick % int(hold) == 0:
@@ -77,7 +77,7 @@ def foresee(p: Any, z: Any, n: int, follows: int, window: Any) -> None:
     follows: 1 where the driver reacts to the car, and no programme steers.
     """
     clock = read(z, Z.clock)
-    key_low, key_high, first = int(clock.key_low), int(clock.key_high), int(clock.tick) + 1
+    key_low, key_high, first = word(clock.key_low), word(clock.key_high), int(clock.tick) + 1
     programme = read(p, P.programme)
     for j in range(0, n, lane_count()):
         ticks = ramp(first + j)
@@ -94,7 +94,7 @@ def foresee(p: Any, z: Any, n: int, follows: int, window: Any) -> None:
 def foresee_lanes(p: Any, z: Any, n: int, follows: int, window: Any) -> None:
     """The same of a block of vehicles: p, z with a column for each."""
     clock = read(z, Z.clock)
-    key_low, key_high = whole(clock.key_low), whole(clock.key_high)
+    key_low, key_high = word(clock.key_low), word(clock.key_high)
     programme = read(p, P.programme)
     for j in range(n):
         tick = clock.tick + (j + 1)

@@ -5,9 +5,9 @@ from typing import Any
 
 import pytest
 
-pytest.importorskip("torch")
+torch = pytest.importorskip("torch")
 
-from sideslip.benchmarks.speed import device as device_speed
+from sideslip.benchmarks.speed import device as device_speed  # noqa: E402
 
 ENV_ID = "sideslip/YawVision-v0"
 
@@ -17,24 +17,33 @@ def test_the_table_has_a_line_for_each_size_and_says_how_it_was_made(
 ) -> None:
     monkeypatch.setattr(device_speed, "_COPIED", 1 << 20)
     out = tmp_path / "table.md"
-    device_speed.main("cpu", "float64", ENV_ID, [4, 8], compiled=False, steps=1, rounds=2, out=out)
+    device_speed.main("cpu", ["float64"], ENV_ID, [4, 8], steps=1, rounds=2, out=out)
     command, _, text, _, *lines = out.read_text().splitlines()
     assert "sideslip.benchmarks.speed.device" in command
-    assert f"{ENV_ID}, float64, not compiled. Median and range of 2 rounds of 1 steps" in text
+    assert f"{ENV_ID}, engine torch, not compiled. Median and range of 2 rounds of 1 steps" in text
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
     assert [row[0] for row in rows] == ["N", "---", "4", "8"]
-    for count, rate, spread, *_ in rows[2:]:
+    for count, dtype, rate, spread, *_ in rows[2:]:
+        assert dtype == "float64"
         low, high = map(float, spread.split(" .. "))
         assert 0.0 < low <= float(rate) <= high, count
 
 
 @pytest.mark.parametrize(
     ("wrong", "message"),
-    [({"device": "gpu"}, "unknown device 'gpu'"), ({"dtype": "half"}, "dtype is 'float64' or")],
+    [({"device": "gpu"}, "unknown device 'gpu'"), ({"dtype": ["half"]}, "dtype is 'float64' or")],
 )
 def test_a_wrong_word_is_refused(wrong: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         device_speed.main(**wrong, count=[2], rounds=1, steps=1, out=None)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_without_a_gpu_it_says_so_and_writes_nothing(tmp_path: Path) -> None:
+    out = tmp_path / "table.md"
+    with pytest.raises(ValueError, match="device 'cuda' is not there: torch"):
+        device_speed.main("cuda", count=[2], out=out)
+    assert not out.exists()
 
 
 def test_a_table_that_cannot_be_written_is_refused_before_the_work(tmp_path: Path) -> None:

@@ -1,0 +1,82 @@
+"""Question: what does the fused CUDA kernel compile to, without a GPU?
+
+`python -m sideslip.benchmarks.speed.ptx --out table.md`
+"""
+
+import re
+import shutil
+import subprocess
+import tempfile
+from pathlib import Path
+from typing import Annotated, Any
+
+import gymnasium as gym
+import numpy as np
+import typer
+from rich.console import Console
+
+from ...envs.cuda.kernel import how_of
+from ...envs.cuda.ptx import instructions, ptx_of
+from ...envs.vector import StabilityVectorEnv
+from ..harness.results import check_writable, write_text
+
+_ARITHMETIC = ("add", "sub", "mul", "fma", "div", "rcp", "sqrt")
+
+
+def counts(text: str) -> dict[str, Any]:
+    """What of a PTX text is counted, by name."""
+    found = instructions(text)
+
+    def of(pattern: str) -> int:
+        return sum(count for name, count in found.items() if re.match(pattern, name))
+
+    any_of = "|".join(_ARITHMETIC)
+    return {
+        "instructions": found.total(),
+        "on float64": of(rf"({any_of})\S*\.f64"),
+        "on float32": of(rf"({any_of})\S*\.f32"),
+        "fused": of("fma|mad"),
+        "divisions, roots": of(r"(div|rcp|sqrt)\S*\.f"),
+    }
+
+
+def assembled(text: str, capability: tuple[int, int]) -> dict[str, Any]:
+    """Registers and bytes spilled of a thread, by `ptxas` where it is on the path."""
+    if shutil.which("ptxas") is None:
+        return {}
+    with tempfile.TemporaryDirectory() as folder:
+        source = Path(folder, "kernel.ptx")
+        source.write_text(text)
+        arch = f"-arch=sm_{capability[0]}{capability[1]}"
+        command = ["ptxas", "-v", arch, str(source), "-o", f"{source}.cubin"]
+        run = subprocess.run(command, capture_output=True, text=True, check=True)
+    patterns = {
+        "registers": r"Used (\d+) registers",
+        "stack, bytes": r"(\d+) bytes stack",
+        "spilled, bytes": r"(\d+) bytes spill stores",
+    }
+    return {name: re.findall(each, run.stderr)[-1] for name, each in patterns.items()}
+
+
+def main(
+    env: Annotated[str, typer.Option(help="An environment's id.")] = "sideslip/YawFusion-v0",
+    out: Annotated[Path | None, typer.Option(help="Write the table as Markdown.")] = None,
+) -> None:
+    """Count the kernel's instructions for an H200 (sm_90), in float64 and float32."""
+    check_writable(out)
+    how = how_of(StabilityVectorEnv(1, **gym.spec(env).kwargs).config, "NextStep", record=False)
+    columns: list[dict[str, Any]] = []
+    for real in (np.float64, np.float32):
+        text = ptx_of(how, real, (9, 0))
+        columns.append({"": real.__name__} | counts(text) | assembled(text, (9, 0)))
+    lines = [
+        f"| {name} | {' | '.join(str(each[name]) for each in columns)} |" for name in columns[0]
+    ]
+    table = "\n".join([lines[0], "|---|---|---|", *lines[1:]]) + "\n"
+    Console().print(table, highlight=False, markup=False, soft_wrap=True)
+    if out is not None:
+        write_text(out, table)
+
+
+if __name__ == "__main__":
+    typer.run(main)

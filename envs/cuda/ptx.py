@@ -1,0 +1,84 @@
+# numba's own types say too little about itself:
+# mypy: disable-error-code="attr-defined,no-untyped-call"
+"""The kernel as PTX, compiled without a GPU and kept on disk.
+
+In float64 a product and a sum are never contracted to one operation: numba-cuda's decorator has no
+switch for it, NVVM's call has.
+"""
+
+import contextlib
+import hashlib
+import json
+import re
+from collections import Counter
+from collections.abc import Iterator
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+from numba import types
+from numba.cuda import dispatcher
+from numba.cuda.compiler import compile_cuda, kernel_fixup
+from numba.cuda.cudadrv.nvvm import NVVM
+from numba.cuda.np.numpy_support import from_dtype
+
+from ..backend import cache
+from ..backend.files import replaced
+from .kernel import NAME, How, kernel_of, specification
+
+Capability = tuple[int, int]  # of a GPU: (9, 0) is an H200
+
+
+def ptx_of(how: How, real: type[np.floating[Any]], capability: Capability) -> str:
+    """The PTX of a kernel for GPUs of a compute capability, from the disk where it is."""
+    folder = cache.kernel_folder("envs")
+    built = version("numba-cuda"), version("numba"), NVVM().get_version()
+    key = json.dumps([how, real.__name__, capability, built])
+    path = folder / f"fused-{hashlib.sha256(key.encode()).hexdigest()[:16]}.ptx" if folder else None
+    if path and (data := cache.read(path)):
+        first, _, text = data.decode().partition("\n")
+        if first == f"// {key}":  # else it is of another GPU, or cut short
+            return text
+    text = _compiled(how, real, capability)
+    if path:
+        with contextlib.suppress(OSError), replaced(path) as file:
+            file.write(f"// {key}\n{text}".encode())
+    return text
+
+
+def _compiled(how: How, real: type[np.floating[Any]], capability: Capability) -> str:
+    pointers = [
+        types.CPointer(from_dtype(np.dtype(dtype))) for dtype, _ in specification(how, real, 1, 1)
+    ]
+    with _compiling_for(capability):
+        made = compile_cuda(
+            kernel_of(how, real),
+            types.void,
+            (types.int64, types.boolean, *pointers),
+            nvvm_options={"opt": 3, "fma": real is np.float32},
+            cc=capability,
+        )
+        library = made.library
+        kernel = library.get_function(made.fndesc.llvm_func_name)
+        library._entry_name = kernel.name
+        kernel_fixup(kernel, False)
+        return str(library.get_asm_str(cc=capability)).replace(kernel.name, NAME)
+
+
+@contextlib.contextmanager
+def _compiling_for(capability: Capability) -> Iterator[None]:
+    """numba-cuda asks the driver for which GPU a device function is: there may be none here."""
+
+    class Device:
+        compute_capability = capability
+
+    asked, dispatcher.get_current_device = dispatcher.get_current_device, lambda: Device
+    try:
+        yield
+    finally:
+        dispatcher.get_current_device = asked
+
+
+def instructions(ptx: str) -> Counter[str]:
+    """How many of each instruction there are in a PTX text."""
+    return Counter(re.findall(r"^\t(?:@!?%\w+ )?([a-z][a-z0-9]*(?:\.[a-z0-9:]+)*)\s", ptx, re.M))

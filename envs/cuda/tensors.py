@@ -1,0 +1,43 @@
+"""What both engines on tensors share: arguments, checked, and infos."""
+
+from typing import Any
+
+from ..backend.on_torch import DTYPES, torch
+from ..task.failures import RUNNING
+from ..task.info import REPORT, Report
+
+Tensor = torch.Tensor
+
+
+def device_of(device: Any) -> torch.device:
+    """The device of a name or itself; ValueError for an unknown one and one that is not there."""
+    try:
+        made = torch.device(device)
+    except (RuntimeError, TypeError):
+        made = None
+    if made is None or made.type not in ("cpu", "cuda"):
+        raise ValueError(f"unknown device {device!r}; known: 'cpu', 'cuda', 'cuda:0', ...")
+    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    if made.type == "cuda" and (made.index or 0) >= count:
+        there = ", ".join(["cpu", *(f"cuda:{i}" for i in range(count))])
+        why = "" if count else ": no CUDA driver" if torch.version.cuda else ": built without CUDA"
+        raise ValueError(
+            f"device {str(device)!r} is not there: torch {torch.__version__} finds {there}{why}"
+        )
+    return made
+
+
+def dtype_of(dtype: Any) -> torch.dtype:
+    """The type of floats of a name or itself; ValueError for another."""
+    known = DTYPES | {each: each for each in DTYPES.values()}
+    if dtype not in known:
+        raise ValueError(f"dtype is 'float64' or 'float32', got {dtype!r}")
+    return known[dtype]
+
+
+def infos_in(report: Tensor) -> dict[str, Any]:
+    """The numbers of `info` of every row, (N,) each, from a report (len(Report), N)."""
+    infos: dict[str, Any] = dict(zip(Report._fields, report[: REPORT.failure], strict=False))
+    infos["failure"] = failure = report[REPORT.failure].to(torch.int64)
+    infos["is_success"] = (report[REPORT.ended] == 1.0) & (failure == RUNNING)
+    return infos
