@@ -36,9 +36,12 @@ CONTROLLERS: dict[str, tuple[str, ...]] = {
 """Besides the reference controller, on the reference filter."""
 RUNGS = (NOMINAL, PARAMETERS, STATE)
 _CANDIDATES = tuple(name for those in ORACLES.values() for name in those)
-LEARNED: tuple[tuple[str, str], ...] = (("", "ppo-yaw-vision"),)
-"""(estimator, policy), a policy by its shipped name or path; in tier 1, whose car it knows. One
-that was trained on fewer sensors reads what it knows by name."""
+LEARNED: dict[str, tuple[tuple[str, str], ...]] = {
+    "coms-model": (("joint", "distill-coms-steering"),),
+    "coms-zero-slip": (("joint", "distill-coms-yaw"),),
+}
+"""(estimator, policy) by the class of contests that the policy was trained on, by its shipped name
+or path."""
 SHARED = {
     ORACLES[PARAMETERS][0]: ("adaptive-lqr", {"grip", "steer_weight"}),
     ORACLES[PARAMETERS][1]: ("adaptive-nmpc", {"horizon", "grip", "steer_weight"}),
@@ -142,6 +145,6 @@ def cells(contests: Sequence[Contest], quick: bool = False) -> Iterator[Cell]:
         made += [Cell(contest, name, REFERENCE_CONTROLLER) for name in filters]
         made += [Cell(contest, REFERENCE_FILTER, who) for who in CONTROLLERS[contest.env_id]]
         made += [Cell(contest, name, who) for name, who in ADAPTIVE.items()]
-        if contest.tier == "1":
-            made += [Cell(contest, estimator, policy) for estimator, policy in LEARNED]
+        if contest.tier:
+            made += [Cell(contest, *pair) for pair in LEARNED.get(contest.kind, ())]
         yield from (cell for cell in made if not (quick and cell.slow and not cell.rung))

@@ -136,10 +136,11 @@ def _beaten(entries: Mapping[Contest, Entry], there: Results) -> str:
 
 def _learned() -> list[str]:
     """The training of the policies in the table."""
-    cards = {name: load_policy(name).card for _, name in LEARNED if is_policy(name)}
+    names = [name for pairs in LEARNED.values() for _, name in pairs if is_policy(name)]
+    cards = {name: load_policy(name).card for name in names}
     return [
-        f"{name}: {card.algorithm}, {card.steps:.2g} steps of {card.env_id} alone, "
-        f"for the reference {card.reference}."
+        f"{name}: {card.algorithm}, {card.steps:.2g} steps of {card.env_id} in "
+        f"{card.cpu_seconds:.0f} CPU-s, for the reference {card.reference}."
         for name, card in cards.items()
     ]
 

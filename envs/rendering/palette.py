@@ -53,6 +53,8 @@ CONTROLLERS = {
     "lane-keeping": "#486C3F",
     "learned": "#D8636C",
     "ppo-yaw-vision": "#AB6387",
+    "distill-coms-steering": "#8C6D1F",
+    "distill-coms-yaw": "#2E8B9E",
 }
 RUNGS = {
     "nominal": "#CF00B4",

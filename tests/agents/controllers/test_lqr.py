@@ -225,3 +225,22 @@ def test_bad_input(steered: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "control", None)
     with pytest.raises(ModuleNotFoundError, match=r"sideslip\[design\]"):
         make_agent("lqr", steered, disturbance_time=0.123)
+
+
+def test_another_action_costs_what_the_curvature_says_and_moves_the_rate_limit() -> None:
+    """`regulator`'s S, in shares of the yaw moment and of the authority; steering that was added
+    by somebody else is what the next decision may differ from by a step of the rate."""
+    env = estimating(gym.make("sideslip/AfsYawFusion-v0", reference="model"), "F_d", "N_d")
+    agent, speed = Lqr(env), float(SPEEDS[8])
+    _, S = regulator(design_model(agent.vehicle, speed, agent.purpose))
+    per = np.diag([1.0, agent.authority])
+    assert agent.curvature(speed) == pytest.approx(per @ S @ per, rel=1e-9)
+    obs = np.array([each.low if each.name == "steer_command" else 0.0 for each in
+                    env.get_wrapper_attr("layout")], np.float32)  # fmt: skip
+    memory = np.zeros((1, 1))
+    free, _ = agent.predict(obs, memory)
+    agent.acted(memory, np.array([[0.0, 0.5]], np.float32))
+    taken, _ = agent.predict(obs, memory)
+    assert memory[0, 0] == pytest.approx(0.5 * agent.authority)
+    step = COMS.steering_rate * 0.01 / agent.authority
+    assert abs(free[1]) <= step + 1e-6 and abs(taken[1] - 0.5) <= step + 1e-6

@@ -36,7 +36,7 @@ def test_colours_stay_with_their_names() -> None:
 def test_every_filter_controller_and_rung_has_a_colour_of_its_own() -> None:
     """All names of the package, no two alike, none the strangers'; to be seen on white and dark."""
     assert set(FILTERS) == set(ESTIMATORS)
-    assert {*CONTROLLERS} >= {*AGENTS, *(name for _, name in LEARNED)}
+    assert {*CONTROLLERS} >= {*AGENTS, *(name for pairs in LEARNED.values() for _, name in pairs)}
     assert {*RUNGS} >= {*MATRIX_RUNGS, *rungs.RUNGS}
     own = [*FILTERS.values(), *CONTROLLERS.values(), *RUNGS.values(), *STRANGERS, INK]
     assert len(set(own)) == len(own)
