@@ -38,7 +38,8 @@ def learned(tmp_path_factory: pytest.TempPathFactory) -> Any:
 def test_a_student_comes_nearer_to_its_teacher_on_seeds_it_has_not_seen(learned: Any) -> None:
     found, _ = learned
     last, seeds = found.policy.network, range(900, 900 + CARS)
-    idle = replace(last, weights=[0.0 * each for each in last.weights])
+    nothing = {name: [0.0 * x for x in getattr(last, name)] for name in ("weights", "biases")}
+    idle = replace(last, **nothing)
     ours, none = (
         drive(lesson(), replace(found.policy, network=each), seeds, 0.0).costs.mean()
         for each in (last, idle)
