@@ -155,8 +155,8 @@ _OTHERS = {
     "-": "rmse_over_bound score cost_vs_nominal share_won worst_cost failure_rate spin_rate "
     "departure_rate collision_rate success_rate saved_rate not_finite_rate bad_action_rate "
     "gap ratio difference residual rank share spectral_radius count amplitude overshoot "
-    "log_likelihood nis nees rmse_over_exact_kf covered_10 covered_20 covered_30 covered_40 "
-    "covered_50 covered_60 covered_70 covered_80 covered_90 covered_95",
+    "log_likelihood nis nees rmse_over_exact_kf rmse_over_own covered_10 covered_20 covered_30 "
+    "covered_40 covered_50 covered_60 covered_70 covered_80 covered_90 covered_95",
 }
 METRICS = {metric.name: metric.unit for metric in EPISODE} | {
     name: unit for unit, names in _OTHERS.items() for name in names.split()

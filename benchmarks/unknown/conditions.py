@@ -28,7 +28,8 @@ class Condition:
     """A kind of drive. scenario: over `LINEAR`. options: of `joint`. since: s, from which errors
     count. bounded: whether the bound is one there: a linear car that does not roll. foreseen:
     whether `joint` has a state or a level for all that happens. filters: more of them, or others of
-    a name, as (estimator, options) by label.
+    a name, as (estimator, options) by label. vehicle: of the env. gyro_late: s by which the gyro
+    comes later than filters assume.
     """
 
     name: str
@@ -39,6 +40,8 @@ class Condition:
     bounded: bool = True
     foreseen: bool = True
     filters: Filters = field(default_factory=dict)
+    vehicle: str = "coms"
+    gyro_late: float = 0.0
 
     @property
     def all_filters(self) -> Filters:
@@ -50,6 +53,9 @@ FOUR = {"members": 4}
 THREE = {"levels": (0.5, 1.0, 2.0)}
 LIMITED = {"inverse_friction_sd": 0.5}
 BIASED = {"bias_sd": 0.01}
+INERTIAL = {"fast": ["gyro", "accel_y"]}
+GUSTY = {"levels": ((1.0, 1.0), (8.0, 2.0)), "disturbance_time": 1.0}
+"""One member expects a force that is eight times as strong; both, one that lasts."""
 
 
 def pushed(factor: float) -> dict[str, Any]:
@@ -62,8 +68,19 @@ def biased(degrees: float) -> dict[str, Any]:
     return MIX | {"noise": {"gyro_bias": np.radians(degrees)}}
 
 
+def rolling(name: str, options: Mapping[str, Any], gust: Mapping[str, Any] = GUST) -> Condition:
+    """A car whose accelerometer feels that it rolls; there is no bound."""
+    scenario = MIX | {"roll": True} | dict(gust)
+    return Condition(name, CAMERA, scenario, options, bounded=False, foreseen=False)
+
+
 FIALA = {"tyres": "fiala", "friction": 0.9}
 SLALOM = {"base": "slalom", "tyres": "fiala", "friction": 0.5}
+LATER = {"tyre_change_time": 5.37}  # s: half-way between two members of a bank that begin anew
+CAR = {"speed": 80.0 * KMH, "disturbance_force": 200.0, "disturbance_moment": 350.0}
+CAR_LEVELS = {"force_sd": 200.0, "moment_sd": 350.0}
+CAR_FILTERS: Filters = {"exact-kf": ("exact-kf", CAR_LEVELS)}
+"""The disturbances accelerate the passenger car as those of `LINEAR` do the COMS."""
 UNEVEN = {"camera_delays": (0.02, 0.015, 0.01, 0.025)}
 CONDITIONS = (
     Condition("camera", CAMERA, MIX),
@@ -73,6 +90,15 @@ CONDITIONS = (
     Condition("GPS, gentle steering", GPS),
     Condition("camera, 10 km/h", CAMERA, MIX | {"speed": 10.0 * KMH}),
     Condition("camera, 40 km/h, gentle", CAMERA, {"speed": 40.0 * KMH}),
+    Condition(
+        "camera, passenger car, 80 km/h",
+        CAMERA,
+        CAR,
+        CAR_LEVELS,
+        filters=CAR_FILTERS,
+        vehicle="passenger-car",
+    ),
+    Condition("camera, gyro 60 ms late", CAMERA, MIX, foreseen=False, gyro_late=0.06),
     Condition("camera, gyro 0.5 deg/s off", CAMERA, biased(0.5), BIASED),
     Condition("GPS, gyro 0.5 deg/s off", GPS, biased(0.5), BIASED),
     Condition("camera 20, 15, 10, 25 ms late", CAMERA, MIX | UNEVEN),
@@ -83,6 +109,11 @@ CONDITIONS = (
     Condition("twice the disturbances, three levels", CAMERA, pushed(2.0), THREE),
     Condition("a gust of unknown strength", CAMERA, MIX | GUST, foreseen=False),
     Condition("the same gust, three levels", CAMERA, MIX | GUST, THREE, foreseen=False),
+    Condition("the same gust, for a gust", CAMERA, MIX | GUST, GUSTY, foreseen=False),
+    rolling("the gust, car that rolls", {}),
+    rolling("the same, accelerometer", INERTIAL),
+    rolling("the same, accelerometer, for a gust", INERTIAL | GUSTY),
+    rolling("no gust, accelerometer, for a gust", INERTIAL | GUSTY, {}),
     Condition("camera, four members", CAMERA, MIX, FOUR),
     Condition("camera, three levels", CAMERA, MIX, THREE),
     Condition("tyres change at 5 s, four members", CAMERA, MIX | CHANGE, FOUR),
@@ -91,6 +122,7 @@ CONDITIONS = (
     Condition("from the change on, four members", CAMERA, MIX | CHANGE, FOUR, CHANGED),
     Condition("from the change on, three levels", CAMERA, MIX | CHANGE, THREE, CHANGED),
     Condition("from the change on, one filter", CAMERA, MIX | CHANGE, {}, CHANGED, foreseen=False),
+    Condition("tyres change at 5.37 s, four members", CAMERA, MIX | CHANGE | LATER, FOUR),
     Condition("Fiala tyres, friction 0.9", CAMERA, MIX | FIALA, LIMITED, bounded=False),
     Condition("slalom, Fiala tyres, friction 0.5", CAMERA, SLALOM, LIMITED, bounded=False),
 )
@@ -137,9 +169,6 @@ def _dark(seconds: float) -> Condition:
 
 def _off(degrees: float) -> Condition:
     return Condition(f"gyro {degrees:g} deg/s off", CAMERA, biased(degrees), BIASED)
-
-
-INERTIAL = {"fast": ["gyro", "accel_y"]}
 
 
 def _noisy(factor: float) -> Condition:

@@ -1,5 +1,6 @@
 """Drives of a condition, every filter over the same records, and what the bound is there."""
 
+import dataclasses
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -11,7 +12,7 @@ from scipy.stats import norm
 
 from ...agents.rollout import steps_of
 from ...agents.rungs import spread_of
-from ...envs.record import Array, Log, Record, concatenate
+from ...envs.record import FAST, Array, Log, Record, concatenate
 from ...envs.vehicle.vehicle import Vehicle
 from ...estimators.analysis.bound import Change, Gust, bound
 from ...estimators.make import make_estimator
@@ -27,9 +28,9 @@ _CHUNK = 16
 
 @dataclass
 class Measured:
-    """Of some seeds: mean squared errors and NEES (seeds, filters), mean squares of the bound
-    (seeds,), NaN where there is none, and shares of the errors within `LEVELS` (seeds, filters,
-    levels). Episodes that ended early are left out, `seeds` are the others'.
+    """Of some seeds: mean squared errors, NEES and filters' own variances (seeds, filters), mean
+    squares of the bound (seeds,), NaN where there is none, and shares of the errors within `LEVELS`
+    (seeds, filters, levels). Episodes that ended early are left out, `seeds` are the others'.
     """
 
     labels: tuple[str, ...]
@@ -38,6 +39,7 @@ class Measured:
     best: Array
     nees: Array
     inside: Array
+    own: Array
     left_out: int
 
     def of(self, label: str) -> tuple[Array, Array, Array]:
@@ -60,22 +62,23 @@ def measure_all(
 
 
 def _together(parts: Sequence[Measured]) -> Measured:
-    squares, best, nees, inside = (
+    squares, best, nees, inside, own = (
         np.concatenate([getattr(part, name) for part in parts])
-        for name in ("squares", "best", "nees", "inside")
+        for name in ("squares", "best", "nees", "inside", "own")
     )
     left_out = sum(part.left_out for part in parts)
     seeds = tuple(seed for part in parts for seed in part.seeds)
-    return Measured(parts[0].labels, seeds, squares, best, nees, inside, left_out)
+    return Measured(parts[0].labels, seeds, squares, best, nees, inside, own, left_out)
 
 
 def measure(case: tuple[Condition, Iterable[int]]) -> Measured:
     """Drive some seeds of a condition."""
     what, seeds = case
-    env: Any = gym.make(what.env_id, scenario=LINEAR | dict(what.scenario), control_period=10)
+    scenario = LINEAR | dict(what.scenario)
+    env: Any = gym.make(what.env_id, scenario=scenario, control_period=10, vehicle=what.vehicle)
     filters, left_out = dict[str, Any](), 0
     labels = tuple(what.all_filters)
-    squares, nees, inside, best, there = (list[Any]() for _ in range(5))
+    squares, nees, inside, best, own, there = (list[Any]() for _ in range(6))
     for seed in seeds:
         driven = _drive(env, seed)
         if driven is None:
@@ -86,23 +89,42 @@ def measure(case: tuple[Condition, Iterable[int]]) -> Measured:
         late = log.time >= what.since - 1e-9
         if not filters or TRUE in filters:  # else only clocks differ, and the log has them
             filters = _filters(what, env.unwrapped, log)
-        errors, sds = [], []
+        felt, errors, sds = _later(log, what.gyro_late), [], []
         for filter_ in filters.values():
-            found = filter_.run(log)
+            found = filter_.run(felt)
             errors.append((found["beta"] - log.truth["beta"])[late])
             sds.append(found.std[late, found.names.index("beta")])
         sizes = np.abs(errors) / sds
         squares.append(np.mean(np.square(errors), axis=1))
         nees.append(np.mean(sizes**2, axis=1))
+        own.append(np.mean(np.square(sds), axis=1))
         inside.append(np.mean(sizes[:, :, None] < _Z, axis=1))
         best.append(
             np.mean(_bound(env.unwrapped, log, cars)[late] ** 2) if what.bounded else np.nan
         )
     n = len(labels)
-    table = np.reshape(squares, (-1, n)), np.array(best), np.reshape(nees, (-1, n))
+    tables = [np.reshape(each, (-1, n)) for each in (squares, nees, own)]
+    shares = np.reshape(inside, (-1, n, len(LEVELS)))
     return Measured(
-        labels, tuple(there), *table, np.reshape(inside, (-1, n, len(LEVELS))), left_out
+        labels, tuple(there), tables[0], np.array(best), tables[1], shares, tables[2], left_out
     )
+
+
+def drive_and_bound(env: Any, seed: int) -> tuple[Log, Array]:
+    """An episode's record, and the least deviation at every row; RuntimeError if it ends early."""
+    driven = _drive(env, seed)
+    if driven is None:
+        raise RuntimeError(f"the episode of seed {seed} ends early")
+    return driven[0], _bound(env.unwrapped, *driven)
+
+
+def _later(log: Log, late: float) -> Log:
+    """A log whose gyro is read so many seconds after it measured; the first value until then."""
+    if late == 0.0:
+        return log
+    fast, rows = log.record.fast.copy(), round(late / log.record.dt)
+    fast[rows:, FAST.gyro], fast[:rows, FAST.gyro] = fast[:-rows, FAST.gyro], fast[0, FAST.gyro]
+    return dataclasses.replace(log, record=dataclasses.replace(log.record, fast=fast))
 
 
 def _drive(env: Any, seed: int) -> tuple[Log, tuple[Vehicle, Vehicle]] | None:

@@ -3,12 +3,15 @@ stiffness are drawn from 0.6 to 1.4 of what filters assume, over the bound that 
 
 from collections.abc import Mapping
 
+import numpy as np
 from rich.console import Console
 
+from ... import __version__
+from ..harness.parallel import run_cases
 from ..harness.results import Row, Suite, Table
 from ..harness.stats import Estimate, interval, mean, ratio_of_roots
 from ..harness.verdict import verdict
-from .conditions import CONDITIONS, CURVES, PARTS
+from .conditions import CAMERA, CONDITIONS, CURVES, PARTS
 from .curves import add_curve, add_reliability, all_points, columns_of, parts_table
 from .measure import LEVELS, measure_all
 
@@ -46,23 +49,28 @@ def run(seeds: int = SEEDS, jobs: int | None = None, console: Console | None = N
             known = numbers["rmse_over_bound"] = interval(ours, ratio_of_roots, each.best)
             best = interval(theirs, ratio_of_roots, each.best)
             over[what.name] = {"joint": known, "exact-kf": best}
+        theory = interval(ours, ratio_of_roots, each.own[:, each.labels.index("joint")])
+        numbers["rmse_over_own"] = theory
         here = columns_of(what, each)
         suite.rows += [Row.of(k, v, estimator="joint", **here) for k, v in numbers.items()]
         lines.append([
             what.name, str(len(nees)), str(each.left_out), _cell(known), _cell(saved),
-            f"{honest.value:.2f}",
+            f"{honest.value:.2f}", f"{theory.value:.2f}",
             *(f"{100.0 * covered[LEVELS.index(level)]:.0f}" for level in COVERED),
         ])  # fmt: skip
-    head = ("condition", "n", "left out", "over the bound", "over exact-kf", "NEES")
+    head = ("condition", "n", "left out", "over the bound", "over exact-kf", "NEES", "over its own")
     suite.tables = [
         Table(
             "joint, which assumes nominal tyres",
             (*head, *(f"in {100.0 * each:.0f} %" for each in COVERED)),
             lines,
             "left out: episodes that end early, in which tyres that saturate let the car "
-            "spin. in 50 %: share of the errors within the interval of that confidence.",
+            "spin. over its own: error over the deviation that joint gives, where NEES is 1 the "
+            "limit of filters that do not know the tyres. in 50 %: share of the errors within the "
+            "interval of that confidence.",
         ),
         parts_table(suite, parts),
+        *_race(suite, max(few // 8, 2), jobs, console),
     ]
     suite.verdict = _answer(over, against)
     _draw(suite, over)
@@ -71,6 +79,39 @@ def run(seeds: int = SEEDS, jobs: int | None = None, console: Console | None = N
     for curve in CURVES:
         add_curve(suite, curve, [next(rest) for _ in curve.values])
     return suite
+
+
+def _race(suite: Suite, seeds: int, jobs: int | None, console: Console | None) -> list[Table]:
+    """Rows and a table of joint beside FilterPy's filter; none where FilterPy is not installed."""
+    try:
+        from .rival import DELAYS, race
+    except ModuleNotFoundError:
+        return []
+    cases = [(delay, seed) for delay in DELAYS.values() for seed in range(seeds)]
+    found = np.reshape(
+        run_cases(race, cases, f"{NAME}: FilterPy", jobs, console), (-1, seeds, 3, 2)
+    )
+    cells = []
+    for name, each in zip(DELAYS, found, strict=True):
+        for i, label in enumerate(("joint", "FilterPy")):
+            error = interval(each[:, i, 0], ratio_of_roots, each[:, 2, 0])
+            us = Estimate(float(np.median(each[:, i, 1])))
+            here = {
+                "suite": NAME,
+                "scenario": name,
+                "salt": "fixed",
+                "n": seeds,
+                "estimator": label,
+            }
+            here["env_version"] = f"{CAMERA} {__version__}"
+            numbers = {"rmse_over_bound": error, "us_per_tick": us}
+            suite.rows += [Row.of(metric, number, **here) for metric, number in numbers.items()]
+            cells.append([name, label, _cell(error), f"{us.value:.3g}"])
+    head = ("camera", "filter", "over the bound", "CPU us a tick")
+    text = (
+        "The same eight states; FilterPy's takes a frame as it arrives. One core, in one process."
+    )
+    return [Table("Beside FilterPy's extended Kalman filter", head, cells, text)]
 
 
 def _cell(ratio: Estimate | None) -> str:

@@ -10,10 +10,11 @@ from sideslip.benchmarks.unknown.conditions import CAMERA, CONDITIONS, CURVES, P
 
 NAMED = {each.name: each for each in CONDITIONS}
 FIALA = "Fiala tyres, friction 0.9"
+LATE, CAR = "camera, gyro 60 ms late", "camera, passenger car, 80 km/h"
 FEW = tuple(
     each
     for each in CONDITIONS
-    if each.name in ("camera and GPS", "twice the disturbances it was told", FIALA)
+    if each.name in ("camera and GPS", "twice the disturbances it was told", FIALA, LATE, CAR)
     or "change" in each.name
 )
 
@@ -37,6 +38,10 @@ def test_every_condition_has_its_numbers_and_the_bound_holds(few: Any) -> None:
     double = "twice the disturbances it was told"
     assert 0.9 < numbers[double, "rmse_over_bound"] < 1.6 and numbers[double, "nees"] > 2.0
     assert (FIALA, "rmse_over_bound") not in numbers
+    assert 0.9 < numbers[CAR, "rmse_over_bound"] < 2.0
+    own = numbers[CAR, "rmse_over_own"] ** 2  # a ratio of means beside the mean of ratios
+    assert own == pytest.approx(numbers[CAR, "nees"], rel=0.5)
+    assert numbers[LATE, "rmse_over_bound"] > 1.5  # a delay that filters do not know harms
     table = few.tables[0]
     assert [line[0] for line in table.cells] == [each.name for each in FEW]
     assert few.verdict.splitlines()[1].startswith("joint, which estimates them, has")
@@ -98,3 +103,13 @@ def test_an_episode_that_ends_early_is_left_out_and_counted() -> None:
     spinning = conditions.Condition("fast", CAMERA, {"speed": 25.0, "rear_stiffness": 0.3})
     found = measure.measure((spinning, (0, 1)))
     assert found.left_out == 2 and np.shape(found.squares) == (0, 2)
+
+
+def test_filterpys_filter_errs_as_ours_where_the_camera_is_at_once() -> None:
+    """The same model and noise; where frames are late, which it does not know, it errs more."""
+    pytest.importorskip("filterpy")
+    from sideslip.benchmarks.unknown.rival import race
+
+    for late in (0.0, 0.03):
+        (ours, _), (theirs, _), _ = race((late, 1))
+        assert np.sqrt(theirs / ours) > 1.5 if late else theirs == pytest.approx(ours, rel=0.1)
