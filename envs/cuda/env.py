@@ -72,6 +72,8 @@ class CudaVectorEnv(VectorEnv[Any, Any, Any]):
         if (self.device.type == "cpu") != SIMULATED:
             runs = "in numba's simulator on 'cpu'" if SIMULATED else "on a CUDA device"
             raise ValueError(f"engine='cuda' runs {runs}, got {str(device)!r}")
+        if self.device.type == "cuda" and self.device.index is None:
+            self.device = torch.device("cuda", torch.cuda.current_device())
         one = StabilityVectorEnv(1, **arguments)
         self.layout, self.control_period = one.layout, one.control_period
         self.reference, self._config = one.reference, one.config
@@ -86,15 +88,14 @@ class CudaVectorEnv(VectorEnv[Any, Any, Any]):
         if not SIMULATED:
             check_memory(sizes, N, self.device)
         self._kernel = kernel_on(self._how, self._real, self.device)
-        self._memory = Memory(*(self._zeros(each) for each in sizes))
+        self._memory = Memory(*(self._made(*each) for each in sizes))
         words = np.random.default_rng().integers(0, 2**32, (WORDS, N))
         words[WORDS // 2] |= 1  # PCG64's increment is odd
         self._memory.generators.copy_(torch.as_tensor(words))
         self._memory.bounds.copy_(torch.as_tensor(self._config.bounds))
         self._started = False
 
-    def _zeros(self, size: tuple[Any, tuple[int, ...]]) -> Tensor:
-        kind, shape = size
+    def _made(self, kind: Any, shape: tuple[int, ...]) -> Tensor:
         return torch.zeros(shape, dtype=_TORCH.get(kind, self.dtype), device=self.device)
 
     def reset(
@@ -160,7 +161,7 @@ class CudaVectorEnv(VectorEnv[Any, Any, Any]):
                 "call reset() with a reset_mask"
             )
         sizes = specification(self._how, self._real, self.num_envs, 1)
-        fresh = {name: self._zeros(getattr(sizes, name)) for name in _FRESH[1:]}
+        fresh = {name: self._made(*getattr(sizes, name)) for name in _FRESH[1:]}
         self._memory = memory = memory._replace(actions=self._taken(actions), **fresh)
         self._kernel(self.num_envs, False, memory)
         ends = memory.terminated.view(torch.bool), memory.truncated.view(torch.bool)
@@ -175,7 +176,7 @@ class CudaVectorEnv(VectorEnv[Any, Any, Any]):
         N, width, fail = self.num_envs, self._how.inputs, self._config.on_bad_action == "fail"
         if not isinstance(actions, torch.Tensor):
             actions = torch.as_tensor(actions_of(actions, N, width, fail)).to(self.device)
-        if actions.device.type != self.device.type:
+        if actions.device != self.device:
             raise ValueError(
                 f"actions are on {actions.device}, the env on {self.device}; nothing was stepped"
             )

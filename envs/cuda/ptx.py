@@ -81,4 +81,4 @@ def _compiling_for(capability: Capability) -> Iterator[None]:
 
 def instructions(ptx: str) -> Counter[str]:
     """How many of each instruction there are in a PTX text."""
-    return Counter(re.findall(r"^\t(?:@!?%\w+ )?([a-z][a-z0-9]*(?:\.[a-z0-9:]+)*)\s", ptx, re.M))
+    return Counter(re.findall(r"^\t(?:@!?%\w+ )?([a-z][a-z0-9]*(?:\.[a-z0-9:]+)*)[\s;]", ptx, re.M))

@@ -1,0 +1,34 @@
+"""What is counted of the fused kernel's PTX."""
+
+import pytest
+
+pytest.importorskip("numba_cuda")
+
+from sideslip.benchmarks.speed.ptx import counts
+
+TEXT = """
+.visible .entry step(
+\t.param .u64 step_param_0
+)
+{
+$L__BB0_1:
+\tld.param.u64 \t%rd1, [step_param_0];
+\tmul.rn.f64 \t%fd2, %fd1, %fd1;
+\t@%p1 bra \t$L__BB0_1;
+\tfma.rn.f32 \t%f1, %f2, %f3, %f4;
+\tdiv.rn.f64 \t%fd3, %fd2, %fd1;
+\tcvt.f64.f32 \t%fd4, %f1;
+\tmax.f64 \t%fd5, %fd4, %fd3;
+\tret;
+}
+"""
+
+
+def test_arithmetic_is_told_from_the_rest() -> None:
+    assert counts(TEXT) == {
+        "instructions": 8,
+        "on float64": 2,
+        "on float32": 1,
+        "fused": 1,
+        "divisions, roots": 1,
+    }
