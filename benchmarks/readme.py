@@ -27,6 +27,8 @@ SHOWN: Mapping[str, tuple[str, str]] = {
     "`nominal`: `lqr` on `exact-kf`": (NOMINAL, ""),
     "`mpc` on `exact-kf`": ("mpc", REFERENCE_FILTER),
     "`sliding-mode` on `exact-kf`": ("sliding-mode", REFERENCE_FILTER),
+    "policy `distill-coms-yaw` on `joint`": ("distill-coms-yaw", "joint"),
+    "policy `distill-coms-steering` on `joint`": ("distill-coms-steering", "joint"),
     "`model-following` on `exact-kf`": ("model-following", REFERENCE_FILTER),
     "`two-dof` on `exact-kf`": ("two-dof", REFERENCE_FILTER),
     "`esc` on `exact-kf`": ("esc", REFERENCE_FILTER),
