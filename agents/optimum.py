@@ -17,7 +17,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from ..envs.backend.rebuild import plain
+from ..envs.backend.decorators import plain
 from ..envs.engine.config import EnvConfig
 from ..envs.record import PACKET_WIDTH, Array
 from ..envs.scenarios.steering import wandering

@@ -196,18 +196,9 @@ class StabilityEnv(Seeing, DrawnOne, gym.Env[npt.NDArray[np.float32], npt.NDArra
     def _advance(self, force: npt.NDArray[np.float32], obs: npt.NDArray[np.float32]) -> int:
         """One control period; what `step_vehicle` returns."""
         arguments = (
-            self._params,
-            self._state,
-            self._switches,
-            obs,
-            self.rows,
-            self.packets,
-            self._report,
-            force,
-            self.control_period,
-            self._bounds,
-            self._window,
-        )
+            self._params, self._state, self._switches, obs, self.rows, self.packets, self._report,
+            force, self.control_period, self._bounds, self._window,
+        )  # fmt: skip
         if not _STEP:
             _STEP.append(entry_of(step_vehicle, *arguments))
         done: int = _STEP[0](*arguments)

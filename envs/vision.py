@@ -15,10 +15,10 @@ from gymnasium.envs.registration import EnvSpec
 
 from .arguments import mapping_of, unknown_names
 from .backend.arrays import read
+from .backend.decorators import plain
 from .backend.elementary import PI
 from .backend.extras import extra
 from .backend.random import uniforms
-from .backend.rebuild import plain
 from .engine.arrays import Row
 from .engine.layout import P, Z
 from .engine.step import sense_ticks, sum_up

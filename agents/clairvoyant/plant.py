@@ -4,8 +4,8 @@ from typing import Any, NamedTuple
 
 import casadi as ca
 
+from ...envs.backend.decorators import plain
 from ...envs.backend.on_casadi import SYMBOLS, symbolic
-from ...envs.backend.rebuild import plain
 from ...envs.engine.tick import load_at, torques
 from ...envs.scenarios.roads import NOMINAL_PATH
 from ...envs.task.cost import cost_rate

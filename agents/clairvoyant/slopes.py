@@ -8,8 +8,8 @@ import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
+from ...envs.backend.decorators import plain
 from ...envs.backend.primitives import ARRAYS
-from ...envs.backend.rebuild import plain
 from ...envs.vehicle.actuators import within_stop
 from .foresight import Fixed, Forecast, Known, State
 from .plant import advance, carried, node_cost, node_errors, scales

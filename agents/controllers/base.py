@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...envs.backend.decorators import jit
+from ...envs.backend.decorators import jit, plain
 from ...envs.backend.primitives import ARRAYS
-from ...envs.backend.rebuild import plain
 from ...envs.engine.packing import car_of
 from ...envs.vehicle.actuators import torque_limit
 from ...envs.vehicle.dynamics import Car

@@ -12,9 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from ...envs.backend.decorators import jit
+from ...envs.backend.decorators import jit, plain
 from ...envs.backend.primitives import maximum
-from ...envs.backend.rebuild import plain
 from ...envs.task.reference import LAGGED, REFERENCES, ZERO_SLIP, reference, target_of
 from ...envs.ticks import TICK
 from ...envs.vehicle.vehicle import Vehicle

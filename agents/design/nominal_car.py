@@ -5,8 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...envs.backend.arrays import offsets
-from ...envs.backend.decorators import jit
-from ...envs.backend.rebuild import plain
+from ...envs.backend.decorators import jit, plain
 from ...envs.record import Array
 from ...envs.vehicle.linear import Bicycle, bicycle_coefficients
 from ...envs.vehicle.vehicle import Vehicle

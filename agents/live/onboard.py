@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...envs.backend.arrays import read
-from ...envs.backend.rebuild import plain
+from ...envs.backend.decorators import plain
 from ...envs.engine.arrays import Row
 from ...envs.engine.layout import FLAGS, STATE_WIDTH, P, Z
 from ...envs.engine.observe import observe

@@ -19,8 +19,8 @@ import gymnasium as gym
 import numpy as np
 import typer
 
+from ...envs.backend.decorators import plain
 from ...envs.backend.files import write_whole
-from ...envs.backend.rebuild import plain
 from ...envs.documents import write_document
 from ...envs.record import PACKET, Array, concatenate
 from ...envs.sensors.camera import at_preview

@@ -18,6 +18,7 @@ from .decorators import config as config
 from .decorators import copied as copied
 from .decorators import inlined as inlined
 from .decorators import jit as jit
+from .decorators import plain as plain
 from .primitives import ARRAYS as ARRAYS
 from .primitives import absolute as absolute
 from .primitives import anywhere as anywhere
@@ -28,4 +29,3 @@ from .primitives import select as select
 from .primitives import sqrt as sqrt
 from .primitives import to_float as to_float
 from .primitives import whole as whole
-from .rebuild import plain as plain

@@ -6,12 +6,16 @@ rebuilds the very same functions for Python floats, NumPy arrays or any other ta
 
 import functools
 import os
-from collections.abc import Callable
+import types
+from collections.abc import Callable, Mapping
 from typing import Any, TypeVar, cast
 
 import numba
+from numba.extending import is_jitted
 
+from .arrays import read
 from .cache import LAYERS, kernel_folder, notice
+from .primitives import minimum
 
 STOCK = "SIDESLIP_STOCK_NUMBA"
 """The environment variable with which numba compiles by itself."""
@@ -106,3 +110,46 @@ def copied(source: Any, target: Any) -> None:
     """Copy a vector's numbers into another one; a slice's assignment would allocate."""
     for i in range(len(source)):
         target[i] = source[i]
+
+
+_TABLED = {read.__module__, minimum.__module__}  # what a table may replace
+
+
+def _same(function: Any) -> Any:
+    return function
+
+
+def plain(
+    function: F,
+    table: Mapping[str, Callable[..., Any]] | None = None,
+    finish: Callable[[Any], Any] = _same,
+) -> F:
+    """The same text without the compiler.
+
+    Parameters: `function`, compiled by `jit` or not; `table`, primitives by name that replace
+    ours (`ARRAYS` for NumPy arrays, None for Python floats); `finish`, what each rebuilt function
+    becomes (another compiler's).
+    Returns: a function built from the same code object, its callees replaced likewise.
+    """
+    rebuilt: F = _rebuild(function, dict(table or {}), finish, {})
+    return rebuilt
+
+
+def _rebuild(function: Any, table: dict[str, Any], finish: Any, done: dict[Any, Any]) -> Any:
+    source = function.py_func if is_jitted(function) else function
+    if source.__name__ in table and source.__module__ in _TABLED:
+        return table[source.__name__]
+    if source in done:
+        return done[source]
+    names: dict[str, Any] = dict(source.__globals__)
+    rebuilt = types.FunctionType(source.__code__, names, source.__name__, source.__defaults__)
+    done[source] = finished = finish(rebuilt)
+    for name in source.__code__.co_names:
+        callee: Any = names.get(name)
+        ours = isinstance(callee, types.FunctionType) and (callee.__module__ or "").startswith(
+            __name__.rpartition(".envs")[0]
+        )
+        if is_jitted(callee) or ours:
+            names[name] = _rebuild(callee, table, finish, done)
+    del names["__name__"]  # by which torch.compile would look the names up in the module itself
+    return finished

@@ -4,8 +4,8 @@ import types
 from collections.abc import Callable
 from typing import Any, TypeVar
 
+from .decorators import plain
 from .extras import extra
-from .rebuild import plain
 
 with extra("mpc", "the plant on symbols needs CasADi"):
     import casadi as ca

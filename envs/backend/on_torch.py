@@ -9,8 +9,8 @@ from collections.abc import Callable
 from types import FunctionType, MethodType
 from typing import Any
 
+from .decorators import plain
 from .extras import extra
-from .rebuild import plain
 
 with extra("train", "the device engine needs torch"):
     import torch as torch  # for the other modules of the device engine

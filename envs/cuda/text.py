@@ -14,8 +14,8 @@ import numpy as np
 from numba import cuda, types
 
 from ..backend.arrays import at, put, read, write
+from ..backend.decorators import plain
 from ..backend.extras import extra
-from ..backend.rebuild import plain
 
 with extra("cuda", "the CUDA engine needs numba-cuda"):
     import numba_cuda as numba_cuda  # numba's own `cuda` is another

@@ -17,7 +17,7 @@ import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 
-from ..backend.rebuild import plain
+from ..backend.decorators import plain
 from ..engine.layout import P, Z
 from ..outside.env import PlantEnv
 from ..outside.plants import Acting

@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from ..arguments import check_choice
 from ..backend.arrays import at, read, write
-from ..backend.rebuild import plain
+from ..backend.decorators import plain
 from ..engine.layout import P, Z
 from ..engine.step import conclude, fixed_of, kind_of, shares_of, write_end
 from ..engine.tick import Fixed, Kind, Moving, command, sense

@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ..backend.arrays import read
+from ..backend.decorators import plain
 from ..backend.primitives import ARRAYS
-from ..backend.rebuild import plain
 from ..engine.layout import P, Z
 from ..engine.packing import EpisodeConfig
 from ..engine.step import fixed_of, kind_of

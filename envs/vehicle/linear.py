@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ..backend.decorators import jit
-from ..backend.rebuild import plain
+from ..backend.decorators import jit, plain
 from .vehicle import GRAVITY, Vehicle
 
 if TYPE_CHECKING:

@@ -8,8 +8,9 @@ a time, so that a gain is a division and not a matrix inverse.
 from math import log
 from typing import Any
 
-from ...envs.backend.arrays import at, eight, mirror, put_eight, scratch
+from ...envs.backend.arrays import at
 from ...envs.backend.decorators import inlined, jit
+from ...envs.backend.eights import eight, mirror, put_eight, scratch
 from ...envs.backend.primitives import absolute, sqrt
 from .memory import CORE, WIDTH, Memory, Row
 

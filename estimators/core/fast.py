@@ -2,8 +2,9 @@
 
 from typing import Any
 
-from ...envs.backend.arrays import at, eight, put, put_eight, scratch
+from ...envs.backend.arrays import at, put
 from ...envs.backend.decorators import jit
+from ...envs.backend.eights import eight, put_eight, scratch
 from ...envs.backend.primitives import maximum, minimum
 from ...envs.record import FAST
 from .covariance import measure_state, predict_covariance

@@ -14,8 +14,8 @@ with a bank is the mixture's mean and covariance, which nothing measures; its me
 from math import exp
 from typing import Any
 
-from ...envs.backend.arrays import eight, put_eight
 from ...envs.backend.decorators import apart, copied, jit
+from ...envs.backend.eights import eight, put_eight
 from ...envs.backend.elementary import sincos
 from ...envs.backend.primitives import maximum
 from ...envs.record import PACKET

@@ -16,8 +16,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ...envs.backend.arrays import prefetch
 from ...envs.backend.decorators import jit
+from ...envs.backend.eights import prefetch
 from ...envs.record import PACKET_WIDTH
 from ...envs.sensors.slow import SLOW_NAMES
 
@@ -272,7 +272,6 @@ _WINDOW = [  # history: of tick k in row k % WINDOW
 ]
 
 _FIELDS = _MODEL + _BANK + _FAST + _SLOW + _DELAY + _GAINS + _SPEED + _NOW + _BETWEEN + _SCRATCH
-_SMALL = 64  # numbers
 
 
 def _size(field: Any) -> int:
@@ -280,16 +279,9 @@ def _size(field: Any) -> int:
     return math.prod(field[2]) if len(field) > 2 else 1
 
 
-FILTER = np.dtype(
-    [
-        ("ahead", _FLOAT, (1,)),  # where the small fields begin
-        *sorted(_FIELDS, key=_size),  # those that a tick reads lie next to each other
-        *_WINDOW,
-    ],
-    align=True,
-)
-HEAD = sum(_size(field) for field in _FIELDS if _size(field) <= _SMALL)
-"""Numbers of the small fields, which come first in a record."""
+_AHEAD = ("ahead", _FLOAT, (1,))  # where small fields begin, all that a tick reads next to another
+FILTER = np.dtype([_AHEAD, *sorted(_FIELDS, key=_size), *_WINDOW], align=True)
+HEAD = sum(_size(field) for field in _FIELDS if _size(field) <= 64)  # numbers of the small fields
 
 
 @jit

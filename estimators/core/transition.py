@@ -2,8 +2,9 @@
 
 from typing import Any
 
-from ...envs.backend.arrays import at, eight, put, put_eight, scratch
+from ...envs.backend.arrays import at, put
 from ...envs.backend.decorators import apart, jit
+from ...envs.backend.eights import eight, put_eight, scratch
 from ...envs.backend.primitives import absolute, maximum
 from ...envs.vehicle.linear import write_kinematic, write_lateral, write_roll
 from ...envs.vehicle.vehicle import GRAVITY

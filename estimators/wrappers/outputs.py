@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from ...envs.backend.decorators import plain
 from ...envs.backend.elementary import wrap
 from ...envs.backend.primitives import ARRAYS
-from ...envs.backend.rebuild import plain
 from ...envs.task.observation import Entry
 from ..design.models import FOREIGN_STATE, STATES
 from ..protocol import EstimatorLike, deviations

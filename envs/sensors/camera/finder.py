@@ -10,7 +10,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from ...backend.rebuild import plain
+from ...backend.decorators import plain
 from .analytic import View, at_preview
 from .consensus import Array, Fit, Place, across, fit, levelled, reach_of, search
 from .pinhole import Pinhole

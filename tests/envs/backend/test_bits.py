@@ -9,8 +9,8 @@ import pytest
 from sideslip.envs import COMS, PASSENGER_CAR, stability
 from sideslip.envs.backend import elementary
 from sideslip.envs.backend import random as noise
+from sideslip.envs.backend.decorators import plain
 from sideslip.envs.backend.primitives import ARRAYS
-from sideslip.envs.backend.rebuild import plain
 from sideslip.envs.engine import reset as restart
 from sideslip.envs.engine import step as kernel
 from sideslip.envs.engine.packing import car_of

@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.envs.backend.arrays import eight, mirror, put_eight, scratch
 from sideslip.envs.backend.decorators import jit
+from sideslip.envs.backend.eights import eight, mirror, put_eight, scratch
 
 
 @jit

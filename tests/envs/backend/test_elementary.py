@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sideslip.envs.backend import elementary
+from sideslip.envs.backend.decorators import plain
 from sideslip.envs.backend.elementary import PI
 from sideslip.envs.backend.primitives import ARRAYS, absolute, floor, maximum, minimum, select, sqrt
-from sideslip.envs.backend.rebuild import plain
 
 pytestmark = pytest.mark.plain
 

@@ -9,9 +9,9 @@ import pytest
 from scipy import stats
 
 from sideslip.envs.backend import random as noise
+from sideslip.envs.backend.decorators import plain
 from sideslip.envs.backend.primitives import ARRAYS
 from sideslip.envs.backend.random import CHANNELS, normals, philox, uniform, uniforms
-from sideslip.envs.backend.rebuild import plain
 
 pytestmark = pytest.mark.plain
 

@@ -91,8 +91,7 @@ class OwnPlant(OutsidePlant):
         load = load_of(Inputs(*acting[:3]), car, 0, 1)
         before, push, road = self.motion, Push(*acting[3:]), Road(0.0, 0.0, 1.0)
         after = kutta3(before, (load, load, load), push, car, road, h, 0, FIALA, 1)
-        self.specific_force = specific_force(before, after, road, 0, 1)
-        self.x = np.array(after)
+        self.x, self.specific_force = np.array(after), specific_force(before, after, road, 0, 1)
 
 
 @pytest.mark.parametrize("base", ["random-steering", "double-lane-change", "gust"])

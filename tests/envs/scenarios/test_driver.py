@@ -9,8 +9,8 @@ import pytest
 
 from sideslip.envs import COMS, FAILURES, StabilityEnv
 from sideslip.envs.backend.arrays import read
+from sideslip.envs.backend.decorators import plain
 from sideslip.envs.backend.primitives import ARRAYS
-from sideslip.envs.backend.rebuild import plain
 from sideslip.envs.engine.layout import P
 from sideslip.envs.scenarios.driver import Driver, steered, wanted_angle
 from sideslip.envs.scenarios.tracks import laid, path_of, path_offset, sections

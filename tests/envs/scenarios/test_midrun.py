@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sideslip.envs import COMS, StabilityEnv, stability
-from sideslip.envs.backend.rebuild import plain
+from sideslip.envs.backend.decorators import plain
 from sideslip.envs.engine import reset as restart
 from sideslip.envs.engine import step as kernel
 from sideslip.envs.engine.layout import P

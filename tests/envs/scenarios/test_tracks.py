@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sideslip.envs.backend.decorators import plain
 from sideslip.envs.backend.primitives import ARRAYS
-from sideslip.envs.backend.rebuild import plain
 from sideslip.envs.scenarios.tracks import PATHS, Path, laid, path_of, path_offset, sections
 
 pytestmark = pytest.mark.plain

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 pytest.importorskip("cv2")
-from sideslip.envs.backend.rebuild import plain
+from sideslip.envs.backend.decorators import plain
 from sideslip.envs.sensors.camera import View, lane_offset
 from sideslip.envs.sensors.camera.finder import Lane, LaneFinder
 from sideslip.envs.sensors.camera.pinhole import Pinhole
