@@ -89,6 +89,7 @@ def test_the_salt_is_of_the_weights_alone(file: Path) -> None:
     assert load_policy(file).salt != first
 
 
+@pytest.mark.compiled  # their filters' gains are found by thousands of ticks
 @pytest.mark.parametrize("name", shipped())
 def test_shipped_policies_can_be_read(name: str) -> None:
     policy = load_policy(name)
