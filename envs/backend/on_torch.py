@@ -35,6 +35,10 @@ def numbers(dtype: torch.dtype) -> dict[str, Callable[..., Any]]:
     def to_float(a: Any) -> Any:
         return a.to(dtype) if isinstance(a, torch.Tensor) else a * 1.0
 
+    def frexp(a: Any) -> Any:
+        m, e = torch.frexp(a) if isinstance(a, torch.Tensor) else math.frexp(a)
+        return m, to_float(e)
+
     def sqrt(a: Any) -> Any:
         if not isinstance(a, torch.Tensor):
             return math.sqrt(a)
@@ -54,6 +58,7 @@ def numbers(dtype: torch.dtype) -> dict[str, Callable[..., Any]]:
         "sqrt": sqrt,
         "select": select,
         "to_float": to_float,
+        "frexp": frexp,
         "whole": lambda a: a.to(torch.int64) if isinstance(a, torch.Tensor) else int(a),
         "anywhere": lambda condition: isinstance(condition, torch.Tensor) or condition,
         "read": read,

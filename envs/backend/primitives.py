@@ -54,6 +54,12 @@ def to_float(a: Any) -> Any:
     return a * 1.0
 
 
+def frexp(a: Any) -> Any:
+    """(m, e) of a positive number a = m 2^e with 0.5 <= m < 1, both floats."""
+    m, e = math.frexp(a)
+    return m, e * 1.0
+
+
 def whole(a: Any) -> Any:
     """A whole number that is a float, as an integer."""
     return int(a)
@@ -82,6 +88,7 @@ ARRAYS: dict[str, Callable[..., Any]] = {
     "sqrt": np.sqrt,
     "select": np.where,
     "to_float": lambda a: np.multiply(a, 1.0),
+    "frexp": lambda a: np.multiply(np.frexp(a), 1.0),
     "whole": lambda a: np.asarray(a).astype(np.int64),
     "anywhere": np.any,
 }
@@ -117,6 +124,11 @@ def _of_float(a):
         return None
     kind = FLOATS if isinstance(kind, Lanes) else types.float64
     return signature(kind, kind)
+
+
+def _of_fraction(a):
+    found = _of_float(a)
+    return found and signature(types.UniTuple(found.return_type, 2), *found.args)
 
 
 def _of_choice(condition, a, b):
@@ -176,6 +188,22 @@ def _as_whole(builder, sig, args):
     return builder.fptosi(args[0], to)
 
 
+def _fraction(builder, sig, args):
+    """The bits of a normal number's fraction under the exponent of 0.5, and its own as a float."""
+    kind, of = sig.args[0], args[0].type
+    ints = INTS.value if kind is FLOATS else ir.IntType(64)
+
+    def constant(value):
+        return ir.Constant(ints, [value] * LANES if kind is FLOATS else value)
+
+    bits = builder.bitcast(args[0], ints)
+    fraction = builder.or_(builder.and_(bits, constant((1 << 52) - 1)), constant(1022 << 52))
+    exponent = builder.sub(builder.lshr(bits, constant(52)), constant(1022))
+    return cgutils.pack_array(
+        builder, [builder.bitcast(fraction, of), builder.sitofp(exponent, of)]
+    )
+
+
 def _any(builder, sig, args):
     if sig.args[0] is not BOOLS:
         return args[0]
@@ -190,6 +218,7 @@ _teach(floor, _of_float, _machine("floor"))
 _teach(sqrt, _of_float, _machine("sqrt"))
 _teach(select, _of_choice, lambda builder, sig, args: builder.select(*args))
 _teach(to_float, _converted(types.float64, FLOATS), _as_float)
+_teach(frexp, _of_fraction, _fraction)
 _teach(whole, _converted(types.int64, INTS), _as_whole)
 _teach(word, _converted(types.int64, INTS), _as_whole)
 _teach(from_word, _converted(types.float64, FLOATS), _as_float)

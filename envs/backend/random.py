@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from .decorators import jit
 from .elementary import PI, cos_kernel, quadrant, sin_kernel
-from .primitives import select, sqrt, to_float
+from .primitives import frexp, maximum, sqrt, to_float
 
 _MASK = 0xFFFFFFFF
 _M0, _M1 = 0xD2511F53, 0xCD9E8D57
@@ -65,13 +65,7 @@ def uniform(word: int) -> Any:
 @jit
 def _log_uniform(word: int) -> Any:
     """log((word + 0.5) / 2^32), error below 1e-13."""
-    w = 2 * word + 1  # 33 bits; normalised by shifts to [2^32, 2^33)
-    exponent = 0
-    for shift in (16, 8, 4, 2, 1, 1):
-        small = w < (1 << (33 - shift))
-        w = select(small, w << shift, w)
-        exponent = select(small, exponent + shift, exponent)
-    m = to_float(w) / (2.0 * _2_32)  # [0.5, 1)
+    m, exponent = frexp(to_float(2 * word + 1))  # of 2^33
     z = (m - _SQRT_HALF) / (m + _SQRT_HALF)  # |z| < 0.1716
     q = z * z
     p = 1.0 / 15.0
@@ -81,13 +75,13 @@ def _log_uniform(word: int) -> Any:
     p = p * q + 1.0 / 7.0
     p = p * q + 1.0 / 5.0
     p = p * q + 1.0 / 3.0
-    return 2.0 * (z + z * (q * p)) - (to_float(exponent) + 0.5) * _LN2
+    return 2.0 * (z + z * (q * p)) - (33.0 - exponent + 0.5) * _LN2
 
 
 @jit
 def _normal_pair(first: int, second: int) -> Any:
     """Two standard normal numbers from two words (Box and Muller)."""
-    radius = sqrt(-2.0 * _log_uniform(first))
+    radius = sqrt(maximum(-2.0 * _log_uniform(first), 0.0))  # below 0 by rounding in float32 alone
     turn = second + (1 << 29)  # the quarter turns are the two leading bits, exactly
     q = turn >> 30
     r = (to_float(turn - (q << 30)) - 536870912.0 + 0.5) * (2.0 * PI / _2_32)

@@ -78,6 +78,7 @@ def _table(real: Any) -> dict[str, Callable[..., Any]]:
     fabs = libdevice.fabsf if single else libdevice.fabs
     floor = libdevice.floorf if single else libdevice.floor
     sqrt = libdevice.fsqrt_rn if single else libdevice.dsqrt_rn
+    frexp = libdevice.frexpf if single else libdevice.frexp
     texts = {
         "minimum": lambda a, b: a if a < b else b,
         "maximum": lambda a, b: a if a > b else b,
@@ -86,6 +87,7 @@ def _table(real: Any) -> dict[str, Callable[..., Any]]:
         "sqrt": lambda a: sqrt(a),
         "select": lambda condition, a, b: a if condition else b,
         "to_float": lambda a: real(a),
+        "frexp": lambda a: (frexp(a)[0], real(frexp(a)[1])),
         "whole": lambda a: int(a),
         "word": lambda a: int(a),
         "from_word": lambda a: real(a),

@@ -7,7 +7,7 @@ from typing import Any
 
 from ..backend.arrays import read
 from ..backend.decorators import jit
-from ..backend.primitives import minimum, word
+from ..backend.primitives import maximum, minimum, select, word
 from ..record import PACKET, PACKET_WIDTH
 from ..sensors.link import arrivals
 from ..sensors.slow import BLOCKS, SEES, VALUES, Scene, sample
@@ -89,12 +89,13 @@ def _deliver(z: Any, tick: Any, packets: Any, count: int) -> int:
 
 
 @jit
-def due(z: Any, tick: Any) -> bool:
-    """Whether a slow sensor captures or a packet arrives at a tick."""
+def next_due(z: Any, tick: Any) -> Any:
+    """The first tick after this one at which a slow sensor captures or a packet arrives."""
+    soon = maximum(z[Z.clock.next_due], tick + 1.0)
     for sensor in range(len(Z.slow)):
-        if tick == z[Z.slow[sensor].next_capture]:
-            return True
-    return bool(tick >= z[Z.clock.next_due])
+        capture = z[Z.slow[sensor].next_capture]
+        soon = select(capture > tick, minimum(soon, capture), soon)
+    return soon
 
 
 @jit

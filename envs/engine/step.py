@@ -25,7 +25,7 @@ from ..vehicle.tyres import shifts
 from .arrays import Row
 from .layout import FLAGS, P, Z
 from .observe import observe, write_report
-from .packets import due, sense_slow
+from .packets import next_due, sense_slow
 from .tick import Fixed, Kind, Moving, Seen, advance, changed, standing_load
 from .window import WINDOW, chance_at, foresee
 
@@ -162,10 +162,11 @@ def sense_ticks(row: Row, first: int, last: int, count: int, done: int, window: 
     packets there are then, of `count` before."""
     z = row.z
     before = z[Z.clock.tick] - done
-    for j in range(first, last):
-        tick = before + (j + 1)
-        if due(z, tick):
-            count = sense_slow(row, read(window, WINDOW.track, j), tick, count)
+    tick = next_due(z, before + first)
+    while tick <= before + last:
+        j = int(tick - before) - 1
+        count = sense_slow(row, read(window, WINDOW.track, j), tick, count)
+        tick = next_due(z, tick)
     return count
 
 

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 from ..arguments import brief, is_finite
 from ..backend.decorators import jit
-from ..backend.primitives import floor, select, whole
+from ..backend.primitives import anywhere, floor, select, whole
 from ..backend.random import CHANNELS, uniforms
 from ..ticks import NEVER, TICK, ticks
 
@@ -118,7 +118,9 @@ def arrivals(link: Any, frame: Any, tick: Any, key_low: int, key_high: int, bloc
 
     Loss, outage, duplication, latency and jitter are this one function.
     """
-    late, lost, twice, again = uniforms(key_low, key_high, whole(tick), block)
+    late, lost, twice, again = 0.0, 0.0, 0.0, 0.0  # what a link without chance makes nothing of
+    if anywhere((link.jitter > 0.0) | (link.loss > 0.0) | (link.duplicate > 0.0)):
+        late, lost, twice, again = uniforms(key_low, key_high, whole(tick), block)
     which = frame - link.patterns * floor(frame / link.patterns)
     delay = select(which == 1.0, link.delay_1, link.delay_0)
     delay = select(which == 2.0, link.delay_2, delay)

@@ -12,7 +12,16 @@ from hypothesis import strategies as st
 from sideslip.envs.backend import elementary
 from sideslip.envs.backend.decorators import plain
 from sideslip.envs.backend.elementary import PI
-from sideslip.envs.backend.primitives import ARRAYS, absolute, floor, maximum, minimum, select, sqrt
+from sideslip.envs.backend.primitives import (
+    ARRAYS,
+    absolute,
+    floor,
+    frexp,
+    maximum,
+    minimum,
+    select,
+    sqrt,
+)
 
 pytestmark = pytest.mark.plain
 
@@ -109,6 +118,7 @@ def test_primitives_mean_what_python_means(a: float, b: float) -> None:
     assert absolute(a) == abs(a)
     assert floor(a) == float(math.floor(a))
     assert sqrt(abs(a)) == math.sqrt(abs(a))
+    assert frexp(abs(a) + 1.0) == math.frexp(abs(a) + 1.0)
     assert select(a < b, a, b) == min(a, b)
 
 
@@ -120,6 +130,8 @@ def test_array_primitives_mean_the_same() -> None:
     for name, one in (("absolute", absolute), ("floor", floor)):
         assert ARRAYS[name](a).tolist() == [one(x) for x in a.tolist()]
     assert ARRAYS["sqrt"](a * a).tolist() == [sqrt(x) for x in (a * a).tolist()]
+    m, e = ARRAYS["frexp"](a * a)
+    assert list(zip(m.tolist(), e.tolist(), strict=True)) == [frexp(x) for x in (a * a).tolist()]
     assert ARRAYS["to_float"](np.arange(3)).dtype == np.float64
 
 

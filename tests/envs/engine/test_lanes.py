@@ -14,6 +14,7 @@ from sideslip.envs.backend.primitives import (
     absolute,
     anywhere,
     floor,
+    frexp,
     maximum,
     minimum,
     select,
@@ -46,7 +47,8 @@ def _operators(x: Any, y: Any) -> Any:
 
 @jit
 def _primitives(x: Any, y: Any) -> Any:
-    return minimum(x, y), maximum(x, 0.5), absolute(y), floor(x), sqrt(absolute(x))
+    m, e = frexp(absolute(y) + 1e-300)
+    return minimum(x, y), maximum(x, 0.5), absolute(y), floor(x), sqrt(absolute(x)), m, e
 
 
 @jit
