@@ -53,6 +53,11 @@ def _control(suite: Any, r: Request) -> Any:
     return suite.run(r.episodes or usual, r.jobs, r.console, r.keep, r.quick, r.clairvoyant)
 
 
+def _learned(suite: Any, r: Request) -> Any:
+    usual = suite.QUICK_EPISODES if r.quick else suite.EPISODES
+    return suite.run(r.episodes or usual, r.jobs, r.console, r.keep)
+
+
 def _following(suite: Any, r: Request) -> Any:
     numbers = (suite.QUICK_SEEDS, suite.QUICK_CARS) if r.quick else (suite.SEEDS, suite.CARS)
     return suite.run(*numbers, r.jobs, r.console)
@@ -67,6 +72,7 @@ SUITES: dict[str, tuple[str, _Run]] = {
     "estimation": (".estimation", _seeds),
     "unknown": (".unknown.suite", _seeds),
     "control": (".control.suite", _control),
+    "learned": (".learned", _learned),
     "papers": (".papers.suite", _seeds),
     "following": (".following", _following),
     "highway": (".highway", _highway),

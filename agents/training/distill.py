@@ -19,7 +19,7 @@ from ..controllers.lqr import Lqr
 from ..learned.card import Card
 from ..learned.files import Policy, save_policy
 from ..learned.policy import Learned
-from .student import Course, Drives, Single, Student, fitted, scaling_of
+from .student import LONGER, Course, Drives, Single, Student, fitted, scaling_of
 
 import torch  # isort: skip  # after ours, which say which extra is missing
 
@@ -32,7 +32,7 @@ _MEMORY = 0.95  # share of the noise left after a step
 class Lesson(NamedTuple):
     """Cars that a student drives, the same cars as the teacher sees them, and the teacher.
 
-    Vector envs of as many rows that reset themselves.
+    Vector envs of as many rows that reset themselves; a `Controller`.
     """
 
     cars: Any
@@ -49,8 +49,17 @@ class Round(NamedTuple):
     loss: float
 
 
-def drive(lesson: Lesson, policy: Policy | None, seeds: Sequence[int], noise: float) -> Drives:
+def drive(
+    lesson: Lesson,
+    policy: Policy | None,
+    seeds: Sequence[int],
+    noise: float,
+    usual: float = np.inf,
+) -> Drives:
     """Each seed's first episode, driven by a policy, or by the teacher, shaken, without one.
+
+    usual: the cost by which errors are judged where an episode costs more: one that fails, or is
+    lost, is what there is most to learn from.
 
     Raises ValueError where the teacher's cars are not those of the student.
     """
@@ -81,7 +90,7 @@ def drive(lesson: Lesson, policy: Policy | None, seeds: Sequence[int], noise: fl
         start = np.logical_or(terminated, truncated)
         running = running & ~start
     x, y, w = (np.stack(each, axis=1) for each in zip(*steps, strict=True))
-    weights = w / (costs[:, None] + FLOOR)
+    weights = w / (np.minimum(costs, usual)[:, None] + FLOOR)
     return Drives(x, y, weights.astype(np.float32), _curvature(cars, teacher, x), costs)
 
 
@@ -128,17 +137,20 @@ def distill(
     policy, mean, scale = None, np.zeros(0), np.zeros(0)
     drives: list[Drives] = []
     rounds: list[Round] = []
-    for _ in range(course.rounds):
+    usual = [np.inf] * len(lessons)
+    for i in range(course.rounds):
         fresh = []
-        for lesson in lessons:
+        for lesson, most in zip(lessons, usual, strict=True):
             first = next(seeds)
             numbers = range(first, first + lesson.cars.num_envs)
-            fresh.append(drive(lesson, policy, numbers, course.noise))
+            fresh.append(drive(lesson, policy, numbers, course.noise, most))
         drives += fresh
         steps += sum(int((each.weights > 0.0).sum()) for each in fresh)
         if policy is None:
-            mean, scale = scaling_of(fresh, cars.layout)
-        loss = fitted(model, drives, mean, scale, course)
+            mean, scale = scaling_of(fresh, cars.layout, lessons[0].teacher.needs)
+            usual = [float(np.median(each.costs)) for each in fresh]
+        epochs = course.epochs * (LONGER if i == course.rounds - 1 else 1)
+        loss = fitted(model, drives, mean, scale, course, epochs)
         rounds.append(Round(steps, float(np.mean([each.costs.mean() for each in fresh])), loss))
         spent = round(time.process_time() - begun, 1)
         card = replace(card, steps=steps, cpu_seconds=spent)

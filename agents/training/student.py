@@ -27,8 +27,15 @@ Single = npt.NDArray[np.float32]
 CLIP = 8.0  # standard deviations of an input
 WINDOW = 50  # steps through which the gradient goes back in time
 BATCH = 16  # episodes
+SAMPLES = 512  # steps of a batch without memory
+LONGER = 3  # times as many epochs in the last round
 UNREAD = ("gps_X", "gps_Y", "gps_satellites")
 """Where the car is says nothing of how to hold it."""
+
+
+Batch = tuple[Any, Any, Any, Any, bool]
+"""Normalised observations (B, T, k), labels (B, T, m), weights (B, T), curvatures (B, m, m), and
+whether it begins the episodes."""
 
 
 class Drives(NamedTuple):
@@ -48,18 +55,19 @@ class Course:
     """How a student learns.
 
     rounds: of driving and learning, the first one with the teacher at the wheel. epochs: passes
-    over all drives of a round. cells: of a GRU, 0 for a student without memory. hidden: sizes of
-    the dense layers. learning_rate: of Adam, falling to a tenth in each round. noise: largest
-    standard deviation of what shakes the teacher's actions. seed: of weights and episodes.
+    over all drives in a round, `LONGER` times as many in the last one. cells: of a GRU, 0 for a
+    student without memory. hidden: sizes of the dense layers. learning_rate: of Adam, falling to a
+    fiftieth in each round. noise: largest standard deviation of what shakes the teacher's actions.
+    seed: of weights and episodes.
 
     Raises ValueError for a number out of range.
     """
 
-    rounds: int = 4
-    epochs: int = 6
-    cells: int = 32
-    hidden: tuple[int, ...] = (32,)
-    learning_rate: float = 2e-3
+    rounds: int = 7
+    epochs: int = 12
+    cells: int = 0
+    hidden: tuple[int, ...] = (64, 64)
+    learning_rate: float = 3e-3
     noise: float = 0.02
     seed: int = 0
 
@@ -109,64 +117,102 @@ class Student(nn.Module):
         )
 
 
-def scaling_of(drives: Sequence[Drives], layout: Sequence[Entry]) -> tuple[Array, Array]:
-    """Mean and scale of each entry, zero of what never varies and of `UNREAD`."""
+def scaling_of(
+    drives: Sequence[Drives], layout: Sequence[Entry], needs: Sequence[str]
+) -> tuple[Array, Array]:
+    """Mean and scale of each entry, zero of what is not read.
+
+    needs: what the teacher reads. A student that has all of it reads nothing else, of which it
+    would only learn noise; one that has less reads whatever varies, but for `UNREAD`.
+    """
     seen = np.concatenate([each.obs[each.weights > 0.0] for each in drives])
     mean, spread = seen.mean(0, np.float64), seen.std(0, dtype=np.float64)
-    reads = (spread > 1e-9) & ~np.isin([entry.name for entry in layout], UNREAD)
-    return mean, np.where(reads, 1.0 / np.maximum(spread, 1e-9), 0.0)
+    names = [entry.name for entry in layout]
+    there = np.isin(names, needs) if set(needs) <= set(names) else ~np.isin(names, UNREAD)
+    return mean, np.where(there & (spread > 1e-9), 1.0 / np.maximum(spread, 1e-9), 0.0)
 
 
-def _batches(drives: Sequence[Drives], mean: Array, scale: Array) -> Iterator[tuple[Any, ...]]:
-    """All drives once, `BATCH` episodes of a few lessons at once, in a random order: normalised
-    observations, labels, weights and curvatures (B, m, m)."""
-    everyone = [(i, j) for i, each in enumerate(drives) for j in range(len(each.costs))]
-    for chosen in torch.split(torch.randperm(len(everyone)), BATCH):
-        rows = [everyone[int(i)] for i in chosen]
-        longest = max(drives[i].weights.shape[1] for i, _ in rows)
-        x, y, w = (
-            np.zeros((len(rows), longest, *getattr(drives[0], name).shape[2:]), np.float32)
-            for name in ("obs", "labels", "weights")
-        )
-        for row, (i, j) in enumerate(rows):
-            length = drives[i].weights.shape[1]
-            x[row, :length], y[row, :length] = drives[i].obs[j], drives[i].labels[j]
-            w[row, :length] = drives[i].weights[j]
-        z = np.clip((x - mean.astype(np.float32)) * scale.astype(np.float32), -CLIP, CLIP)
-        S = np.stack([drives[i].curvature for i, _ in rows])
-        yield tuple(torch.from_numpy(each) for each in (z, y, w, S))
+def _normalised(obs: Single, mean: Array, scale: Array) -> Single:
+    return np.clip((obs - mean.astype(np.float32)) * scale.astype(np.float32), -CLIP, CLIP)
+
+
+def _joined(parts: Sequence[Single]) -> Any:
+    return torch.from_numpy(np.concatenate(parts))
+
+
+class _Episodes:
+    """`BATCH` episodes of a few lessons at once, cut into windows that the state goes through."""
+
+    def __init__(self, drives: Sequence[Drives], mean: Array, scale: Array) -> None:
+        self.drives, self.scaling = drives, (mean, scale)
+        self.everyone = [(i, j) for i, each in enumerate(drives) for j in range(len(each.costs))]
+        longest = max(each.weights.shape[1] for each in drives)
+        self.most = -(-len(self.everyone) // BATCH) * -(-longest // WINDOW)
+
+    def __iter__(self) -> Iterator[Batch]:
+        for chosen in torch.split(torch.randperm(len(self.everyone)), BATCH):
+            rows = [self.everyone[int(i)] for i in chosen]
+            longest = max(self.drives[i].weights.shape[1] for i, _ in rows)
+            x, y, w = (
+                np.zeros((len(rows), longest, *getattr(self.drives[0], name).shape[2:]), np.float32)
+                for name in ("obs", "labels", "weights")
+            )
+            for row, (i, j) in enumerate(rows):
+                length = self.drives[i].weights.shape[1]
+                x[row, :length], y[row, :length] = self.drives[i].obs[j], self.drives[i].labels[j]
+                w[row, :length] = self.drives[i].weights[j]
+            S = torch.from_numpy(np.stack([self.drives[i].curvature for i, _ in rows]))
+            arrays = (_normalised(x, *self.scaling), y, w)
+            for at in range(0, longest, WINDOW):
+                z, labels, weights = (torch.from_numpy(a[:, at : at + WINDOW]) for a in arrays)
+                yield z, labels, weights, S, at == 0
+
+
+class _Steps:
+    """`SAMPLES` single steps of all drives at once, as if each were an episode."""
+
+    def __init__(self, drives: Sequence[Drives], mean: Array, scale: Array) -> None:
+        there = [each.weights > 0.0 for each in drives]
+        self.lesson = torch.cat([torch.full((int(t.sum()),), i) for i, t in enumerate(there)])
+        self.curvatures = torch.from_numpy(np.stack([each.curvature for each in drives]))
+        pairs = list(zip(drives, there, strict=True))
+        self.x = _joined([_normalised(each.obs[t], mean, scale) for each, t in pairs])
+        self.y = _joined([each.labels[t] for each, t in pairs])
+        self.w = _joined([each.weights[t] for each, t in pairs])
+        self.most = -(-len(self.w) // SAMPLES)
+
+    def __iter__(self) -> Iterator[Batch]:
+        for i in torch.split(torch.randperm(len(self.w)), SAMPLES):
+            S = self.curvatures[self.lesson[i]]
+            yield self.x[i, None], self.y[i, None], self.w[i, None], S, True
 
 
 def fitted(
-    model: Student, drives: Sequence[Drives], mean: Array, scale: Array, course: Course
+    model: Student, drives: Sequence[Drives], mean: Array, scale: Array, course: Course, epochs: int
 ) -> float:
     """Train a model on drives; the loss of the last epoch. Raises FloatingPointError where it
     diverges."""
     optimiser = torch.optim.Adam(model.parameters(), course.learning_rate)
-    batches = -(-sum(len(each.costs) for each in drives) // BATCH)
-    longest = max(each.weights.shape[1] for each in drives)
-    most = course.epochs * batches * -(-longest // WINDOW)
-    falling = torch.optim.lr_scheduler.LinearLR(optimiser, 1.0, 0.1, most)
-    step, total, count = 0, 0.0, 0
-    for _ in range(course.epochs):
-        total, count = 0.0, 0
-        for z, y, w, S in _batches(drives, mean, scale):
-            state = None
-            for at in range(0, z.shape[1], WINDOW):
-                here = slice(at, at + WINDOW)
-                actions, state = model(z[:, here], state)
-                state = None if state is None else state.detach()
-                error = actions - y[:, here]
-                added = torch.einsum("bti,bij,btj->bt", error, S, error) * w[:, here]
-                loss = added.sum() / (w[:, here] > 0.0).sum().clamp(min=1)
-                optimiser.zero_grad()
-                loss.backward()
-                norm = nn.utils.clip_grad_norm_(model.parameters(), 1.0)
-                if not torch.isfinite(loss + norm):
-                    raise FloatingPointError(f"the loss is {loss.item()} at step {step}")
-                optimiser.step()
-                falling.step()
-                step += 1
-                total += float(added.detach().sum())
-            count += len(z)
+    batches = (_Episodes if course.cells else _Steps)(drives, mean, scale)
+    falling = torch.optim.lr_scheduler.LinearLR(optimiser, 1.0, 0.02, epochs * batches.most)
+    count = sum(len(each.costs) for each in drives)
+    length = sum(int((each.weights > 0.0).sum()) for each in drives) / count
+    step, total, state = 0, 0.0, None
+    for _ in range(epochs):
+        total = 0.0
+        for z, y, w, S, begins in batches:
+            actions, state = model(z, None if begins else state)
+            state = None if state is None else state.detach()
+            error = actions - y
+            added = torch.einsum("bti,bij,btj->bt", error, S, error) * w
+            loss = length * added.sum() / (w > 0.0).sum().clamp(min=1)  # of an episode
+            optimiser.zero_grad()
+            loss.backward()
+            norm = nn.utils.clip_grad_norm_(model.parameters(), 1.0)
+            if not torch.isfinite(loss + norm):
+                raise FloatingPointError(f"the loss is {loss.item()} at step {step}")
+            optimiser.step()
+            falling.step()
+            step += 1
+            total += float(added.detach().sum())
     return total / count

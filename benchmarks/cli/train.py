@@ -136,15 +136,17 @@ def distill_command(
     kind: Annotated[str, typer.Option("--class", help="Of contests, as coms-model.")],
     teacher: Annotated[
         str, typer.Option(help="A rung, or a controller of the matrix.")
-    ] = "oracle-state",
+    ] = "adaptive-nmpc",
     estimator: Annotated[
         str, typer.Option(help="What the policy reads: joint, or nothing but the sensors.")
     ] = "joint",
-    cars: Annotated[int, typer.Option(help="Of each contest and round.", min=1)] = 16,
-    rounds: Annotated[int, typer.Option(help="Of driving and learning.")] = 4,
-    epochs: Annotated[int, typer.Option(help="Passes over all drives in a round.")] = 6,
-    cells: Annotated[int, typer.Option(help="Of its GRU; 0: no memory.")] = 32,
-    hidden: Annotated[list[int] | None, typer.Option(help="Size of a dense layer (32).")] = None,
+    cars: Annotated[int, typer.Option(help="Of each contest and round.", min=1)] = 6,
+    rounds: Annotated[int, typer.Option(help="Of driving and learning.")] = 7,
+    epochs: Annotated[int, typer.Option(help="Passes over all drives in a round.")] = 12,
+    cells: Annotated[int, typer.Option(help="Of its GRU; 0: no memory.")] = 0,
+    hidden: Annotated[
+        list[int] | None, typer.Option(help="Size of a dense layer (64, 64).")
+    ] = None,
     seed: Annotated[int, typer.Option(help="Of weights and episodes.")] = 0,
     episodes: Annotated[int, typer.Option(help="Of each contest's test.", min=2)] = 32,
     out: Annotated[Path | None, typer.Option(help="The file; default: NAME here.")] = None,
@@ -156,7 +158,7 @@ def distill_command(
 
     target, console = out or Path(f"{name}.safetensors"), Console()
     check_files(policy=target)
-    course = Course(rounds, epochs, cells, tuple(hidden or (32,)), seed=seed)
+    course = Course(rounds, epochs, cells, tuple(hidden or (64, 64)), seed=seed)
     about = {"class": kind, "teacher": teacher, "cars": cars, **course.described()}
     options = {"algorithm": "distill", "algorithm_options": about, "seeds": {"training": seed}}
     card = card_of(kind, estimator, command=command_line(), **options)

@@ -15,8 +15,8 @@ from sideslip.agents.learned.card import Card
 from sideslip.agents.learned.files import load_policy
 from sideslip.agents.rungs import make_rung
 from sideslip.agents.training import distill as training
-from sideslip.agents.training.distill import Lesson, distill, drive
-from sideslip.agents.training.student import CLIP, Course, Student, fitted
+from sideslip.agents.training.distill import FLOOR, Lesson, distill, drive
+from sideslip.agents.training.student import CLIP, UNREAD, Course, Student, fitted, scaling_of
 
 ID, CARS = "sideslip/YawFusion-v0", 16
 SHORT = {"base": "coms-step", "duration": 1.2, "onset": 0.1}
@@ -29,10 +29,11 @@ def lesson(**options: Any) -> Lesson:
     return Lesson(cars, *make_rung("oracle-state-lqr", ID, CARS, **OPTIONS | options))
 
 
-@pytest.fixture(scope="module")
-def learned(tmp_path_factory: pytest.TempPathFactory) -> Any:
+@pytest.fixture(scope="module", params=[8, 0], ids=["GRU", "no memory"])
+def learned(request: Any, tmp_path_factory: pytest.TempPathFactory) -> Any:
     path = tmp_path_factory.mktemp("distilled") / "student.safetensors"
-    return distill(Card.of(ID, OPTIONS), [lesson()], COURSE, path), path
+    course = replace(COURSE, cells=request.param)
+    return distill(Card.of(ID, OPTIONS), [lesson()], course, path), path
 
 
 def test_a_student_comes_nearer_to_its_teacher_on_seeds_it_has_not_seen(learned: Any) -> None:
@@ -86,6 +87,23 @@ def test_what_the_teachers_sensors_do_changes_no_car() -> None:
     assert (seen.weights > 0.0).all() and np.ptp(seen.labels) > 0.0
 
 
+def test_a_drive_that_is_lost_weighs_as_a_usual_one() -> None:
+    """So that what led there is learned, however much it cost."""
+    plain, capped = (drive(lesson(), None, range(CARS), 0.1, most) for most in (np.inf, 0.0))
+    assert np.allclose(plain.weights[:, 0], 1.0 / (plain.costs + FLOOR))
+    assert np.allclose(capped.weights, 1.0 / FLOOR) and (capped.costs == plain.costs).all()
+
+
+def test_a_student_that_sees_what_its_teacher_reads_reads_nothing_else() -> None:
+    cars = lesson().cars
+    seen = [drive(lesson(), None, range(CARS), 0.1)]
+    names = [entry.name for entry in cars.layout]
+    for needs, there in ((("steer", "beta_ref"), {"steer"}), (("beta_hat",), None)):
+        _, scale = scaling_of(seen, cars.layout, needs)
+        reads = {name for name, each in zip(names, scale, strict=True) if each > 0.0}
+        assert reads == there if there else "gyro" in reads and not reads & set(UNREAD)
+
+
 def test_a_training_that_diverges_stops_with_the_step_and_leaves_the_last_good_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -94,7 +112,7 @@ def test_a_training_that_diverges_stops_with_the_step_and_leaves_the_last_good_f
     names, model = len(drives[0].obs[0, 0]), Student(len(drives[0].obs[0, 0]), 1, COURSE)
     with pytest.raises(FloatingPointError, match=r"the loss is nan at step \d+"):
         mean = np.full(names, np.nan)
-        real(model, drives, mean, np.ones(names), COURSE)
+        real(model, drives, mean, np.ones(names), COURSE, 1)
     calls: list[Any] = []
 
     def second(*arguments: Any) -> float:

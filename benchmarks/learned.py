@@ -1,0 +1,208 @@
+"""Question: what do the learned policies cost where training never was, against all rivals?
+
+Each shipped policy of `LEARNED` drives contests of its class in conditions that no training had,
+on salted seeds, beside controllers on the same late sensors and the rungs of the ladder. Nobody
+learns of a condition: filters have the levels of the contest itself.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from .. import __version__
+from ..envs.record import Array
+from ..envs.scenarios.manoeuvres import scenario_from
+from ..envs.vehicle.vehicles import VEHICLES
+from .control.cells import ADAPTIVE, CONTROLLERS, LEARNED, REFERENCE_FILTER, Cell
+from .control.contests import NOMINAL, PARAMETERS, STATE, Contest, contests
+from .control.episodes import Driven
+from .control.run import Results, measure
+from .control.scores import FLOOR, Yardstick, score
+from .control.seeds import salt_of, seeds_of_contests
+from .harness.results import Row, Suite, Table
+from .harness.stats import Estimate, share, won, worst
+from .harness.verdict import verdict
+
+NAME, TRAINED = "learned", "as trained"
+EPISODES, QUICK_EPISODES = 32, 4
+RIVALS = tuple(ADAPTIVE.values())
+"""Against whom episodes are counted."""
+_TEXT = (
+    "The shipped policies beside controllers on the same late sensors, on salted seeds and in "
+    "conditions that no training had; of each tier of a policy's class one contest. Share: of the "
+    "paired log ratio of cost from nominal (0) to oracle-parameters (1), which knows car, friction "
+    "and biases, over the contests, on the episodes that both survive; a failure counts as 20 "
+    "times nominal's cost."
+)
+
+
+def _tyres(low: float, high: float) -> dict[str, Any]:
+    return dict.fromkeys(("front_stiffness", "rear_stiffness"), (low, high))
+
+
+CONDITIONS: Mapping[str, Mapping[str, Any]] = {
+    TRAINED: {},
+    "tyres 0.45 to 0.6": _tyres(0.45, 0.6),
+    "tyres 1.4 to 1.8": _tyres(1.4, 1.8),
+    "camera 100 ms late": {"camera_delays": [0.1], "camera_jitter": 0.0},
+    "no GPS from 2 to 7 s": {"gps_outage": (2.0, 7.0)},
+    "gyro 0.5 deg/s off": {"noise": {"gyro_bias": float(np.radians(0.5))}},
+    "a quarter heavier": {"mass": 1.25},
+}
+"""What each one changes of a contest's scenario; noise comes to the scenario's own, the mass is a
+factor of the true car's."""
+
+
+def scenario_in(contest: Contest, condition: str) -> dict[str, Any]:
+    """A contest's scenario in a condition, over its name."""
+    change, base = dict(CONDITIONS[condition]), scenario_from(contest.scenario)
+    if "noise" in change:
+        change["noise"] = dict(base.noise) | change["noise"]
+    if "mass" in change:
+        mass = change.pop("mass") * VEHICLES[contest.vehicle].mass
+        change["vehicle"] = dict(base.vehicle) | {"mass": mass}
+    return {"base": contest.scenario} | change
+
+
+def contestants(contest: Contest) -> list[tuple[str, str]]:
+    """(estimator, controller) of everybody who drives a contest: rungs, classics, the policies."""
+    classics = [who for who in ("two-dof", "model-following") if who in CONTROLLERS[contest.env_id]]
+    return [
+        ("", NOMINAL),
+        ("", PARAMETERS),
+        ("", STATE),
+        *((REFERENCE_FILTER, who) for who in classics),
+        *ADAPTIVE.items(),
+        *LEARNED[contest.kind],
+    ]
+
+
+def chosen(kind: str) -> list[Contest]:
+    """The contest in the middle of each tier of a class."""
+    mine = [each for each in contests() if each.kind == kind]
+    tiers = [[c for c in mine if c.tier == tier] for tier in dict.fromkeys(c.tier for c in mine)]
+    return [those[len(those) // 2] for those in tiers]
+
+
+@dataclass
+class Found:
+    """A class's episodes: of each condition, of each contest in the order of `chosen`."""
+
+    kind: str
+    driven: dict[str, list[dict[str, Driven]]] = field(default_factory=dict)
+
+    def shared(self, name: str, condition: str) -> Estimate:
+        """A contestant's share of the gap in a condition."""
+        found = [
+            Yardstick(each[NOMINAL], each[PARAMETERS]).paired(each[name])
+            for each in self.driven[condition]
+        ]
+        return score(found)
+
+    def costs(self, name: str) -> Array:
+        """A contestant's in all conditions and contests, one behind the other."""
+        return np.concatenate([each[name].costs for each in self._all()])
+
+    def failed(self, name: str) -> Array:
+        """Which of those episodes ended by a failure."""
+        return np.concatenate([each[name]["failure"] != 0.0 for each in self._all()])
+
+    def _all(self) -> list[dict[str, Driven]]:
+        return [each for those in self.driven.values() for each in those]
+
+
+def run(
+    episodes: int = EPISODES,
+    jobs: int | None = None,
+    console: Console | None = None,
+    keep: Path | None = None,
+) -> Suite:
+    """Every class that has a policy, in every condition.
+
+    episodes: of each contest and condition. The rest is of `control.run.measure`. Raises ValueError
+    with the reason where somebody cannot drive.
+    """
+    suite = Suite(NAME, "Learned policies where training never was", _TEXT)
+    seeds, results = seeds_of_contests(salt_of(), episodes), dict[str, Results]()
+    everyone = [contest for kind in LEARNED for contest in chosen(kind)]
+    for condition in CONDITIONS:
+        cells = [
+            Cell(contest, *who, {"scenario": scenario_in(contest, condition)})
+            for contest in everyone
+            for who in contestants(contest)
+        ]
+        results[condition] = measure(
+            cells, seeds, jobs=jobs, console=console, keep=keep, title=f"{NAME}, {condition}"
+        )
+    found = [_found(kind, results) for kind in LEARNED]
+    for each in found:
+        _tabled(suite, each)
+    suite.verdict = answer(found)
+    return suite
+
+
+def _found(kind: str, results: Mapping[str, Results]) -> Found:
+    found = Found(kind)
+    for condition, those in results.items():
+        found.driven[condition] = []
+        for contest in chosen(kind):
+            mine = {who: those.of(contest, who, e) for e, who in contestants(contest)}
+            wrong = [
+                f"{who}, {condition}: {each.error}" for who, each in mine.items() if each.error
+            ]
+            if wrong:
+                raise ValueError("; ".join(wrong))
+            found.driven[condition].append(mine)
+    return found
+
+
+def answer(found: Sequence[Found]) -> str:
+    """The verdict: each policy's share of the gap, as trained and in the worst condition."""
+    lines = []
+    for each in found:
+        _, policy = LEARNED[each.kind][0]
+        shares = {name: each.shared(policy, name).value for name in CONDITIONS}
+        worst_name = min(shares, key=lambda name: shares[name])
+        better = won(each.costs(policy), each.costs(RIVALS[0])).value
+        lines.append(
+            f"{policy} closes {shares[TRAINED]:.2f} of the gap, {shares[worst_name]:.2f} with "
+            f"{worst_name}; beats {RIVALS[0]} in {100.0 * better:.0f} %."
+        )
+    return verdict(*lines)
+
+
+def _tabled(suite: Suite, found: Found) -> None:
+    names = [who for _, who in contestants(chosen(found.kind)[0])]
+    episodes = len(found.costs(NOMINAL))
+    shares, all_in_all = [], []
+    for who in names:
+        mine = {condition: found.shared(who, condition) for condition in CONDITIONS}
+        shares.append([who, *(f"{e.value:.2f} [{e.low:.2f}, {e.high:.2f}]" for e in mine.values())])
+        costs = found.costs(who)
+        ratio = worst((costs + FLOOR) / (found.costs(NOMINAL) + FLOOR)).value
+        beaten = [
+            "" if who == rival else f"{100.0 * won(costs, found.costs(rival)).value:.0f} %"
+            for rival in (NOMINAL, *RIVALS)
+        ]
+        fails = share(found.failed(who)).value
+        all_in_all.append([who, *beaten, f"{100.0 * fails:.1f} %", f"{ratio:.2f}"])
+        who_and_how = {"controller": who, "n": episodes, "salt": salt_of()}
+        for condition, each in mine.items():
+            where = {"suite": NAME, "scenario": f"{found.kind}, {condition}"}
+            version = {"env_version": f"{chosen(found.kind)[0].env_id} {__version__}"}
+            suite.rows.append(Row.of("score", each, **where, **who_and_how, **version))
+    driven = ", ".join(each.scenario for each in chosen(found.kind))
+    note = f"{driven}; {episodes // len(CONDITIONS)} episodes a condition, the same for everybody."
+    suite.tables += [
+        Table(f"{found.kind}: share of the gap", ("controller", *CONDITIONS), shares, note),
+        Table(
+            f"{found.kind}: all conditions together",
+            ("controller", *(f"beats {each}" for each in (NOMINAL, *RIVALS)), "fails", "worst 5 %"),
+            all_in_all,
+            f"Of {episodes} episodes. worst 5 %: mean of the largest ratios to nominal's cost.",
+        ),
+    ]

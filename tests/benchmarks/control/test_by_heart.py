@@ -1,0 +1,93 @@
+"""Nobody wins by heart: open-loop actions made for known seeds are worth nothing on salted ones.
+
+The cheater has a plan for each public seed, found by the cross-entropy method, and drives the plan
+of the seed whose first observation is most like what it sees.
+"""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from sideslip.agents.rollout import costs_of
+from sideslip.benchmarks.control.contests import YAW, Contest
+from sideslip.benchmarks.control.scores import FLOOR
+from sideslip.benchmarks.control.seeds import salt_of, seeds_of_contests
+
+CONTEST = Contest("1", YAW, "coms", "zero-slip", "coms-random")
+PUBLIC = (0, 1, 2)
+KNOTS, TRIES, BEST, TURNS = 24, 96, 12, 12
+
+
+class OpenLoop:
+    """Rows of knots (N, KNOTS), straight between them over `steps` decisions."""
+
+    def __init__(self, knots: Any, steps: int) -> None:
+        self.knots, self.at = knots, np.linspace(0.0, KNOTS - 1.001, steps)
+
+    def predict(
+        self, obs: Any, state: Any = None, start: Any = None, deterministic: bool = True
+    ) -> tuple[Any, Any]:
+        step = 0 if state is None else state
+        i, part = divmod(self.at[min(step, len(self.at) - 1)], 1.0)
+        here, there = self.chosen(obs, step)[:, int(i) : int(i) + 2].T
+        return ((1.0 - part) * here + part * there)[:, None].astype(np.float32), step + 1
+
+    def chosen(self, obs: Any, step: int) -> Any:
+        return self.knots
+
+
+class Cheater(OpenLoop):
+    """seen: (plans, k), the first observations of the plans' seeds."""
+
+    def __init__(self, knots: Any, steps: int, seen: Any) -> None:
+        super().__init__(knots, steps)
+        self.seen, self.scale = seen, np.maximum(seen.std(axis=0), 1e-9)
+
+    def chosen(self, obs: Any, step: int) -> Any:
+        if step == 0:
+            apart = (obs[:, None, :] - self.seen) / self.scale
+            self.own = self.knots[np.argmin((apart**2).sum(axis=2), axis=1)]
+        return self.own
+
+
+def made(cars: int) -> Any:
+    return gym.make_vec(CONTEST.env_id, num_envs=cars, **CONTEST.env_options)
+
+
+def steps_of_an_episode() -> int:
+    env: Any = gym.make(CONTEST.env_id, **CONTEST.env_options)
+    base = env.unwrapped
+    return round(float(base.scenario.duration) / (1e-3 * int(base.control_period)))
+
+
+def plan_for(seed: int, env: Any, steps: int) -> Any:
+    """(KNOTS,) found by the cross-entropy method on one seed."""
+    rng, middle, spread = np.random.default_rng(seed), np.zeros(KNOTS), np.full(KNOTS, 0.3)
+    for _ in range(TURNS):
+        tries = np.clip(rng.normal(middle, spread, (TRIES, KNOTS)), -1.0, 1.0)
+        tries[0] = middle
+        costs = costs_of(env, OpenLoop(tries, steps), [seed] * TRIES)
+        best = tries[np.argsort(costs)[:BEST]]
+        middle, spread = best.mean(axis=0), best.std(axis=0) + 0.01
+    return middle
+
+
+def gained(env: Any, agent: Any, seeds: Any) -> Any:
+    """(N,) paired log ratios of no control's cost to an agent's."""
+    none, own = (costs_of(env, each, seeds) for each in (None, agent))
+    return np.log((none + FLOOR) / (own + FLOOR))
+
+
+@pytest.mark.long
+def test_what_is_known_by_heart_is_worth_nothing_on_salted_seeds() -> None:
+    steps, env = steps_of_an_episode(), made(TRIES)
+    plans = np.array([plan_for(seed, env, steps) for seed in PUBLIC])
+    few = made(len(PUBLIC))
+    first, _ = few.reset(seed=list(PUBLIC))
+    cheater = Cheater(plans, steps, first)
+    known = gained(few, cheater, PUBLIC)
+    salted = gained(env, cheater, seeds_of_contests(salt_of(), TRIES)(CONTEST))
+    assert known.min() > 1.0
+    assert salted.mean() < 0.1

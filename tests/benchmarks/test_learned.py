@@ -1,0 +1,60 @@
+"""`sideslip bench learned`: conditions that change the car alone, and what the shares are of."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from sideslip.benchmarks import learned
+from sideslip.benchmarks.control.build import estimate_options
+from sideslip.benchmarks.control.cells import LEARNED, Cell
+from sideslip.benchmarks.control.contests import NOMINAL, PARAMETERS
+from sideslip.benchmarks.control.episodes import NUMBERS, Driven
+from sideslip.benchmarks.learned import CONDITIONS, TRAINED, Found, chosen, scenario_in
+from sideslip.envs.scenarios.manoeuvres import scenario_from
+
+
+@pytest.mark.parametrize("kind", LEARNED)
+@pytest.mark.parametrize("condition", CONDITIONS)
+def test_a_condition_changes_the_drive_and_no_filter_hears_of_it(kind: str, condition: str) -> None:
+    for contest in chosen(kind):
+        scenario = scenario_in(contest, condition)
+        same = scenario_from(scenario) == scenario_from(contest.scenario)
+        assert same == (condition == TRAINED)
+        for estimator, who in learned.contestants(contest):
+            if estimator:
+                plain, now = (
+                    estimate_options(Cell(contest, estimator, who, options))
+                    for options in ({}, {"scenario": scenario})
+                )
+                assert plain == now
+
+
+def test_the_heavier_car_is_heavier_than_controllers_know() -> None:
+    contest = chosen("car-yaw")[0]
+    scenario = scenario_in(contest, "a quarter heavier")
+    env: Any = gym.make(contest.env_id, **contest.env_options | {"scenario": scenario}).unwrapped
+    assert env.vehicle.mass == pytest.approx(1.25 * env.nominal.mass)
+    assert env.scenario.front_stiffness == scenario_from(contest.scenario).front_stiffness
+
+
+def driven(costs: Any, failed: Any = 0.0) -> Driven:
+    numbers = np.zeros((len(costs), len(NUMBERS)))
+    numbers[:, NUMBERS.index("cost")] = costs
+    numbers[:, NUMBERS.index("failure")] = failed
+    return Driven(numbers, 0.0)
+
+
+def test_the_share_is_of_the_gap_between_nominal_and_the_car_that_is_known() -> None:
+    rng = np.random.default_rng(0)
+    nominal = rng.uniform(1.0, 2.0, 400)
+    cases = {NOMINAL: 1.0, PARAMETERS: 0.25, "half": 0.5, "dearer": 2.0}
+    mine = {name: driven(factor * nominal) for name, factor in cases.items()}
+    mine["fails"] = driven(0.25 * nominal, rng.random(400) < 0.1)
+    found = Found("car-yaw", {TRAINED: [mine]})
+    expected = {NOMINAL: 0.0, PARAMETERS: 1.0, "half": 0.5, "dearer": -0.5}
+    for name, share in expected.items():
+        assert found.shared(name, TRAINED).value == pytest.approx(share, abs=2e-3)
+    assert found.shared("fails", TRAINED).high < 0.9
+    assert found.failed("fails").mean() == pytest.approx(0.1, abs=0.05)
