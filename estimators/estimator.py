@@ -27,8 +27,8 @@ from .estimates import Estimates, UnobservableWarning
 Array = npt.NDArray[np.float64]
 
 CHECKED_SPEEDS = (3.0, 7.0, 14.0)  # m/s, where a filter without a fixed speed is checked
-_EMPTY = np.zeros((0, 0))
-_NO_NIS = np.zeros(0)
+EMPTY = np.zeros((0, 0))
+NO_NIS = np.zeros(0)
 _NO_PACKETS = np.zeros((0, PACKET_WIDTH))
 
 
@@ -43,7 +43,10 @@ class Estimator:
     Counters of what was skipped: `refused` (older than the filter's window), `duplicates`,
     `future`, `invalid` (not finite), `poor` (quality 0, too few satellites), `unknown` (sensor or
     stamp), `gated` (an innovation that the gate does not believe), `stuck` (the last packet again).
+    `compiled`: whether compiled code may run it by `filters` and `gains` alone.
     """
+
+    compiled = True
 
     def __init__(
         self, config: FilterConfig, dt: float, filters: Any, schedules: tuple[Schedule, ...]
@@ -96,11 +99,8 @@ class Estimator:
                     self.unobservable = unobservable(M, names)
             first += int(f.n)
         if self.unobservable:
-            warnings.warn(
-                f"{self.name} cannot see: {'; '.join(self.unobservable)}",
-                UnobservableWarning,
-                stacklevel=3,
-            )
+            text = f"{self.name} cannot see: {'; '.join(self.unobservable)}"
+            warnings.warn(text, UnobservableWarning, stacklevel=3)
 
     def _designed(self, f: Memory, schedule: Schedule, speed: float) -> tuple[Array, Array]:
         """The table of gains at a speed and the map of the error; ValueError if that grows."""
@@ -153,18 +153,21 @@ class Estimator:
         fast = np.ascontiguousarray(fast, np.float64)
         packets = np.ascontiguousarray(packets, np.float64)
         try:
-            (rows, wide), (arrived, long) = fast.shape, packets.shape
+            (_, wide), (arrived, long) = fast.shape, packets.shape
         except ValueError:
-            rows, wide, arrived, long = 0, 0, 0, 0
+            wide, arrived, long = 0, 0, 0
         if wide != FAST_WIDTH or long != PACKET_WIDTH:
             raise ValueError(_misshapen(fast, packets))
         if count is not None:
             if not 0 <= count <= arrived:
                 raise ValueError(f"count is 0 to {arrived}, as many as packets, got {count}")
             arrived = count
-        done = step_entry()(self.filters, self.gains, fast, packets, arrived)
+        self._step(fast, packets, arrived)
+
+    def _step(self, fast: Array, packets: Array, count: int) -> None:
+        done, rows = step_entry()(self.filters, self.gains, fast, packets, count), len(fast)
         if done < rows:  # gains are missing
-            self._go_on(done, rows, (fast, rows, packets, arrived), (_EMPTY, _EMPTY, _NO_NIS))
+            self._go_on(done, rows, (fast, rows, packets, count), (EMPTY, EMPTY, NO_NIS))
 
     def take(
         self,
@@ -172,9 +175,9 @@ class Estimator:
         rows: int,
         packets: Array,
         count: int,
-        X: Array = _EMPTY,
-        S: Array = _EMPTY,
-        nis: Array = _NO_NIS,
+        X: Array = EMPTY,
+        S: Array = EMPTY,
+        nis: Array = NO_NIS,
     ) -> None:
         """`step` without any checks: the first rows and packets of C-contiguous float64 arrays.
 
@@ -204,7 +207,10 @@ class Estimator:
         values = np.ascontiguousarray(packet, np.float64)
         if values.shape != (PACKET_WIDTH,):
             raise ValueError(f"a packet has shape ({PACKET_WIDTH},), got {values.shape}")
-        receive_entry()(self.filters, self.gains, values)
+        self._receive(values)
+
+    def _receive(self, packet: Array) -> None:
+        receive_entry()(self.filters, self.gains, packet)
 
     def run(self, source: Log | Record) -> Estimates:
         """Reset, then filter a whole record.
@@ -212,17 +218,11 @@ class Estimator:
         Raises ValueError if the record is empty, has another tick than `dt`, or lacks a column.
         """
         record = self.accept(source)
-        fast = np.ascontiguousarray(record.fast, np.float64)
-        packets = np.ascontiguousarray(record.packets, np.float64)
-        n = len(self.names)
-        X, S, nis = (
-            np.empty((len(fast), n)),
-            np.empty((len(fast), n)),
-            np.full(len(packets), np.nan),
-        )
+        fast, packets = (np.ascontiguousarray(a, np.float64) for a in (record.fast, record.packets))
+        X, S = np.empty((2, len(fast), len(self.names)))
+        nis = np.full(len(packets), np.nan)
         self.take(fast, len(fast), packets, len(packets), X, S, nis)
-        time = np.asarray(record.ticks * record.dt, np.float64)
-        return Estimates(time, X, S, self.names, nis)
+        return Estimates(np.asarray(record.ticks * record.dt, np.float64), X, S, self.names, nis)
 
     def accept(self, source: Log | Record) -> Record:
         """Reset for a record, which is returned; raises as `run`."""

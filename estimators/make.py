@@ -13,6 +13,7 @@ from .design.assemble import alone, assemble, told_tyres
 from .design.config import configure
 from .estimator import Estimator
 from .filters import FILTERS
+from .late import LateEstimator
 from .protocol import EstimatorFactory, ForeignEstimator, label_of
 from .registry import Registry
 
@@ -62,7 +63,7 @@ def make_estimator(
     config = configure(name, FILTERS[name], there, options)
     car = vehicle_from(vehicle)
     layers, schedules = assemble(config, car, dt, speed)
-    estimator = Estimator(config, dt, layers, schedules)
+    estimator = (LateEstimator if config.latency else Estimator)(config, dt, layers, schedules)
     several = len(config.sensors) > 1  # no cycle of both to check
     checked = told_tyres(alone(config) if several else config)
     estimator.check(layers if checked is config else assemble(checked, car, dt, speed)[0])

@@ -48,7 +48,7 @@ class Onboard:
         self.facts, self.agent, self.outputs = facts_of(env), agent, env.outputs
         self.estimator: Any = env.estimator
         self.sensors, self.names = self.base.slow_sensors, env.estimator.names
-        self._ours = isinstance(self.estimator, Estimator)
+        self._ours = isinstance(self.estimator, Estimator) and self.estimator.compiled
         snapshot = self.base.get_state()
         self._p, self._switches = snapshot["params"], snapshot["switches"]
         self._kind, self._target = int(self._switches[FLAGS.reference]), read(self._p, P.target)

@@ -13,10 +13,9 @@ from ...envs.record import FAST, PACKET, Log
 from ...envs.sensors.slow import SLOW_NAMES
 from ...envs.vehicle.vehicle import Vehicle
 from ...envs.vehicle.vehicles import WIRES, VehicleSource
+from ...estimators.design.options import FAST_CHANNELS, columns_of
 
-_FAST = {"steer": ("steer",), "gyro": ("gyro",), "accel_x": ("accel_x",), "accel_y": ("accel_y",),
-         "roll_rate": ("roll_rate",), "wheels": ("wheel_left", "wheel_right")}  # fmt: skip
-CHANNELS = (*_FAST, *SLOW_NAMES)
+CHANNELS = (*FAST_CHANNELS, *SLOW_NAMES)
 """What may be late."""
 MOST_LATE = 5.0  # s
 
@@ -82,8 +81,8 @@ def corrected(log: Log, wires: Wires) -> Log:
     record, slow = log.record, dict(log.slow)
     fast, place = record.fast.copy(), np.arange(len(record.fast), dtype=float)
     fast[:, FAST.steer] = wires.gain * fast[:, FAST.steer] + wires.offset
-    for channel in wires.latency.keys() & _FAST.keys():
-        for column in (getattr(FAST, name) for name in _FAST[channel]):
+    for channel in wires.latency.keys() & FAST_CHANNELS.keys():
+        for column in columns_of(channel):
             late = wires.latency[channel] / record.dt
             fast[:, column] = np.interp(place + late, place, fast[:, column])
     packets = record.packets.copy()

@@ -29,7 +29,7 @@ class Condition:
     count. bounded: whether the bound is one there: a linear car that does not roll. foreseen:
     whether `joint` has a state or a level for all that happens. filters: more of them, or others of
     a name, as (estimator, options) by label. vehicle: of the env. gyro_late: s by which the gyro
-    comes later than filters assume.
+    comes later than measured, which the bound knows.
     """
 
     name: str
@@ -49,6 +49,8 @@ class Condition:
         return {"joint": ("joint", self.options), "exact-kf": ("exact-kf", {})} | dict(self.filters)
 
 
+LATE = 0.06  # s
+FIND = {"latency": {"gyro": "find"}}
 FOUR = {"members": 4}
 THREE = {"levels": (0.5, 1.0, 2.0)}
 LIMITED = {"inverse_friction_sd": 0.5}
@@ -98,7 +100,11 @@ CONDITIONS = (
         filters=CAR_FILTERS,
         vehicle="passenger-car",
     ),
-    Condition("camera, gyro 60 ms late", CAMERA, MIX, foreseen=False, gyro_late=0.06),
+    Condition("camera, gyro 60 ms late", CAMERA, MIX, foreseen=False, gyro_late=LATE),
+    Condition("the same, configured", CAMERA, MIX, {"latency": {"gyro": LATE}}, gyro_late=LATE),
+    Condition("the same, found", CAMERA, MIX, FIND, gyro_late=LATE),
+    Condition("GPS, gyro 60 ms late, found", GPS, MIX, FIND, gyro_late=LATE),
+    Condition("camera, a punctual gyro's found", CAMERA, MIX, FIND),
     Condition("camera, gyro 0.5 deg/s off", CAMERA, biased(0.5), BIASED),
     Condition("GPS, gyro 0.5 deg/s off", GPS, biased(0.5), BIASED),
     Condition("camera 20, 15, 10, 25 ms late", CAMERA, MIX | UNEVEN),

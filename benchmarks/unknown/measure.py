@@ -100,7 +100,9 @@ def measure(case: tuple[Condition, Iterable[int]]) -> Measured:
         own.append(np.mean(np.square(sds), axis=1))
         inside.append(np.mean(sizes[:, :, None] < _Z, axis=1))
         best.append(
-            np.mean(_bound(env.unwrapped, log, cars)[late] ** 2) if what.bounded else np.nan
+            np.mean(_bound(env.unwrapped, log, cars, what.gyro_late)[late] ** 2)
+            if what.bounded
+            else np.nan
         )
     n = len(labels)
     tables = [np.reshape(each, (-1, n)) for each in (squares, nees, own)]
@@ -162,9 +164,9 @@ def _filters(what: Condition, base: Any, log: Log) -> dict[str, Any]:
     return made
 
 
-def _bound(base: Any, log: Log, cars: tuple[Vehicle, Vehicle]) -> Array:
-    """The least deviation at every row; tyres that change and a gust are known but for what no
-    filter can know: the strength of a gust."""
+def _bound(base: Any, log: Log, cars: tuple[Vehicle, Vehicle], gyro_late: float = 0.0) -> Array:
+    """The least deviation at every row; tyres that change, a gust and by how many s the gyro is
+    late are known but for what no filter can know: the strength of a gust."""
     scene, passing = base.scenario, dict[str, Any]()
     if scene.tyre_change_time is not None:
         passing["change"] = Change(scene.tyre_change_time, cars[1])
@@ -173,5 +175,5 @@ def _bound(base: Any, log: Log, cars: tuple[Vehicle, Vehicle]) -> Array:
         passing["gust"] = Gust(
             spread_of(scene, "wind_force"), scene.wind_arm, scene.wind_start, end
         )
-    facts = facts_of(base) | {"vehicle": cars[0]} | _levels(scene)
+    facts = facts_of(base) | {"vehicle": cars[0], "latency": {"gyro": gyro_late}} | _levels(scene)
     return bound(record=log.record, **facts, **passing)

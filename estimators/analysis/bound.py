@@ -65,10 +65,14 @@ def bound(
     vehicle: the true one. sensors: all slow sensors that are there; the packets' captured and
     arrived ticks are those of the record. speed: held, m/s. change: to the vehicle that it is
     later. gust: one that the filter feels and does not know. options: those of `exact-kf` that say
-    the true noise and disturbances. The start is known exactly, as it is in the environment.
+    the true noise, disturbances and latencies. The start is known exactly, as it is in the
+    environment. Raises ValueError for latencies where the model varies with time.
 
     The lowest possible RMSE over a stretch of time is the root of the mean square of this.
     """
+    late = any(options.get("latency", {}).values())
+    if late and not (change is None and gust is None):
+        raise ValueError("a bound with latency has no change and no gust")
     prior = dict.fromkeys(states_for(tuple(sensors)), 0.0)
     if gust is not None:  # a state that is a constant, as the road's bank is, but pushes as a force
         options |= {"bank_sd": gust.force_sd}

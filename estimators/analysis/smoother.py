@@ -51,8 +51,10 @@ def smooth(
         estimator = make_estimator(estimator, **(usual | options))
     elif options:
         raise TypeError(f"{estimator.name} is built, got {', '.join(options)}")
-    if not isinstance(estimator, Estimator):
-        raise TypeError(f"the smoother needs a filter of the catalogue, got {estimator!r}")
+    if not (isinstance(estimator, Estimator) and estimator.compiled):
+        raise TypeError(
+            f"the smoother needs a filter of the catalogue without latency, got {estimator!r}"
+        )
     if not lag_seconds > 0.0:
         raise ValueError(f"the lag is in s and positive, got {lag_seconds!r}")
     prompt = _without_delay(estimator)

@@ -174,16 +174,17 @@ def _write_rules(f: Memory, config: FilterConfig, planned: tuple[Schedule, ...])
         f.inverse[: len(C), : f.total] = gain(np.eye(f.total), C, np.zeros((len(C), len(C)))).T
     if _needs_covariance(config) and (f.periodic or f.between != NONE):
         raise ValueError(
-            f"{config.name}: gate, adapt, delay='larsen' and delay='buffer' need "
+            f"{config.name}: gate, adapt, latency, delay='larsen' and delay='buffer' need "
             f"gains='covariance' and no correction between samples; got gate={config.gate}, "
-            f"adapt={config.adapt}, delay={config.delay!r}"
+            f"adapt={config.adapt}, latency={dict(config.latency)}, delay={config.delay!r}"
         )
     if config.adapt > 0.0 and config.delay in ("larsen", "buffer"):
         raise ValueError(f"{config.name}: adapt needs delay='clone', got delay={config.delay!r}")
 
 
 def _needs_covariance(config: FilterConfig) -> bool:
-    return config.gate is not None or config.adapt > 0.0 or config.delay in ("larsen", "buffer")
+    judges = config.gate is not None or config.adapt > 0.0 or bool(config.latency)
+    return judges or config.delay in ("larsen", "buffer")
 
 
 def _periodic(f: Memory, config: FilterConfig, random: bool) -> bool:

@@ -25,7 +25,7 @@ from .models import (
     Model,
     bicycle_model,
 )
-from .options import Options
+from .options import Options, latency_of
 from .tunings import TUNINGS
 
 Array = npt.NDArray[np.float64]
@@ -93,6 +93,8 @@ class FilterConfig:
         in a row that agree with each other the filter begins anew with the sensor.
     adapt: share of a new innovation in an R that follows them (0: R as configured).
     force_sd (N), moment_sd (N m), disturbance_time (s): of disturbances that are forces.
+    latency: s by which fast channels (steer, gyro, accel_x, accel_y, roll_rate, wheels) stand too
+        late in the record, {"gyro": 0.06}; "find" for one that joint finds while driving.
     prior: standard deviations of states at the start, by state.
     allow_unstable: build a filter whose error grows.
     """
@@ -125,6 +127,7 @@ class FilterConfig:
     times: Mapping[str, float]  # s, of biases
     adapt: float
     prior: Mapping[str, float]  # of all states
+    latency: Mapping[str, float | str]  # s, or "find", by channel; none that is punctual
     allow_unstable: bool
 
     @property
@@ -172,6 +175,7 @@ def configure(
         times={name: read.not_negative(f"{name}_time", "s") for name in biases if name in WANDER},
         adapt=read.number("adapt", 0.0, "is a share from 0 to 1", lambda v: 0.0 <= v < 1.0),
         prior=prior_of(states, noise, biases, read),
+        latency=latency_of(read, rules["delay"], bool(used) and TYRES[0] in states),
         allow_unstable=bool(read.value("allow_unstable", False)),
     )
     read.done()

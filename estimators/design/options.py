@@ -7,8 +7,21 @@ import numpy as np
 import numpy.typing as npt
 
 from ...envs.arguments import unknown_names
+from ...envs.record import FAST
 
 Fits = Callable[[float], bool]
+
+FAST_CHANNELS = {
+    "steer": ("steer",),
+    "gyro": ("gyro",),
+    "accel_x": ("accel_x",),
+    "accel_y": ("accel_y",),
+    "roll_rate": ("roll_rate",),
+    "wheels": ("wheel_left", "wheel_right"),
+}
+"""The columns of `envs.record.Fast` that are late together."""
+LONGEST = 0.5  # s, of a latency that is known
+FIND = "find"
 
 
 def _any(number: float) -> bool:
@@ -85,3 +98,34 @@ class Options:
         if self._left:
             message = unknown_names("option", sorted(self._left), sorted(self._known))
             raise TypeError(f"{self.name}: {message}")
+
+
+def columns_of(channel: str) -> tuple[int, ...]:
+    """The columns of a fast row that a channel of `FAST_CHANNELS` has."""
+    return tuple(int(getattr(FAST, name)) for name in FAST_CHANNELS[channel])
+
+
+def latency_of(read: Options, delay: str, findable: bool) -> dict[str, float | str]:
+    """The option `latency` without zeros: s by channel, or `FIND` for one of them.
+
+    delay: the filter's rule for late samples. findable: whether it has packets and tyres as states.
+    """
+    value: Any = read.value("latency", {})
+    if not isinstance(value, Mapping):
+        raise TypeError(f"{read.name}: latency is seconds by channel, got {value!r}")
+    for channel in value:
+        if channel not in FAST_CHANNELS:
+            raise read.wrong("latency", f"is of {', '.join(FAST_CHANNELS)}", dict(value))
+    found: dict[str, float | str] = {}
+    for channel, late in value.items():
+        expected = f"is 0 to {LONGEST} s or {FIND!r}"
+        if late == FIND:
+            found[channel] = FIND
+        elif read.checked(f"latency of {channel}", late, expected, lambda s: 0 <= s <= LONGEST):
+            found[channel] = float(late)
+    if list(found.values()).count(FIND) > (1 if findable else 0):
+        expected = f"is {FIND!r} for one channel of a filter with tyres as states and slow sensors"
+        raise read.wrong("latency", expected, dict(value))
+    if found and delay not in ("clone", "buffer"):
+        raise read.wrong("latency", "needs delay 'clone' or 'buffer'", dict(value))
+    return found

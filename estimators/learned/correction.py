@@ -36,6 +36,8 @@ class Learned:
 
     def __init__(self, base: Estimator, correction: Correction, vehicle: Vehicle) -> None:
         card, there = correction.card, base.names[: int(base.filters[0].n)]
+        if not base.compiled:
+            raise ValueError(f"{base.name} with latency={base.config.latency} has no correction")
         if base.name != card.base or not set(card.states) <= set(there) or base.dt != TICK:
             raise ValueError(
                 f"the correction was trained on {card.base} with {', '.join(card.states)} and "

@@ -1,4 +1,4 @@
-"""A batch of users' own estimators: one object a row, stepped one after the other."""
+"""A batch of users' own estimators, or of late ones: an object a row, one after the other."""
 
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..protocol import ForeignEstimator
 from ..wrappers.arguments import AnyEstimator, Setup
 from ..wrappers.outputs import write
 from .batch import Array, BatchEstimator, Whole
@@ -20,7 +19,7 @@ class ForeignBatch(BatchEstimator):
     """
 
     def __init__(
-        self, first: ForeignEstimator, setups: Sequence[Setup], dt: float, build: Build
+        self, first: AnyEstimator, setups: Sequence[Setup], dt: float, build: Build
     ) -> None:
         self.name, self.dt, self.names, self.units = first.name, dt, first.names, first.units
         self._build = build

@@ -22,16 +22,18 @@ from .learned import LearnedBatch
 def batch_of(
     source: str | EstimatorFactory, setups: Sequence[Setup], dt: float, options: Mapping[str, Any]
 ) -> BatchEstimator:
-    """An estimator for each setup: a compiled batch where they are ours, else one of objects.
+    """An estimator for each setup: a compiled batch where they are ours and no channel is late,
+    else one of objects.
 
     source, options, errors: as in `make_estimator`.
     """
     each = functools.partial(build, source, dict(options), dt)
-    if not (isinstance(source, str) and source in FILTERS):
+    if not (isinstance(source, str) and source in FILTERS) or options.get("latency"):
         first = each(setups[0])
-        if isinstance(first, ForeignEstimator):
-            kind = LearnedBatch if isinstance(first.inner, Learned) else ForeignBatch
-            return kind(first, setups, dt, each)
+        if isinstance(first, ForeignEstimator) and isinstance(first.inner, Learned):
+            return LearnedBatch(first, setups, dt, each)
+        if isinstance(first, ForeignEstimator) or not first.compiled:
+            return ForeignBatch(first, setups, dt, each)
     return BatchEstimator(label_of(source), setups, dt, each)
 
 

@@ -101,7 +101,7 @@ class EstimateObservation(
             setup = setup._replace(vehicle=fits)
         if before is None or setup.design != before.design:
             self.estimator, self._setup = arguments.build(setup, base.dt), setup
-            self._ours = isinstance(self.estimator, Estimator)
+            self._ours = isinstance(self.estimator, Estimator) and self.estimator.compiled
         if arguments.truth:
             set_stiffness(self.estimator, base.vehicle)
         return self.estimator

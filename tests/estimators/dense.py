@@ -101,7 +101,7 @@ def first_of_each(packets: Any) -> Any:
 
 
 class Posterior:
-    """The states of every tick given a record.
+    """The states of every tick given a record; a fast measurement that is NaN is none.
 
     prior: variances. Q: variances of a tick's noise (n,). V: speeds of all rows. factor: on the
     course's noise by HDOP.
@@ -148,8 +148,10 @@ class Posterior:
             if bias in names:
                 rows[:, names.index(bias)] = 1.0
             known = np.einsum("kn,kn->k", rows, self.mean) + np.einsum("ki,ki->k", through, acted)
-            M.append(np.einsum("kn,knm->km", rows, self.T) / FAST_SD[name])
-            b.append((record.fast[:, getattr(FAST, name)] - known) / FAST_SD[name])
+            measured = record.fast[:, getattr(FAST, name)]
+            there = np.isfinite(measured)
+            M.append(np.einsum("kn,knm->km", rows, self.T)[there] / FAST_SD[name])
+            b.append((measured - known)[there] / FAST_SD[name])
         for packet in first_of_each(record.packets):
             name, k = SLOW_NAMES[int(packet[PACKET.sensor])], int(packet[PACKET.captured])
             for i, states in enumerate(MEASURED[name]):

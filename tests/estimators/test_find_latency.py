@@ -1,0 +1,66 @@
+"""A latency that is found while driving: where the log tells it, and only there."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sideslip.envs.record import FAST, PACKET, PACKET_WIDTH, Log, Record
+from sideslip.estimators import make_estimator
+from tests.estimators.simulation import CAMERA, FIG7, simulate
+from tests.estimators.test_late import later
+
+FACTS: dict[str, Any] = {"sensors": {"camera": CAMERA}, "speed": FIG7.speed}
+
+
+def finder(front: float, rear: float) -> Any:
+    """joint, whose nominal car has other tyres than the true one by these factors."""
+    car = FIG7.truth.scaled(front, rear)
+    return make_estimator("joint", vehicle=car, **FACTS, latency={"gyro": "find"})
+
+
+@pytest.mark.parametrize("late", [0.0, 0.013, 0.06, 0.1])
+@pytest.mark.parametrize("tyres", [(1.0, 1.0), (0.7, 1.3), (1.4, 0.7)])
+def test_it_finds_the_latency_whatever_the_tyres(late: float, tyres: tuple[float, float]) -> None:
+    filter_ = finder(*tyres)
+    for seed in range(2):
+        log = later(simulate(FIG7, FACTS["sensors"], seed), {"gyro": late} if late else {})
+        estimates = filter_.run(log)
+        off = filter_.latency["gyro"] - late
+        assert filter_.latency_sd < 0.003 and abs(off) <= max(4.0 * filter_.latency_sd, 0.001)
+        punctual = finder(*tyres).run(simulate(FIG7, FACTS["sensors"], seed))
+        squares = [
+            np.mean((each["beta"] - log.truth["beta"])[2000:] ** 2)
+            for each in (estimates, punctual)
+        ]
+        assert squares[0] < 1.2 * squares[1]
+
+
+def straight(rows: int) -> Log:
+    """A car on a straight road: gyro and camera have noise, nothing turns."""
+    rng = np.random.default_rng(0)
+    fast = np.zeros((rows, len(FAST)))
+    fast[:, FAST.wheel_left] = fast[:, FAST.wheel_right] = FIG7.speed
+    fast[:, FAST.gyro] = 0.005 * rng.standard_normal(rows)
+    packets = np.zeros((rows // 33, PACKET_WIDTH))
+    packets[:, PACKET.captured] = packets[:, PACKET.arrived] = 33.0 * np.arange(len(packets))
+    packets[:, PACKET.quality] = 1.0
+    packets[:, PACKET.value] = 3.5e-3 * rng.standard_normal(len(packets))
+    packets[:, PACKET.value + 1] = 0.02 * rng.standard_normal(len(packets))
+    return Log(Record(fast, packets), FACTS["sensors"])
+
+
+def test_it_leaves_alone_what_a_log_cannot_tell_and_goes_on_looking() -> None:
+    """A straight road has no latency; where the car turns at last it is found."""
+    filter_, still = finder(1.0, 1.0), straight(9900)
+    filter_.run(still)
+    assert filter_.latency == {"gyro": 0.0} and filter_.latency_sd == np.inf
+    turn = simulate(FIG7, FACTS["sensors"], 0).record
+    packets = turn.packets.copy()
+    packets[:, [PACKET.captured, PACKET.arrived]] += 9900.0
+    both = Record(
+        np.concatenate([still.record.fast, turn.fast]),
+        np.concatenate([still.record.packets, packets]),
+    )
+    filter_.run(later(Log(both, still.slow), {"gyro": 0.06}))
+    assert filter_.latency["gyro"] == pytest.approx(0.06, abs=0.003)

@@ -1,0 +1,175 @@
+"""Fast channels that are late, by a known latency: exact, whoever calls, and refused where not."""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sideslip.envs.record import FAST, PACKET, Log, Record
+from sideslip.envs.sensors.link import SlowSensor
+from sideslip.estimators import Estimator, make_estimator
+from sideslip.estimators.analysis.bound import Change, bound
+from sideslip.estimators.late import LateEstimator
+from sideslip.estimators.vector.make import make_batch
+from tests.estimators.core.test_conditioning import CASES, EXACT, differences
+from tests.estimators.simulation import CAMERA, FIG7, simulate
+
+LATE = {"gyro": 0.06}
+
+
+def later(log: Log, latency: dict[str, float]) -> Log:
+    """The log with columns that stand too late, the first value until they come."""
+    fast = log.record.fast.copy()
+    for name, late in latency.items():
+        column, rows = getattr(FAST, name), round(late / log.record.dt)
+        fast[rows:, column], fast[:rows, column] = fast[:-rows, column], fast[0, column]
+    return dataclasses.replace(log, record=dataclasses.replace(log.record, fast=fast))
+
+
+@pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning")
+@pytest.mark.parametrize("delay", ["clone", "buffer"])
+@pytest.mark.parametrize("case", ["forces, camera and gps", "accelerometer, roll rate, bias"])
+def test_it_equals_dense_conditioning_on_what_has_come(case: str, delay: str) -> None:
+    """Of the last ticks the gyro is not there, accelerometers and packets are."""
+    told = CASES[case]
+    latency = {"gyro": 0.06} | ({"accel_y": 0.025} if "accel" in case else {})
+    late = dataclasses.replace(told, options=told.options | {"latency": latency})
+    filter_ = late.build(delay)
+    for seed in range(6):
+        log = told.schedule(seed)
+        filter_.run(later(log, latency))
+        fast = log.record.fast.copy()
+        for name, seconds in latency.items():
+            fast[len(fast) - round(seconds / told.dt) :, getattr(FAST, name)] = np.nan
+        record = dataclasses.replace(log.record, fast=fast)
+        assert (
+            differences(filter_, *told.posterior(filter_.names, record).at(told.rows - 1)) < EXACT
+        )
+        assert {name for name, count in filter_.counts.items() if count} <= {"duplicates"}
+
+
+def drive() -> tuple[Log, dict[str, Any]]:
+    """Two seconds with a camera that is late, some of whose frames are refused."""
+    sensors = {"camera": SlowSensor(0.033, (0.04, 0.02))}
+    log = simulate(FIG7, sensors, 3)
+    packets = log.record.packets.copy()
+    packets[5, PACKET.value], packets[9, PACKET.captured] = np.nan, 1e9
+    record = Record(log.record.fast[:2000], packets[packets[:, PACKET.arrived] < 2000])
+    facts = {"vehicle": FIG7.truth, "sensors": sensors, "speed": FIG7.speed}
+    return later(dataclasses.replace(log, record=record), LATE), facts
+
+
+def stepped(filter_: Any, record: Record, width: int) -> None:
+    """A run in steps of some ticks."""
+    filter_.reset()
+    for first in range(0, len(record.fast), width):
+        arrived = record.packets[:, PACKET.arrived]
+        new = (arrived >= first) & (arrived < first + width)
+        filter_.step(record.fast[first : first + width], record.packets[new])
+
+
+@pytest.mark.parametrize("latency", [LATE, {"gyro": "find"}])
+def test_a_run_is_its_steps_whatever_their_length_and_so_is_a_batch(latency: Any) -> None:
+    log, facts = drive()
+    filter_ = make_estimator("joint", **facts, latency=latency)
+    end = filter_.run(log)
+    batch = make_batch("joint", 2, **facts, latency=latency)
+    for width in (10, 37, 2000):
+        stepped(filter_, log.record, width)
+        assert (filter_.x == end.x[-1]).all() and filter_.tick == 1999
+        assert filter_.invalid == filter_.unknown == 1
+    for first in range(0, 2000, 500):
+        arrived = log.record.packets[:, PACKET.arrived]
+        new = log.record.packets[(arrived >= first) & (arrived < first + 500)]
+        fast = log.record.fast[first : first + 500]
+        batch.step(np.stack([fast, fast]), np.stack([new, new]))
+    assert (batch.x == filter_.x).all() and (batch.P == filter_.P).all()
+
+
+def test_a_snapshot_goes_on() -> None:
+    log, facts = drive()
+    filter_ = make_estimator("joint", **facts, latency={"gyro": "find"})
+    split = log.record.packets[:, PACKET.arrived] < 700
+    filter_.step(log.record.fast[:700], log.record.packets[split])
+    snapshot = filter_.get_state()
+    ends = []
+    for _ in range(2):
+        filter_.step(log.record.fast[700:], log.record.packets[~split])
+        ends.append(filter_.x)
+        filter_.set_state(snapshot)
+    assert (ends[0] == ends[1]).all()
+
+
+def test_a_single_packet_counts_at_once() -> None:
+    log, facts = drive()
+    filter_ = make_estimator("exact-kf", **facts, latency=LATE)
+    came = log.record.packets[:, PACKET.arrived] < 700
+    filter_.step(log.record.fast[:700], log.record.packets[came])
+    before, packet = filter_.P, log.record.packets[~came][0]
+    packet[PACKET.arrived] = 699.0
+    filter_.update(packet)
+    assert filter_.P[0, 0] < before[0, 0] and filter_.future == 0
+
+
+def test_without_a_latency_it_is_the_filter_that_it_was() -> None:
+    log, facts = drive()
+    for none in ({}, {"gyro": 0.0}):
+        filter_ = make_estimator("joint", **facts, latency=none)
+        assert type(filter_) is Estimator
+        assert (filter_.run(log).x == make_estimator("joint", **facts).run(log).x).all()
+
+
+def test_behind_it_is_the_punctual_filter_on_the_punctual_record() -> None:
+    """All but the prediction: at the time of the latest channel nothing was lost."""
+    log, facts = drive()
+    punctual = log.record.fast.copy()
+    punctual[:-60, FAST.gyro] = log.record.fast[60:, FAST.gyro]
+    packets = log.record.packets.copy()
+    early = np.maximum(packets[:, PACKET.captured], packets[:, PACKET.arrived] - 60)
+    packets[:, PACKET.arrived] = np.where(packets[:, PACKET.captured] < 1e6, early, 0.0)
+    here = packets[:, PACKET.arrived] < 1940
+    late = make_estimator("exact-kf", **facts, latency=LATE)
+    late.run(log)
+    plain = make_estimator("exact-kf", **facts)
+    plain.run(Log(Record(punctual[:1940], packets[here]), log.slow))
+    assert isinstance(late, LateEstimator)
+    assert (late.behind[0].x[:6] == plain.x).all() and late.P[0, 0] > plain.P[0, 0]
+
+
+def test_the_bound_that_knows_it_is_a_bound() -> None:
+    """A late gyro costs, a punctual one that is slower costs no less; the filter reaches it."""
+    log, facts = drive()
+    told: Any = {"record": log.record, "sensors": facts["sensors"], "speed": FIG7.speed}
+    best = [bound(FIG7.truth, **told, latency=how) for how in ({}, LATE, {"gyro": 0.12})]
+    assert (best[0][500:] < best[1][500:]).all() and (best[1][500:] < best[2][500:]).all()
+    with pytest.raises(ValueError, match="a bound with latency has no change"):
+        bound(FIG7.truth, **told, latency=LATE, change=Change(1.0, FIG7.truth))
+
+
+@pytest.mark.parametrize(
+    "latency, match",
+    [
+        ({"gyro": -0.01}, "latency of gyro is 0 to 0.5 s"),
+        ({"gyro": np.nan}, "latency of gyro is 0 to 0.5 s"),
+        ({"gyro": 0.6}, "latency of gyro is 0 to 0.5 s"),
+        ({"gyro": 0.0605}, "a latency of gyro of 0.0605 s is no whole number of ticks"),
+        ({"sonar": 0.1}, "latency is of steer, gyro"),
+        ({"gyro": "find", "steer": "find"}, "is 'find' for one channel"),
+    ],
+)
+def test_what_a_latency_cannot_be(latency: Any, match: str) -> None:
+    with pytest.raises(ValueError, match=match):
+        make_estimator("joint", sensors={"camera": CAMERA}, speed=7.0, latency=latency)
+
+
+def test_filters_that_cannot_have_one() -> None:
+    common: dict[str, Any] = {"sensors": {"camera": CAMERA}, "speed": 7.0}
+    with pytest.raises(ValueError, match="'find' for one channel of a filter with tyres as states"):
+        make_estimator("exact-kf", **common, latency={"gyro": "find"})
+    with pytest.raises(ValueError, match="latency needs delay 'clone' or 'buffer'"):
+        make_estimator("multirate-kf", **common, latency=LATE, delay="ignore")
+    with pytest.raises(ValueError, match="latency, delay='larsen' and delay='buffer' need"):
+        make_estimator("multirate-residual-kf", **common, latency=LATE)
+    with pytest.raises(TypeError, match="latency is seconds by channel"):
+        make_estimator("joint", **common, latency=0.06)
