@@ -64,7 +64,7 @@ class Episodes:
         self._final = Records(
             self.final_rows, self.final_packets, self.final_ticks_done, self.final_delivered
         )
-        self.block = block_of(N, self.control_period)
+        self.block = block_of(N, self.control_period, len(self.layout))
         self.configs: list[EpisodeConfig] = [each.base for each in rows]
         self.generators: list[np.random.Generator | None] = [None] * N
         self.seeds: list[int | None] = [None] * N

@@ -5,17 +5,18 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ..backend.arrays import at, lane_count
+from ..backend.arrays import at, lane_count, read
 from ..backend.decorators import apart
 from ..backend.simd import LANES
 from ..record import FAST_WIDTH, Array
 from ..task.info import REPORT
 from .arrays import Rows, row_of
-from .layout import PARAMS_WIDTH, STATE_WIDTH, Z
-from .step import conclude, drive_on, kind_of, shares_of
+from .layout import FLAGS, PARAMS_WIDTH, STATE_WIDTH, Z
+from .observe import observe_fast
+from .step import conclude_slow, drive_on, kind_of, shares_of
 from .window import follow, follows_another, foresee_lanes, window_of
 
-_REPORT = len(REPORT)
+_REPORT, _REFS = len(REPORT), (REPORT.beta_ref, REPORT.gamma_ref)
 _MOVING = Z.slow[0].frames  # what a tick changes comes first in a state, but for the driver's angle
 
 
@@ -29,12 +30,13 @@ class Block(NamedTuple):
     shares: Array
     rows: Array
     reports: Array
+    obs: Array  # but for the entries of slow sensors
     window: Array  # `window.window_of` the block
     alone: Array  # and of a row that is stepped by itself
 
 
-def block_of(count: int, n: int) -> Block:
-    """The block of an env of `count` rows and n ticks a step."""
+def block_of(count: int, n: int, entries: int) -> Block:
+    """The block of an env of `count` rows, n ticks a step and `entries` of an observation."""
     return Block(
         np.arange(count),
         np.zeros(LANES, np.int64),
@@ -43,6 +45,7 @@ def block_of(count: int, n: int) -> Block:
         np.zeros((2, LANES)),
         np.zeros((n, FAST_WIDTH, LANES)),
         np.zeros((_REPORT, LANES)),
+        np.zeros((entries, LANES)),
         window_of(n, LANES),
         window_of(n),
     )
@@ -82,6 +85,8 @@ def step_block(count: int, rows: Rows, actions: Any, n: int, bounds: Any, block:
     )
     if done == 0:
         return False
+    refs, every = read(block.reports, _REFS), rows.switches[first, FLAGS.all_samples]
+    slow, last = observe_fast(block.rows, n, refs, bounds, every, block.obs), len(bounds[0]) - 2
     for lane in range(count):
         i = block.members[lane]
         for k in range(_MOVING):
@@ -92,5 +97,9 @@ def step_block(count: int, rows: Rows, actions: Any, n: int, bounds: Any, block:
         for j in range(n):
             for k in range(FAST_WIDTH):
                 rows.rows[i, j, k] = block.rows[j, k, lane]
-        conclude(row_of(rows, i), n, n, bounds, block.window[:, :, lane])
+        for k in range(slow):
+            rows.obs[i, k] = block.obs[k, lane]
+        for k in range(last, last + 2):
+            rows.obs[i, k] = block.obs[k, lane]
+        conclude_slow(row_of(rows, i), n, slow, bounds, block.window[:, :, lane])
     return True

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from ..backend.arrays import at, put
 from ..backend.decorators import jit
 from ..backend.elementary import clip
 from ..backend.primitives import select
@@ -17,41 +18,62 @@ from .layout import FLAGS, P, Z
 def observe(row: Any, n: int, count: int, refs: Any, bounds: Any) -> None:
     """Write the float32 observation of a record of n ticks and `count` packets, every entry
     clipped at its bounds (2, k); entries as in `observation_layout`."""
-    p, z, obs, rows, packets = row.p, row.z, row.obs, row.rows, row.packets
+    k = observe_fast(row.rows, n, refs, bounds, row.switches[FLAGS.all_samples], row.obs)
+    observe_slow(row, k, count, bounds)
+
+
+@jit
+def observe_fast(rows: Any, n: int, refs: Any, bounds: Any, all_samples: int, obs: Any) -> int:
+    """Write the entries of n fast rows, which come first, and of the references, which come last;
+    returns how many come first. rows, obs: of a vehicle, or with an axis more for those of a block.
+    """
     k = 0
     for column in range(SAMPLED):
-        if row.switches[FLAGS.all_samples]:
+        if all_samples:
             for j in range(n):
-                obs[k] = clip(rows[j, column], bounds[0, k], bounds[1, k])
+                _put_clipped(obs, at(rows, j, column), bounds, k)
                 k += 1
         else:
             total = 0.0
             for j in range(n):
-                total = total + rows[j, column]
-            obs[k] = clip(rows[n - 1, column], bounds[0, k], bounds[1, k])
-            obs[k + 1] = clip(total / n, bounds[0, k + 1], bounds[1, k + 1])
+                total = total + at(rows, j, column)
+            _put_clipped(obs, at(rows, n - 1, column), bounds, k)
+            _put_clipped(obs, total / n, bounds, k + 1)
             k += 2
     for i in range(4):
-        obs[k] = clip(rows[n - 1, FAST.steer + i], bounds[0, k], bounds[1, k])
+        _put_clipped(obs, at(rows, n - 1, FAST.steer + i), bounds, k)
         k += 1
+    last = len(obs) - 2
+    _put_clipped(obs, refs[0], bounds, last)
+    _put_clipped(obs, refs[1], bounds, last + 1)
+    return k
+
+
+@jit
+def _put_clipped(obs: Any, value: Any, bounds: Any, k: int) -> None:
+    put(obs, clip(value, bounds[0, k], bounds[1, k]), k)
+
+
+@jit
+def observe_slow(row: Any, k: int, count: int, bounds: Any) -> None:
+    """Write the entries of the slow sensors, from k on, of a record of `count` packets."""
+    p, z, obs, packets = row.p, row.z, row.obs, row.packets
     tick = z[Z.clock.tick]
     for sensor in range(len(Z.slow)):
-        at = Z.slow[sensor]
+        newest = Z.slow[sensor]
         if p[P.slow[sensor].period] > 0.0:
             for i in range(WIDTHS[sensor]):
-                obs[k] = clip(z[at.values[0] + i], bounds[0, k], bounds[1, k])
+                obs[k] = clip(z[newest.values[0] + i], bounds[0, k], bounds[1, k])
                 k += 1
-            age = (tick - z[at.captured]) * TICK
-            obs[k] = clip(select(z[at.captured] != NEVER, age, AGE_CAP), 0.0, AGE_CAP)
+            age = (tick - z[newest.captured]) * TICK
+            obs[k] = clip(select(z[newest.captured] != NEVER, age, AGE_CAP), 0.0, AGE_CAP)
             fresh = 0.0
             for i in range(count):
-                newest = packets[i, PACKET.arrived] == z[at.arrived]  # not late, no duplicate
-                if packets[i, PACKET.sensor] == sensor and newest:
+                here = packets[i, PACKET.arrived] == z[newest.arrived]  # not late, no duplicate
+                if packets[i, PACKET.sensor] == sensor and here:
                     fresh = 1.0
             obs[k + 1] = fresh
             k += 2
-    obs[k] = clip(refs[0], bounds[0, k], bounds[1, k])
-    obs[k + 1] = clip(refs[1], bounds[0, k + 1], bounds[1, k + 1])
 
 
 @jit

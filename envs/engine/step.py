@@ -24,7 +24,7 @@ from ..ticks import TICK
 from ..vehicle.tyres import shifts
 from .arrays import Row
 from .layout import FLAGS, P, Z
-from .observe import observe, write_report
+from .observe import observe_fast, observe_slow, write_report
 from .packets import next_due, sense_slow
 from .tick import Fixed, Kind, Moving, Seen, advance, changed, standing_load
 from .window import WINDOW, chance_at, foresee
@@ -150,10 +150,16 @@ def write_end(
     put(report, select(tick >= duration, 1.0, 0.0), REPORT.ended)
 
 
-@apart
+@jit
 def conclude(row: Row, n: int, done: int, bounds: Any, window: Any) -> None:
     """The slow sensors along `done` ticks of one vehicle, its observation and its report."""
-    sum_up(row, n, done, sense_ticks(row, 0, done, 0, done, window), bounds)
+    conclude_slow(row, done, observe_step(row, n, done, bounds), bounds, window)
+
+
+@apart
+def conclude_slow(row: Row, done: int, k: int, bounds: Any, window: Any) -> None:
+    """The same where all but the slow sensors is in the observation; their entries begin at k."""
+    _finish(row, k, sense_ticks(row, 0, done, 0, done, window), bounds)
 
 
 @jit
@@ -171,17 +177,30 @@ def sense_ticks(row: Row, first: int, last: int, count: int, done: int, window: 
 
 
 @jit
-def sum_up(row: Row, n: int, done: int, count: int, bounds: Any) -> None:
-    """The observation and the report of a step of `done` ticks and `count` packets."""
-    z, report, rows = row.z, row.report, row.rows
+def observe_step(row: Row, n: int, done: int, bounds: Any) -> int:
+    """The observation of a step of `done` ticks but for the slow sensors, whose entries begin where
+    it returns."""
+    report, rows, every = row.report, row.rows, row.switches[FLAGS.all_samples]
     refs = (report[REPORT.beta_ref], report[REPORT.gamma_ref])
     shown = done
-    if row.switches[FLAGS.all_samples]:  # the last one stands for the missing
+    if every:  # the last one stands for the missing
         for j in range(done, n):
             copied(rows[done - 1], rows[j])
         shown = n
-    observe(row, shown, count, refs, bounds)
-    write_report(report, z)
+    return int(observe_fast(rows, shown, refs, bounds, every, row.obs))
+
+
+@jit
+def sum_up(row: Row, n: int, done: int, count: int, bounds: Any) -> None:
+    """The observation and the report of a step of `done` ticks and `count` packets."""
+    _finish(row, observe_step(row, n, done, bounds), count, bounds)
+
+
+@jit
+def _finish(row: Row, k: int, count: int, bounds: Any) -> None:
+    report = row.report
+    observe_slow(row, k, count, bounds)
+    write_report(report, row.z)
     report[REPORT.reward] = -report[REPORT.cost]
     report[REPORT.packets] = count
 
