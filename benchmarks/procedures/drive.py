@@ -167,7 +167,7 @@ def prescribed(
     return _series(rows, not plant.finite)
 
 
-def steering_programme(scenario: Scenario) -> tuple[float, ...]:
+def steering_programme(scenario: Scenario) -> Array:
     """The numbers that `steering_at` reads, of a scenario that draws nothing.
 
     Raises ValueError for a range: a procedure leaves nothing to the seed.
@@ -177,7 +177,7 @@ def steering_programme(scenario: Scenario) -> tuple[float, ...]:
         raise ValueError(f"scenario {scenario.name!r} draws; a procedure gives numbers")
     programme = np.zeros(STEERING_WIDTH)
     write_steering(STEERING_KINDS.index(scenario.steering), Draws(*low.tolist()), programme)
-    return tuple(programme.tolist())
+    return programme
 
 
 @dataclass(frozen=True)

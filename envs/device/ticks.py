@@ -7,7 +7,6 @@ branches on values, so the device never waits for the host.
 
 from typing import Any, NamedTuple
 
-from ..backend.arrays import read
 from ..backend.on_torch import compiled, on_tensors, torch
 from ..backend.primitives import select
 from ..backend.random import CHANNELS, normals
@@ -61,7 +60,7 @@ class Ticks:
         self.kind = kind
         self._normals, self._steering_at = on_tensors(dtype, normals, steering_at)
         self._fixed, self._advance, self._changed = on_tensors(dtype, fixed_of, advance, changed)
-        self._failure_of, self._select, self._read = on_tensors(dtype, failure_of, select, read)
+        self._failure_of, self._select = on_tensors(dtype, failure_of, select)
         self._dtype = dtype
         self.tick: Any = compiled(self._tick) if compile else self._tick
         self.foresee: Any = compiled(self._foresee) if compile else self._foresee
@@ -74,7 +73,7 @@ class Ticks:
         wheels = self._normals(keys[0], keys[1], whole, CHANNELS.wheels)
         if self.kind.follows:
             return inertial + wheels, None
-        programme = self._read(p, P.programme)
+        programme = p[P.programme[0] :]
         return inertial + wheels, self._steering_at(ticks.to(self._dtype), programme)
 
     def _tick(

@@ -43,7 +43,7 @@ def programmed(p: Any, tick: Any) -> Any:
     """The angle in rad at a tick of one vehicle's programme, or of the trace behind `Params`."""
     if len(p) > PARAMS_WIDTH and p[PARAMS_WIDTH] > 0.0:
         return trace_at(tick, p[PARAMS_WIDTH:])
-    return steering_at(tick, read(p, P.programme))
+    return steering_at(tick, p[P.programme[0] :])
 
 
 @jit
@@ -78,7 +78,7 @@ def foresee(p: Any, z: Any, n: int, follows: int, window: Any) -> None:
     """
     clock = read(z, Z.clock)
     key_low, key_high, first = word(clock.key_low), word(clock.key_high), int(clock.tick) + 1
-    programme = read(p, P.programme)
+    programme = p[P.programme[0] :]
     for j in range(0, n, lane_count()):
         ticks = ramp(first + j)
         inertial = normals(key_low, key_high, ticks, CHANNELS.inertial)
@@ -95,7 +95,7 @@ def foresee_lanes(p: Any, z: Any, n: int, follows: int, window: Any) -> None:
     """The same of a block of vehicles: p, z with a column for each."""
     clock = read(z, Z.clock)
     key_low, key_high = word(clock.key_low), word(clock.key_high)
-    programme = read(p, P.programme)
+    programme = p[P.programme[0] :]
     for j in range(n):
         tick = clock.tick + (j + 1)
         inertial = normals(key_low, key_high, whole(tick), CHANNELS.inertial)

@@ -7,6 +7,7 @@ can reset its rows without Python.
 
 from typing import Any
 
+from ..backend.arrays import at
 from ..backend.decorators import jit
 from ..backend.elementary import PI, exp, sincos, smoothstep
 from ..backend.primitives import anywhere, floor, maximum, minimum, select, sqrt
@@ -31,30 +32,35 @@ RISE = 0.2  # s, of a step
 
 @jit
 def steering_at(tick: Any, programme: Any) -> Any:
-    """The driver's steering command in rad at a tick; `programme` is STEERING_WIDTH numbers."""
+    """The driver's steering command in rad at a tick.
+
+    programme: an array that begins with STEERING_WIDTH numbers. A tuple would go through memory at
+    every call, and a loop's index into it is a jump table.
+    """
     angle = 0.0
     for i in range(SINES):
-        start = programme[5 * i + 3]
-        s, _ = sincos(programme[5 * i + 1] * ((tick - start) * TICK) + programme[5 * i + 2])
-        on = (tick >= start) & (tick < programme[5 * i + 4])
-        angle = angle + select(on, programme[5 * i] * s, 0.0)
+        start = at(programme, 5 * i + 3)
+        s, _ = sincos(at(programme, 5 * i + 1) * ((tick - start) * TICK) + at(programme, 5 * i + 2))
+        on = (tick >= start) & (tick < at(programme, 5 * i + 4))
+        angle = angle + select(on, at(programme, 5 * i) * s, 0.0)
     for i in range(STEPS):
         k = 5 * SINES + 3 * i
-        angle = angle + programme[k] * smoothstep((tick - programme[k + 1]) / programme[k + 2])
+        done = (tick - at(programme, k + 1)) / at(programme, k + 2)
+        angle = angle + at(programme, k) * smoothstep(done)
     k = _RAMP_AT
-    used = programme[k] != 0.0
+    used = at(programme, k) != 0.0
     if anywhere(used):
-        share = (tick - programme[k + 1]) / select(used, programme[k + 2], 1.0)
-        angle = angle + programme[k] * minimum(maximum(share, 0.0), 1.0)
+        share = (tick - at(programme, k + 1)) / select(used, at(programme, k + 2), 1.0)
+        angle = angle + at(programme, k) * minimum(maximum(share, 0.0), 1.0)
     k = _SWEEP_AT
-    used = programme[k] != 0.0
+    used = at(programme, k) != 0.0
     if anywhere(used):
-        t = maximum(tick - programme[k + 3], 0.0) * TICK
-        grown = minimum(t, programme[k + 4])
-        phase = programme[k + 1] * t + programme[k + 2] * (
-            0.5 * grown * grown / select(used, programme[k + 4], 1.0) + (t - grown)
+        t = maximum(tick - at(programme, k + 3), 0.0) * TICK
+        grown = minimum(t, at(programme, k + 4))
+        phase = at(programme, k + 1) * t + at(programme, k + 2) * (
+            0.5 * grown * grown / select(used, at(programme, k + 4), 1.0) + (t - grown)
         )
-        angle = angle + programme[k] * sincos(phase)[0]
+        angle = angle + at(programme, k) * sincos(phase)[0]
     return angle
 
 

@@ -95,9 +95,8 @@ def test_steering() -> None:
     numbers[3 : 5 * programme.SINES : 5] = 100.0, 0.0, 300.0, 40.0
     numbers[4 : 5 * programme.SINES : 5] = 900.0, FOREVER, 1200.0, 50.0
     numbers[5 * programme.SINES + 2 :: 3] = 200.0
-    code = tuple(numbers.tolist())
     ticks = [float(tick) for tick in range(0, 2000, 7)]
-    agree(programme.steering_at, [ticks], lambda f, tick: f(tick, code))
+    agree(programme.steering_at, [ticks], lambda f, tick: f(tick, numbers))
 
 
 @pytest.mark.parametrize("name", ["normals", "uniforms"])

@@ -9,7 +9,6 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from sideslip.envs import COMS, Scenario, StabilityEnv
-from sideslip.envs.backend.arrays import read
 from sideslip.envs.engine.layout import P, Z
 from sideslip.envs.record import FAST, PACKET, concatenate
 from sideslip.envs.scenarios.steering import steering_at
@@ -34,7 +33,7 @@ def drive(scenario: Any, action: float = 0.0, steps: int = 400, **more: Any) -> 
 def test_its_direction_is_that_of_the_nominal_cars_path() -> None:
     """psi + beta of the linear bicycle, integrated by another's integrator."""
     _, states, p = drive(WINDING)
-    programme, V = read(p, P.programme), float(p[P.pace.speed])
+    programme, V = p[P.programme[0] :], float(p[P.pace.speed])
     model = bicycle(COMS, V)
 
     def slope(t: float, x: Any) -> Any:

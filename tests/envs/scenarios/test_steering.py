@@ -45,8 +45,7 @@ def steering(kind: str, seconds: float = 10.0, **changes: float) -> np.ndarray:
     """The steering angle at every tick."""
     programme = np.zeros(STEERING_WIDTH)
     write_steering(STEERING_KINDS.index(kind), DRAWN._replace(**changes), programme)
-    code = tuple(programme.tolist())
-    return np.array([steering_at(float(tick), code) for tick in range(round(seconds / TICK))])
+    return np.array([steering_at(float(tick), programme) for tick in range(round(seconds / TICK))])
 
 
 def sine(start: float, hertz: float, t: np.ndarray) -> np.ndarray:
