@@ -36,12 +36,6 @@ def aligned(rows: Array, lags: dict[int, int]) -> Array:
     return found
 
 
-def ordered(packets: Array) -> Array:
-    """Packets (count, PACKET_WIDTH or more) as a record has them."""
-    by = PACKET.sensor, PACKET.captured, PACKET.arrived
-    return np.ascontiguousarray(packets[np.lexsort([packets[:, column] for column in by])])
-
-
 class Search:
     """A latency of some columns that is looked for. dt: s of a tick.
 
@@ -125,8 +119,9 @@ class Search:
         """The stretch with a lag: the sum of its packets' NIS, of how many numbers, the memory."""
         filters, count = self._start.copy(), len(rows) - self.longest
         fast = aligned(rows, dict.fromkeys(self.columns, lag))[:count]
-        packets = ordered(np.concatenate(self._packets)[:, :PACKET_WIDTH])
-        packets = packets[packets[:, PACKET.arrived] <= filters[0].tick + count]
+        packets = np.concatenate(self._packets)[:, :PACKET_WIDTH]
+        here = packets[:, PACKET.arrived] <= filters[0].tick + count
+        packets = np.ascontiguousarray(packets[here])
         nis, nothing = np.full(len(packets), np.nan), np.zeros((0, 0))
         record = fast, count, packets, len(packets), 0, nothing, nothing, nis
         advance_entry()(filters, gains, *record)

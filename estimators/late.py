@@ -14,7 +14,7 @@ from .design.options import FIND, columns_of
 from .design.schedule import Schedule, whole_ticks
 from .entry import advance_entry, receive_entry
 from .estimator import EMPTY, NO_NIS, Array, Estimator
-from .find_latency import Search, aligned, ordered
+from .find_latency import Search, aligned
 
 _HISTORY: int = FILTER.fields["predicted"][1]  # type: ignore[index]  # where a memory's window begins, in bytes
 _PLACE = PACKET_WIDTH  # column behind a packet's: its place in the call
@@ -23,11 +23,10 @@ _PLACE = PACKET_WIDTH  # column behind a packet's: its place in the call
 class LateEstimator(Estimator):
     """A filter with the option `latency`; built by `make_estimator`.
 
-    `behind`, a memory, is the filter at the time t - L of the latest channel: there every channel
-    stands at the time when it was true, and packets come L earlier, at their capture at the
-    earliest. The estimate at t is a copy of it that goes on to t with what is known by then: the
-    inputs, channels that are less late, the packets. So it is the conditional mean of a linear
-    system, as without latencies. A step costs L / dt ticks more.
+    `behind`, a memory, is the filter at the time t - L of the latest channel, with every channel at
+    the time when it was true. The estimate at t is a copy of it that goes on to t with what is
+    known by then: the inputs, channels that are less late, the packets. So it is the conditional
+    mean of a linear system, as without latencies. A step costs L / dt ticks more.
 
     `latency`: s by channel in force; `latency_sd`: s, of the one that is looked for, infinite
     while it is not known and the channel is taken as punctual.
@@ -105,18 +104,13 @@ class LateEstimator(Estimator):
 
     def _move(self, fast: Array, packets: Array, now: int, nis: Array) -> None:
         """Take rows up to the tick `now`, and packets: `behind` what is due there."""
-        captured, arrived = packets[:, PACKET.captured], packets[:, PACKET.arrived]
-        sound = (captured <= arrived) & (arrived <= now)
-        earlier = np.maximum(arrived - self._longest, captured)
-        packets[:, PACKET.arrived] = np.where(sound, earlier, arrived)
-        if sound.any():
-            self._waiting = ordered(np.concatenate((self._waiting, packets[sound])))
         rows = np.concatenate((self._rows, fast))
         due = max(len(rows) - self._longest, 0)
-        late = self._waiting[:, PACKET.arrived] > now - len(rows) + due
-        handed = np.concatenate((self._waiting[~late], packets[~sound]))  # the latter: counted
-        self._rows, self._waiting = rows[due:], self._waiting[late]
-        self._pass_on(aligned(rows, self._lags)[:due], handed, nis)
+        came = np.concatenate((self._waiting, packets))
+        arrived = came[:, PACKET.arrived]
+        later = (arrived > now - len(rows) + due) & (arrived <= now)  # others are to be counted
+        self._rows, self._waiting = rows[due:], came[later]
+        self._pass_on(aligned(rows, self._lags)[:due], came[~later], nis)
         if self._search and not self._search.done:
             self._search.take(fast, packets)
             self.behind[:] = self._search.look(self.behind, self._rows, self._waiting, self.gains)
@@ -139,7 +133,8 @@ class LateEstimator(Estimator):
         now, then = (
             each.view(np.uint8).reshape(len(each), -1) for each in (self.filters, self.behind)
         )
-        used = None if self.config.delay == "buffer" else _HISTORY
+        short = self.config.delay == "clone" and not self._f.store_predictions
+        used = _HISTORY if short else None
         now[:, :used] = then[:, :used]
         if len(self._rows):
             rows = aligned(self._rows, self._lags)

@@ -175,7 +175,7 @@ def configure(
         times={name: read.not_negative(f"{name}_time", "s") for name in biases if name in WANDER},
         adapt=read.number("adapt", 0.0, "is a share from 0 to 1", lambda v: 0.0 <= v < 1.0),
         prior=prior_of(states, noise, biases, read),
-        latency=latency_of(read, rules["delay"], bool(used) and TYRES[0] in states),
+        latency=latency_of(read, bool(used) and TYRES[0] in states),
         allow_unstable=bool(read.value("allow_unstable", False)),
     )
     read.done()

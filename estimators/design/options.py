@@ -105,10 +105,10 @@ def columns_of(channel: str) -> tuple[int, ...]:
     return tuple(int(getattr(FAST, name)) for name in FAST_CHANNELS[channel])
 
 
-def latency_of(read: Options, delay: str, findable: bool) -> dict[str, float | str]:
+def latency_of(read: Options, findable: bool) -> dict[str, float | str]:
     """The option `latency` without zeros: s by channel, or `FIND` for one of them.
 
-    delay: the filter's rule for late samples. findable: whether it has packets and tyres as states.
+    findable: whether the filter has slow sensors, and tyres as states.
     """
     value: Any = read.value("latency", {})
     if not isinstance(value, Mapping):
@@ -126,6 +126,4 @@ def latency_of(read: Options, delay: str, findable: bool) -> dict[str, float | s
     if list(found.values()).count(FIND) > (1 if findable else 0):
         expected = f"is {FIND!r} for one channel of a filter with tyres as states and slow sensors"
         raise read.wrong("latency", expected, dict(value))
-    if found and delay not in ("clone", "buffer"):
-        raise read.wrong("latency", "needs delay 'clone' or 'buffer'", dict(value))
     return found

@@ -10,25 +10,28 @@ from sideslip.estimators import make_estimator
 from tests.estimators.simulation import CAMERA, FIG7, simulate
 from tests.estimators.test_late import later
 
+FIND = {"gyro": "find"}
 FACTS: dict[str, Any] = {"sensors": {"camera": CAMERA}, "speed": FIG7.speed}
 
 
-def finder(front: float, rear: float) -> Any:
-    """joint, whose nominal car has other tyres than the true one by these factors."""
-    car = FIG7.truth.scaled(front, rear)
-    return make_estimator("joint", vehicle=car, **FACTS, latency={"gyro": "find"})
+def joint(front: float, rear: float, **options: Any) -> Any:
+    """Its nominal car has other tyres than the true one by these factors."""
+    return make_estimator("joint", vehicle=FIG7.truth.scaled(front, rear), **FACTS, **options)
 
 
 @pytest.mark.parametrize("late", [0.0, 0.013, 0.06, 0.1])
 @pytest.mark.parametrize("tyres", [(1.0, 1.0), (0.7, 1.3), (1.4, 0.7)])
 def test_it_finds_the_latency_whatever_the_tyres(late: float, tyres: tuple[float, float]) -> None:
-    filter_ = finder(*tyres)
+    filter_ = joint(*tyres, latency=FIND)
     for seed in range(2):
         log = later(simulate(FIG7, FACTS["sensors"], seed), {"gyro": late} if late else {})
         estimates = filter_.run(log)
         off = filter_.latency["gyro"] - late
         assert filter_.latency_sd < 0.003 and abs(off) <= max(4.0 * filter_.latency_sd, 0.001)
-        punctual = finder(*tyres).run(simulate(FIG7, FACTS["sensors"], seed))
+        plain = joint(*tyres)
+        punctual = plain.run(simulate(FIG7, FACTS["sensors"], seed))
+        if late == 0.0:
+            assert (estimates.x == punctual.x).all()
         squares = [
             np.mean((each["beta"] - log.truth["beta"])[2000:] ** 2)
             for each in (estimates, punctual)
@@ -52,7 +55,7 @@ def straight(rows: int) -> Log:
 
 def test_it_leaves_alone_what_a_log_cannot_tell_and_goes_on_looking() -> None:
     """A straight road has no latency; where the car turns at last it is found."""
-    filter_, still = finder(1.0, 1.0), straight(9900)
+    filter_, still = joint(1.0, 1.0, latency=FIND), straight(9900)
     filter_.run(still)
     assert filter_.latency == {"gyro": 0.0} and filter_.latency_sd == np.inf
     turn = simulate(FIG7, FACTS["sensors"], 0).record
