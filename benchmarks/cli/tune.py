@@ -42,7 +42,9 @@ def _searched(text: str) -> tuple[str, tuple[float, float] | None]:
 @tune_app.command("estimator")
 def tune_estimator(
     name: Annotated[str, typer.Argument(help="An estimator's name.")],
-    scenario: Annotated[str, typer.Option(help="A scenario's name.")],
+    scenario: Annotated[
+        list[str], typer.Option(help="A scenario's name; repeatable: each counts alike.")
+    ],
     env: Annotated[str, typer.Option(help="An environment's id; default: one that fits.")] = "",
     target: Annotated[str, typer.Option(help="The state whose error counts.")] = "beta",
     option: Annotated[Texts, typer.Option(help="NAME=VALUE, held; repeatable.")] = None,
@@ -92,6 +94,7 @@ def tune_estimator(
     suite, found = run(task, trials, test_seeds, storage or STORAGE, sampler, seed, jobs, console)
     print_suite(console, suite)
     flags: list[tuple[str, Sequence[Any]]] = [
+        ("--scenario", scenario),
         ("--env", [env] if env else []),
         ("--target", [target] if target != "beta" else []),
         ("--option", option or []),
@@ -103,7 +106,7 @@ def tune_estimator(
         ("--seed", [seed] if seed else []),
     ]
     words = [str(word) for flag, values in flags for value in values for word in (flag, value)]
-    command = shlex.join(["sideslip", "tune", "estimator", name, "--scenario", scenario, *words])
+    command = shlex.join(["sideslip", "tune", "estimator", name, *words])
     made = entry(task, found, command, note)
     for path in files:
         update(path, made)

@@ -20,8 +20,7 @@ from ...envs.backend.extras import extra
 from ..harness.drives import Drive
 from ..harness.engines import cores
 from ..harness.parallel import progress, run_cases
-from ..harness.stats import root_mean
-from .task import SAMPLERS, STORAGE, Task, squares
+from .task import SAMPLERS, STORAGE, Task, objective, squares
 
 with extra("tune", "tuning needs optuna"):
     import cmaes  # noqa: F401  Optuna imports it when it is too late
@@ -50,9 +49,9 @@ def _loaded(path: str) -> Any:
 
 
 def score(path: str, task: Task, found: dict[str, float]) -> float:
-    """RMSE of the target with some numbers, over the drives in a file; infinite if unstable."""
+    """`objective` with some numbers, on the drives in a file; infinite if unstable."""
     try:
-        return float(root_mean(squares(task, _loaded(path), found)))
+        return objective(squares(task, _loaded(path), found))
     except ValueError:  # a filter that diverges, a covariance that is none
         return math.inf
 

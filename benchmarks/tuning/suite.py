@@ -46,31 +46,39 @@ def run(
     test = simulate(task, range(test_seeds), "test drives", jobs, console)
     suite = Suite(
         "tune",
-        f"Tuning {task.estimator} on {task.scenario}",
+        f"Tuning {task.estimator} on {task.subject}",
         f"RMSE of {task.target} from 2 s on in {task.unit}, with 95 % bootstrap intervals; "
         f"{trials} trials. The default is make_estimator with no more than what is held "
-        "fixed.",
-        tables=[_comparison(task, training, test, found), found_table(found, task.search)],
+        "fixed. Several scenarios count alike: the search makes the geometric mean of their RMSE "
+        "least.",
+        tables=[*_comparisons(task, training, test, found), found_table(found, task.search)],
     )
     return suite, found
 
 
-def _comparison(
+def _comparisons(
     task: Task, training: Sequence[Drive], test: Sequence[Drive], found: dict[str, float]
-) -> Table:
+) -> list[Table]:
+    """A table a scenario."""
     default = [_squares(task, drives, {}) for drives in (training, test)]
     tuned = [_squares(task, drives, found) for drives in (training, test)]
-    ratio, low, high = (
-        interval(tuned[1], ratio_of_roots, default[1])
-        if np.isfinite(default[1]).all() and np.isfinite(tuned[1]).all()
-        else [math.nan] * 3
-    )
-    return Table(
-        f"{task.estimator} on {task.scenario} ({task.env_id})",
-        ("tuning", f"{len(training)} training seeds", f"{len(test)} test seeds"),
-        [["default", *map(_spread, default)], ["found", *map(_spread, tuned)]],
-        f"Found over default on the test seeds: {ratio:.3f} ({low:.3f} .. {high:.3f}).",
-    )
+    tables = []
+    for i, scenario in enumerate(task.scenarios):
+        before, after = [each[i] for each in default], [each[i] for each in tuned]
+        ratio, low, high = (
+            interval(after[1], ratio_of_roots, before[1])
+            if np.isfinite(before[1]).all() and np.isfinite(after[1]).all()
+            else [math.nan] * 3
+        )
+        tables.append(
+            Table(
+                f"{task.estimator} on {scenario} ({task.env_id})",
+                ("tuning", f"{before[0].size} training seeds", f"{before[1].size} test seeds"),
+                [["default", *map(_spread, before)], ["found", *map(_spread, after)]],
+                f"Found over default on the test seeds: {ratio:.3f} ({low:.3f} .. {high:.3f}).",
+            )
+        )
+    return tables
 
 
 def _squares(task: Task, drives: Sequence[Drive], numbers: dict[str, float]) -> Array:
@@ -78,7 +86,7 @@ def _squares(task: Task, drives: Sequence[Drive], numbers: dict[str, float]) -> 
     try:
         return squares(task, drives, numbers)
     except ValueError:
-        return np.full(len(drives), np.inf)
+        return np.full((len(task.scenarios), len(drives) // len(task.scenarios)), np.inf)
 
 
 def _spread(errors: Array) -> str:

@@ -1,4 +1,4 @@
-"""The task of a tuning: an estimator on a scenario's drives, its error, the numbers to be found."""
+"""The task of a tuning: an estimator on drives of scenarios, its error, the numbers to be found."""
 
 import dataclasses
 import hashlib
@@ -22,6 +22,7 @@ from ...estimators.make import ESTIMATORS, make_estimator
 from ..estimation import EXPERIMENTS
 from ..harness.drives import SETTLED, Drive, facts_of, quietly
 from ..harness.parallel import run_cases
+from ..harness.stats import root_mean
 
 Array = npt.NDArray[np.float64]
 Range = tuple[float, float]
@@ -37,12 +38,13 @@ FIRST_SEED = 1000  # of training; the test seeds count from 0
 class Task:
     """A tuning: which options of an estimator are searched, on which drives, for what.
 
-    options: held. search: option to (low, high), both positive. target: the state whose error
-    counts, in `unit`. sensors: the slow ones that the estimator uses, joined by commas.
+    scenarios: which count alike, each with every seed. options: held. search: option to (low,
+    high), both positive. target: the state whose error counts, in `unit`. sensors: the slow ones
+    that the estimator uses, joined by commas.
     """
 
     estimator: str
-    scenario: str
+    scenarios: tuple[str, ...]
     env_id: str
     target: str
     unit: str
@@ -52,17 +54,22 @@ class Task:
     seeds: tuple[int, ...]
 
     @property
+    def subject(self) -> str:
+        """The scenarios' names."""
+        return ", ".join(self.scenarios)
+
+    @property
     def study(self) -> str:
         """The study's name: the same for the same question asked of the same sources."""
         question = json.dumps(dataclasses.asdict(self), sort_keys=True, default=str)
         stamp = f"{question} {source_stamp('estimators')} {__version__}"
         digest = hashlib.sha256(stamp.encode()).hexdigest()[:12]
-        return f"{self.estimator} on {self.scenario} {digest}"
+        return f"{self.estimator} on {self.subject} {digest}"
 
 
 def make_task(
     estimator: str,
-    scenario: str,
+    scenarios: str | Sequence[str],
     env_id: str | None = None,
     target: str = "beta",
     options: Mapping[str, Any] | None = None,
@@ -72,7 +79,9 @@ def make_task(
 ) -> Task:
     """Check what a user asks for and fill in the rest.
 
-    env_id: default, the first environment with the sensors the estimator needs. search: the
+    scenarios: one's name or several.
+        env_id: default, the first environment in which every scenario has the sensors the estimator
+    needs. search: the
     options to be found with their range (None: the default one); default, the process noise
     `q_...` of every state that `options` does not hold. noises: searched as well.
 
@@ -81,13 +90,16 @@ def make_task(
     """
     if seeds < 1:
         raise ValueError(f"seeds must be at least 1, got {seeds}")
+    scenarios = (scenarios,) if isinstance(scenarios, str) else tuple(scenarios)
+    if not scenarios or len(set(scenarios)) < len(scenarios):
+        raise ValueError(f"scenarios are one or more, each once, got {', '.join(scenarios)}")
     held = dict(options or {})
     ESTIMATORS.load(estimator)  # or ValueError
-    env_id, facts, filter_ = _fitting(estimator, scenario, env_id, held)
+    env_id, facts, filter_ = _fitting(estimator, scenarios, env_id, held)
     states = filter_.names
     if target not in states:
         raise ValueError(f"{estimator} has no {target}; a target is one of {', '.join(states)}")
-    (drive,) = drives_of((env_id, scenario, (FIRST_SEED,)))
+    (drive,) = drives_of((env_id, scenarios[0], (FIRST_SEED,)))
     if target not in drive.log.truth:
         known = ", ".join(state for state in states if state in drive.log.truth) or "none"
         raise ValueError(f"the truth of {target} is not recorded; of its states: {known}")
@@ -107,7 +119,7 @@ def make_task(
             build(estimator, facts, {**held, option: 1.0})  # raises with what it has
     return Task(
         estimator,
-        scenario,
+        scenarios,
         env_id,
         target,
         filter_.units[states.index(target)],
@@ -147,23 +159,27 @@ def _takes(estimator: str, option: str, held: Mapping[str, Any], facts: Mapping[
 
 
 def _fitting(
-    estimator: str, scenario: str, env_id: str | None, held: dict[str, Any]
+    estimator: str, scenarios: Sequence[str], env_id: str | None, held: dict[str, Any]
 ) -> tuple[str, dict[str, Any], Estimator]:
-    """The environment to use, its facts, and the estimator without tuning."""
-    first = [each.env_id for each in EXPERIMENTS if each.scenario == scenario]
+    """The environment to use, and its facts and the estimator without tuning in the last
+    scenario."""
+    first = [each.env_id for each in EXPERIMENTS if each.scenario in scenarios]
     others = [name for name in gym.registry if name.startswith("sideslip/Yaw")]
     ids = list(dict.fromkeys([*first, *others])) if env_id is None else [env_id]
     refused: dict[str, str] = {}
     for name in ids:
-        env: gym.Env[Any, Any] = gym.make(name, scenario=scenario)
-        env.reset(seed=FIRST_SEED)
-        facts = facts_of(env.unwrapped)
         try:
-            return name, facts, build(estimator, facts, {**_unstable(estimator), **held})
+            for scenario in scenarios:
+                env: gym.Env[Any, Any] = gym.make(name, scenario=scenario)
+                env.reset(seed=FIRST_SEED)
+                facts = facts_of(env.unwrapped)
+                filter_ = build(estimator, facts, {**_unstable(estimator), **held})
         except ValueError as error:
             refused.setdefault(str(error), name)
+        else:
+            return name, facts, filter_
     why = "; ".join(f"{name}: {text}" for text, name in refused.items())
-    raise ValueError(f"no environment of {scenario} suits {estimator}: {why}")
+    raise ValueError(f"no environment of {', '.join(scenarios)} suits {estimator}: {why}")
 
 
 def drives_of(case: tuple[str, str, tuple[int, ...]]) -> list[Drive]:
@@ -176,14 +192,15 @@ def drives_of(case: tuple[str, str, tuple[int, ...]]) -> list[Drive]:
 def simulate(
     task: Task, seeds: Sequence[int], title: str, jobs: int | None, console: Console | None
 ) -> list[Drive]:
-    """The drives of some seeds, four a case, side by side."""
-    cases = [(task.env_id, task.scenario, tuple(seeds[i : i + 4])) for i in range(0, len(seeds), 4)]
+    """The drives of some seeds in each scenario in turn, four a case, side by side."""
+    fours = [tuple(seeds[i : i + 4]) for i in range(0, len(seeds), 4)]
+    cases = [(task.env_id, scenario, four) for scenario in task.scenarios for four in fours]
     done = run_cases(drives_of, cases, title, jobs, console)
     return [drive for drives in done for drive in drives]
 
 
 def squares(task: Task, drives: Sequence[Drive], found: Mapping[str, float]) -> Array:
-    """Mean squared error of the target from `SETTLED` s on, one a drive.
+    """Mean squared error of the target from `SETTLED` s on: (scenarios, seeds).
 
     Raises ValueError where the estimator cannot be built. An estimate that is not finite counts as
     infinitely wrong.
@@ -201,4 +218,10 @@ def squares(task: Task, drives: Sequence[Drive], found: Mapping[str, float]) -> 
             if task.unit == "rad":
                 error = np.remainder(error + math.pi, turn) - math.pi
             errors[i] = np.mean(error**2)
-    return np.where(np.isfinite(errors), errors, np.inf)
+    finite = np.where(np.isfinite(errors), errors, np.inf)
+    return finite.reshape(len(task.scenarios), -1)
+
+
+def objective(errors: Array) -> float:
+    """What a search makes least: the geometric mean of the scenarios' RMSE, of `squares`."""
+    return float(np.exp(np.mean(np.log(root_mean(errors)))))

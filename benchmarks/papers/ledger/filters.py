@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -11,12 +12,24 @@ from ....agents.rollout import rollout
 from ....envs.record import PACKET, Log
 from ....envs.scenarios.manoeuvres import scenario_from
 from ....estimators.analysis.bound import bound
+from ....estimators.design.tunings import read_tunings
 from ....estimators.estimator import Estimator
 from ....estimators.make import make_estimator
 from ...harness.drives import SETTLED, facts_of, quietly
 from ...harness.parallel import chunked
 from .claim import Array, Example, Measured
 from .simulations import CHUNK, FIRST, Numbers, rms, stacked
+
+_TUNED = {
+    entry["estimator"]: {f"q_{state}": value for state, value in entry["q"].items()}
+    for entry in read_tunings(Path(__file__).with_name("tunings.toml"))
+}
+
+
+def tuned_for_paper(name: str) -> Mapping[str, float]:
+    """Options of `make_estimator` by which a filter is tuned for its paper's own simulation; none
+    for one whose default tuning is that."""
+    return _TUNED.get(name, {})
 
 
 @dataclass(frozen=True)
@@ -31,14 +44,14 @@ class Filter:
 
 
 def filters_for(filters: Sequence[Filter], base: Any) -> dict[str, Estimator]:
-    """The filters by label, built for the running episode of an env."""
+    """The filters by label, tuned for their papers and built for the running episode of an env."""
     cars, facts = {"nominal": base.nominal, "true": base.vehicle}, facts_of(base)
-    return {
-        each.label: quietly(
-            make_estimator, each.name, **facts | {"vehicle": cars[each.vehicle]}, **each.options
-        )
-        for each in filters
-    }
+    found = {}
+    for each in filters:
+        options = {**facts, "vehicle": cars[each.vehicle]}
+        options |= {**tuned_for_paper(each.name), **each.options}
+        found[each.label] = quietly(make_estimator, each.name, **options)
+    return found
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from ....agents import make_agent
 from ....agents.rollout import Rollout, rollout
 from ....envs.scenarios.scenario import Scenario
 from ...harness.drives import make_env
+from .filters import tuned_for_paper
 from .simulations import rms
 
 Manoeuvre = str | Mapping[str, Any] | Scenario
@@ -47,7 +48,8 @@ def drive(
     agent: "none" is the steer-by-wire car without control. options: of the agent (`bandwidth`,
     `rejection`).
     """
-    estimate = {"outputs": STATES, "options": {"slow": "gps"}}
+    tuned = dict(tuned_for_paper(estimator))
+    estimate = {"outputs": STATES, "options": {"slow": "gps"} | tuned}
     env = make_env(ENV_ID, estimator, estimate, scenario=scenario, control_period=1)
     return rollout(env, make_agent(agent, env, **options), seed)
 

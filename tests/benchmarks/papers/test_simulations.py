@@ -7,10 +7,15 @@ import numpy as np
 import pytest
 
 from sideslip.agents.rollout import rollout
-from sideslip.benchmarks.harness.drives import SETTLED
+from sideslip.benchmarks.harness.drives import SETTLED, facts_of, quietly
 from sideslip.benchmarks.harness.parallel import chunked
 from sideslip.benchmarks.papers.ledger.controllers import Following, Slip
-from sideslip.benchmarks.papers.ledger.filters import Estimation, Filter
+from sideslip.benchmarks.papers.ledger.filters import (
+    Estimation,
+    Filter,
+    filters_for,
+    tuned_for_paper,
+)
 from sideslip.estimators import make_estimator
 
 VISION = "sideslip/YawVision-v0"
@@ -73,3 +78,16 @@ def test_seeds_are_split_and_shared() -> None:
     assert chunked(7, 3) == [(0, 1, 2), (3, 4, 5), (6,)]
     assert Following("f", "dakf-fig7", {}, share=0.25).chunks(8) == [(0, 1)]
     assert Following("f", "dakf-fig7", {}, share=0.25).chunks(1) == [(0,)]
+
+
+def test_claims_are_judged_with_the_papers_tuning() -> None:
+    """What a figure's own tuning has of dakf is in its filter, and is not the package's."""
+    env: Any = gym.make("sideslip/YawGps-v0", scenario="dakf-fig6")
+    env.reset(seed=0)
+    facts = facts_of(env.unwrapped)
+    (ours,) = filters_for([Filter("dakf", "dakf")], env.unwrapped).values()
+    package = quietly(make_estimator, "dakf", **facts)
+    wanted = quietly(make_estimator, "dakf", **facts, **tuned_for_paper("dakf"))
+    Q = [np.diag(each.filters[0].Q)[:5] for each in (ours, wanted, package)]
+    assert np.array_equal(Q[0], Q[1])
+    assert (Q[0] != Q[2]).all()

@@ -46,7 +46,7 @@ def test_error_is_the_mean_square_from_two_seconds_on(task: Task, drives: list[D
         filter_ = make_estimator("bicycle-kf", **(drive.facts | found))
         error = filter_.run(drive.log)["beta"] - drive.log.truth["beta"]
         wanted = np.mean(error[drive.log.time > 1.9995] ** 2)
-        assert tune_task.squares(task, drives, found)[i] == pytest.approx(wanted, rel=1e-12)
+        assert tune_task.squares(task, drives, found)[0, i] == pytest.approx(wanted, rel=1e-12)
 
 
 def test_angles_are_compared_on_the_circle(task: Task, drives: list[Drive]) -> None:
@@ -139,7 +139,7 @@ def test_a_diverging_filter_is_infinitely_wrong_and_says_why(tmp_path: Path) -> 
 
 def test_a_study_is_of_one_question(task: Task) -> None:
     others = [
-        dataclasses.replace(task, scenario="sine"),
+        dataclasses.replace(task, scenarios=("sine",)),
         dataclasses.replace(task, options={"delay": "ignore"}),
         dataclasses.replace(task, search={"q_beta": (1e-8, 1e2)}),
         dataclasses.replace(task, seeds=(1000,)),
@@ -261,3 +261,22 @@ def test_a_damaged_study_is_one_line(task: Task, tmp_path: Path) -> None:
         database.write(b"?" * 20000)
     with pytest.raises(ValueError, match="malformed"):
         tune_study.open_study(task, url)
+
+
+def test_several_scenarios_count_alike() -> None:
+    """Rows are scenarios, each as if it were alone; the objective is their geometric mean."""
+    names = ("tie-vision-fig8", "sine")
+    task = tune_task.make_task("bicycle-kf", names, seeds=2)
+    drives = tune_task.simulate(task, task.seeds, "", 1, None)
+    both = tune_task.squares(task, drives, {})
+    alone = []
+    for name in names:
+        single = dataclasses.replace(task, scenarios=(name,))
+        own = tune_task.simulate(single, task.seeds, "", 1, None)
+        alone.append(tune_task.squares(single, own, {})[0])
+    assert np.array_equal(both, alone)
+    roots = np.sqrt(np.mean(alone, axis=1))
+    assert tune_task.objective(both) == pytest.approx(np.sqrt(roots[0] * roots[1]))
+    assert task.study != dataclasses.replace(task, scenarios=names[::-1]).study
+    with pytest.raises(ValueError, match="scenarios are one or more, each once, got sine, sine"):
+        tune_task.make_task("bicycle-kf", ("sine", "sine"))
