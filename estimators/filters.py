@@ -53,20 +53,24 @@ CAMERA = ("camera",)
 JOINT = (("front_tyres_sd", 0.23), ("rear_tyres_sd", 0.23), ("wary", 10))
 ROBUST = (
     ("fast", ("gyro", "accel_y")),
-    ("q_front_tyres", 0.006),
-    ("q_rear_tyres", 0.006),
-    ("force_share", 0.05),
-    ("moment_share", 0.008),
-    ("model_error", 0.075),
-    ("disturbance_time", 0.17),
+    ("inverse_friction_sd", 0.1),
+    ("q_front_tyres", 0.0016),
+    ("q_rear_tyres", 0.0016),
+    ("force_share", 0.028),
+    ("moment_share", 0.0067),
+    ("model_error", 0.063),
+    ("disturbance_time", 0.23),
+    ("gyro_noise", 0.0041),
     ("robust", 6.0),
     ("accel_time", 2.0),
     ("bias_sd", 0.01),
-    ("accel_bias_sd", 0.3),
-    ("accel_bias_time", 10.0),
+    ("accel_bias_sd", 0.28),
+    ("accel_bias_time", 5.7),
+    ("accel_scale_sd", 0.045),
+    ("steer_rate", 3.0),
 )
-"""For a car that nobody has measured: found on simulated drives of a multi-body model whose
-accelerometer has a noise of its own on each (docs/estimators.md)."""
+"""For a car that nobody has measured: levels of `benchmarks.tuning.robust`, found on simulated
+drives alone."""
 
 FILTERS: dict[str, Filter] = {
     "bicycle-kf": Filter(source="tie-vision VI.A, the model (1)-(2)"),

@@ -23,7 +23,9 @@ NEVER = 1e-6
 WITHOUT: Mapping[str, Mapping[str, Any]] = {
     "complete": {},
     "without accelerometer": {"accel_y_noise": 1e3, "accel_time": 0.0},
-    "with a friction state": {"inverse_friction_sd": 0.5},
+    "without friction": {"inverse_friction_sd": 0.0},
+    "without scale": {"accel_scale_sd": 0.0},
+    "without a check of steering": {"steer_rate": 0.0},
     "without stiffness": {
         **dict.fromkeys(("front_tyres_sd", "rear_tyres_sd"), NEVER),
         **dict.fromkeys(("q_front_tyres", "q_rear_tyres"), 0.0),

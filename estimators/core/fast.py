@@ -2,10 +2,12 @@
 
 from typing import Any
 
+import numpy as np
+
 from ...envs.backend.arrays import at, put
 from ...envs.backend.decorators import jit
 from ...envs.backend.eights import eight, put_eight, scratch
-from ...envs.backend.primitives import maximum, minimum
+from ...envs.backend.primitives import absolute, maximum, minimum
 from ...envs.record import FAST
 from .covariance import measure_state, predict_covariance
 from .delay import BUFFER, LARSEN, carry_gains
@@ -20,8 +22,8 @@ from .intersample import (
 )
 from .memory import CORE, COUNTERS, SLOW, Gains, Memory, Row
 from .speed import cell_of, finite, measured_speed, moved, step_row
-from .transition import BETA, KINEMATIC, LINEAR, VELOCITY_ROLL, build
-from .tyres import AGAIN, linearise
+from .transition import BETA, KINEMATIC, LINEAR, SLOWEST, VELOCITY_ROLL, build
+from .tyres import linearise
 
 
 @jit
@@ -45,6 +47,29 @@ def _measure_noise(f: Memory, now: float) -> None:
 
 
 @jit
+def _scale(f: Memory) -> None:
+    """The accelerometer's row has what it should measure now in the column of its scale's error;
+    at a standstill nothing of the scale is seen."""
+    row = f.C_fast[f.accel_row]
+    row[f.scaled] = 0.0
+    if f.speed <= SLOWEST:
+        return
+    felt = f.rest_fast[f.accel_row] + f.D_fast[f.accel_row, 0] * f.u[0]
+    for k in range(f.n):
+        felt += row[k] * f.x[k]
+    row[f.scaled] = felt
+
+
+@jit
+def _check_steering(f: Memory) -> None:
+    """A steering angle (the first input) that jumps is none until the next row confirms it."""
+    steer = f.u_new[0]
+    if absolute(steer - f.steer_before) > f.steer_jump:
+        f.u_new[0] = np.nan
+    f.steer_before = steer
+
+
+@jit
 def read(f: Memory, row: Row, now: float) -> None:
     """Take a fast row (FAST_WIDTH,): its inputs (the last finite ones), measurements and speed.
 
@@ -53,6 +78,9 @@ def read(f: Memory, row: Row, now: float) -> None:
     fine = True
     for i in range(f.inputs):
         f.u_new[i] = _sum(row, f.u_column[i], f.u_factor[i])
+    if f.steer_jump > 0.0:
+        _check_steering(f)
+    for i in range(f.inputs):
         fine = fine and finite(f.u_new[i])
     if fine:
         for i in range(f.inputs):
@@ -110,9 +138,11 @@ def advance_state(f: Memory, u: Row) -> None:
     """x <- F x + H u for the inputs u (INPUTS,), and P or e with it."""
     if f.stretch != 1.0:
         _change_speed(f)
-    if f.tyres > 0 and (f.tick % AGAIN == 0 or f.late == BUFFER):
+    if f.tyres > 0 and (f.tick % f.again == 0 or f.late == BUFFER):
         linearise(f, u[0])
         build(f, f.model_speed, f.turning)
+        if f.scaled > 0:
+            _scale(f)
     _predict(f, f.x)
     for j in range(0, f.dense, 8):
         total = eight(f.x, j)

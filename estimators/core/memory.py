@@ -54,7 +54,7 @@ class Counters(NamedTuple):
     refused: int = 0  # captured before the oldest state the filter still has
     duplicates: int = 1  # same sensor and captured tick as an earlier packet
     future: int = 2  # captured or arriving after "now"
-    invalid: int = 3  # not finite (or beyond all measure), in a packet or in a fast row
+    invalid: int = 3  # not finite or beyond all measure, in a packet or a fast row
     poor: int = 4  # quality 0, or too few satellites
     unknown: int = 5  # no sensor of ours, or a stamp that is no tick of the sensor's clock
     gated: int = 6  # an innovation that chi-square calls impossible
@@ -99,6 +99,7 @@ _MODEL = [  # dx = A x + B u on the first `dense` states; those behind them deca
     ("load", _FLOAT, (2,)),  # N, on the axles
     ("per_tyre", _FLOAT, (2, 2)),  # N, of each axle by its factor, by the grip's state
     ("rest", _FLOAT, (2,)),  # N, of each axle where all that is linear is zero
+    ("again", _INT),  # ticks between two expansions
     ("q_tyres", _FLOAT, (3,)),  # variances of a step of the factors and the grip, while it moves
     ("model_error", _FLOAT),  # share of the axles' forces by which the tyres' law errs
     ("q_known", _FLOAT, (2,)),  # variances of a step of F_d, N_d without it
@@ -135,12 +136,18 @@ _FAST = [  # inputs and fast measurements: sums of two columns of the fast row
     ("inputs", _INT),
     ("u_column", _INT, (INPUTS, 2)),
     ("u_factor", _FLOAT, (INPUTS, 2)),
+    (
+        "steer_jump",
+        _FLOAT,
+    ),  # rad, of the first input from row to row that needs another row; 0: none
+    ("steer_before", _FLOAT),  # rad, of the row before, as it came
     ("fasts", _INT),
     ("y_column", _INT, (FASTS, 2)),
     ("y_factor", _FLOAT, (FASTS, 2)),
     ("C_fast", _FLOAT, (FASTS, CORE)),
     ("D_fast", _FLOAT, (FASTS, INPUTS)),
     ("accel_row", _INT),  # the fast measurement that is a bicycle's a_y; 0: none
+    ("scaled", _INT),  # where the error of its scale stands; 0: it has none
     ("rest_fast", _FLOAT, (FASTS,)),  # what is measured where states and inputs are zero
     ("r_fast", _FLOAT, (FASTS,)),  # variances
     ("r_told", _FLOAT),  # (m/s2)^2, of a_y, as configured: the least

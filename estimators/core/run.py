@@ -82,6 +82,7 @@ def begin(f: Memory, first: int) -> None:
     if f.r_share > 0.0:
         f.r_fast[f.accel_row] = f.r_told
         _fill(f.y_past, np.nan)
+    f.steer_before = np.nan
     if f.tyres > 0:
         linearise(f, 0.0)
     if f.measured == 1:

@@ -1,7 +1,7 @@
 """Tyres that a filter estimates while it drives: an extended Kalman filter on the bicycle.
 
 The factors of both axles' stiffness, and the reciprocal of friction where tyres have a limit, are
-states behind the dense ones. Every few ticks each axle's force is expanded at the present state:
+states behind the dense ones. Every few ms each axle's force is expanded at the present state:
 its slope by slip stands in `car` and makes the bicycle's matrices, its slopes by the states are
 columns beside them, and the rest is a known push.
 """
@@ -13,7 +13,6 @@ from ...envs.backend.primitives import absolute, maximum, minimum
 from .memory import CAR, Memory
 from .transition import SLOWEST
 
-AGAIN = 4  # ticks between two expansions
 FACTORS = (0.2, 3.0)
 MOST = 4.0  # of the reciprocal of friction
 _LEAST = 0.02  # of a tyre's slope, where it slides

@@ -18,7 +18,7 @@ from ..core.transition import KINEMATIC, SLOWEST, VELOCITY_ROLL
 from .config import FilterConfig
 from .kalman import gain
 from .late_samples import check_window, place_clones
-from .models import TYRES, write_model
+from .models import NONLINEAR, write_model
 from .periodic import measured_rows
 from .schedule import NO_SENSOR, Schedule, schedules, whole_ticks
 
@@ -102,15 +102,15 @@ def alone(config: FilterConfig) -> FilterConfig:
 
 
 def told_tyres(config: FilterConfig) -> FilterConfig:
-    """The same filter with nominal tyres instead of states: that one is linear."""
-    if not any(name in TYRES for name in config.states):
+    """The same filter with nominal tyres and scale instead of states: that one is linear."""
+    if not any(name in NONLINEAR for name in config.states):
         return config
-    left = [i for i, name in enumerate(config.states) if name not in TYRES]
+    left = [i for i, name in enumerate(config.states) if name not in NONLINEAR]
     models = tuple(
-        replace(model, biases=tuple(name for name in model.biases if name not in TYRES))
+        replace(model, biases=tuple(name for name in model.biases if name not in NONLINEAR))
         for model in config.models
     )
-    prior = {name: sd for name, sd in config.prior.items() if name not in TYRES}
+    prior = {name: sd for name, sd in config.prior.items() if name not in NONLINEAR}
     Q = config.Q[np.ix_(left, left)]
     return replace(config, models=models, Q=Q, prior=prior, members=1)
 
@@ -132,6 +132,7 @@ def _write_clocks(f: Memory, config: FilterConfig, dt: float) -> None:
 def _write_trust(f: Memory, config: FilterConfig) -> None:
     """What is known of a sample's noise, and which ones are skipped."""
     f.least_satellites, f.adapt, f.robust = config.satellites, config.adapt, config.robust
+    f.steer_jump = config.steer_rate * f.step
     f.model_error, f.r_told = config.model_error, config.noise["accel_y"] ** 2
     if config.accel_time > 0.0 and f.accel_row > 0:
         f.r_share = 1.0 - math.exp(-f.step / config.accel_time)

@@ -19,6 +19,7 @@ from .models import (
     DISTURBANCES,
     INERTIAL,
     MODELS,
+    SCALE,
     STATES,
     TYRES,
     WANDER,
@@ -63,6 +64,8 @@ class FilterConfig:
     front_tyres_sd, rear_tyres_sd, inverse_friction_sd: of the same, above 0 (default of all but
         joint) states: factors on both stiffnesses, and the reciprocal of friction, tyres having no
         limit where it is known. The model is then expanded at the estimate (an EKF).
+    accel_scale_sd: of joint, above 0 (default) a state: the share by which the accelerometer
+        measures too much, as one does whose roll is not known.
     bias_sd (rad/s), accel_bias_sd (m/s2), bank_sd (rad): of the same, above 0 (default) a state
         `bias`, `accel_bias` or `bank`, a constant of this deviation that the sensor adds, or by
         which the road leans, the left side up; with q_bias, ... it walks, with bias_time, ... (s)
@@ -77,6 +80,8 @@ class FilterConfig:
     satellites: the least that a GPS fix needs (default 4).
     robust: standard deviations of an innovation from which it counts less (Huber); 0 (default of
         all but joint): none does.
+    steer_rate: rad/s; a steering angle that changes faster is skipped until the next row confirms
+        it; 0 (default of all but joint-robust): none is.
     force_share, moment_share: shares of the car's weight, and of that at half the wheelbase, that
         are added to force_sd and moment_sd, as variances (default 0).
     model_error: of joint, the share of the axles' forces by which its tyres err, added likewise.
@@ -121,6 +126,7 @@ class FilterConfig:
     members: int
     levels: Array  # (count, 2), of force_sd, moment_sd
     robust: float
+    steer_rate: float
     model_error: float
     accel_time: float
     shares: tuple[float, float]
@@ -154,6 +160,7 @@ def configure(
     if rules["poles"] and len(rules["poles"]) != len(states):
         raise read.wrong("poles", f"are one for each of {', '.join(states)}", rules["poles"])
     noise, noise_over_speed = noise_levels(models[0].forces, read)
+    steered = models[0].inputs[0] == "steer"
     config = FilterConfig(
         name=name,
         row=row,
@@ -169,6 +176,7 @@ def configure(
         **_gate(rules["delay"], read),
         **bank_of(states, models[0].forces, read),
         robust=read.not_negative("robust", "standard deviations"),
+        steer_rate=read.not_negative("steer_rate", "rad/s") if steered else 0.0,
         model_error=read.not_negative("model_error", "shares of a force"),
         accel_time=read.not_negative("accel_time", "s"),
         shares=(read.not_negative("force_share", "1"), read.not_negative("moment_share", "1")),
@@ -250,6 +258,8 @@ def _inertial(row: Filter, read: Options) -> tuple[tuple[str, ...], dict[str, fl
     known = [name for name in TYRES if not biases[name] > 0.0]
     if known not in (list(TYRES), list(TYRES[2:]), []):
         raise ValueError(f"{read.name}: {known[0]}_sd is above 0 where another tyre's state is")
+    if biases[SCALE] > 0.0 and TYRES[0] in known:
+        raise ValueError(f"{read.name}: {SCALE}_sd needs tyres among the states: {TYRES[0]}_sd")
     for name, sd in biases.items():
         if sd > 0.0 and BIASES[name] not in (*fast, ""):
             raise ValueError(f"{read.name}: {name}_sd needs {BIASES[name]} among fast, got {fast}")

@@ -52,6 +52,7 @@ STATES = {
     "N_d": State("N m", 100.0, 1e5),
     "bias": State("rad/s", 0.0, 10.0),
     "accel_bias": State("m/s2", 0.0, 50.0),
+    "accel_scale": State("-", 0.0, 1.0),
     "bank": State("rad", 0.0, 1.0),
     "front_tyres": State("-", 0.0, 5.0),
     "rear_tyres": State("-", 0.0, 5.0),
@@ -93,9 +94,12 @@ BODY = ("phi", "phi_rate")  # of a bicycle whose accelerometer or roll rate is m
 INERTIAL = ("gyro", "accel_y", "roll_rate")  # the fast sensors of a bicycle, in their order
 TYRES = ("front_tyres", "rear_tyres", "inverse_friction")
 WANDER = {"bias": "gyro", "accel_bias": "accel_y", "bank": ""}
-BIASES = WANDER | dict.fromkeys(TYRES, "")
+SCALE = "accel_scale"
+BIASES = WANDER | {SCALE: "accel_y"} | dict.fromkeys(TYRES, "")
 """States that are constants: what a fast sensor measures on top, the road's bank, which no
-accelerometer feels, and the tyres: factors of stiffness, and the reciprocal of friction."""
+accelerometer feels, the error of the accelerometer's scale, and the tyres: factors of stiffness,
+and the reciprocal of friction."""
+NONLINEAR = (*TYRES, SCALE)
 WALK = (("d1", "beta"), ("d2", "gamma"))  # dakf-stability (8)-(9), (14)
 WALK_ALL = (*WALK, ("d3", "psi"))  # dual-rate (4): one for every state of (37)
 DISTURBANCES = ("none", "walk", "walk-all", "forces")
@@ -116,6 +120,8 @@ MODELS: dict[str, Model] = {
     ),
 }
 """Models other than the bicycle's, by name."""
+
+EXPANDED = 0.004  # s between two expansions of the tyres' forces
 
 _LATE = {"psi": "psi_late", "y_l": "y_l_late"}
 
@@ -211,6 +217,7 @@ def _write_tyres(f: Memory, model: Model, vehicle: Vehicle) -> None:
     if TYRES[0] not in names:
         return
     f.tyres, f.grip = names.index(TYRES[0]), names.index(TYRES[2]) if TYRES[2] in names else 0
+    f.again = max(1, round(EXPANDED / f.step))
     f.stiffness[:] = 2.0 * vehicle.front_stiffness, 2.0 * vehicle.rear_stiffness
     wheelbase = vehicle.front_arm + vehicle.rear_arm
     arms = np.array([vehicle.rear_arm, vehicle.front_arm])
@@ -234,7 +241,8 @@ def _write_signals(f: Memory, model: Model, vehicle: Vehicle, noise: Mapping[str
         f.r_fast[i] = noise[name] ** 2
         if name in state_of:
             f.C_fast[i, names.index(state_of[name])] = 1.0
-    for bias in filter(BIASES.get, model.biases):
+    f.scaled = names.index(SCALE) if SCALE in model.biases else 0
+    for bias in filter(WANDER.get, model.biases):
         f.C_fast[model.fast.index(BIASES[bias]), names.index(bias)] = 1.0
     if model.kind == LATERAL and "accel_y" in model.fast:
         f.accel_row = model.fast.index("accel_y")
