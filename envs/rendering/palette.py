@@ -55,6 +55,8 @@ CONTROLLERS = {
     "ppo-yaw-vision": "#AB6387",
     "distill-coms-steering": "#8C6D1F",
     "distill-coms-yaw": "#2E8B9E",
+    "distill-car-steering": "#B0603A",
+    "distill-car-yaw": "#5E8F2E",
 }
 RUNGS = {
     "nominal": "#CF00B4",
