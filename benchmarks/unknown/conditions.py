@@ -52,6 +52,7 @@ class Condition:
 LATE = 0.06  # s
 FIND = {"latency": {"gyro": "find"}}
 FOUR = {"members": 4}
+SUDDEN = {"sudden": True}
 THREE = {"levels": (0.5, 1.0, 2.0)}
 LIMITED = {"inverse_friction_sd": 0.5}
 BIASED = {"bias_sd": 0.01}
@@ -78,7 +79,8 @@ def rolling(name: str, options: Mapping[str, Any], gust: Mapping[str, Any] = GUS
 
 FIALA = {"tyres": "fiala", "friction": 0.9}
 SLALOM = {"base": "slalom", "tyres": "fiala", "friction": 0.5}
-LATER = {"tyre_change_time": 5.37}  # s: half-way between two members of a bank that begin anew
+LATER = {"tyre_change_time": 5.37}  # s: between two steps of a bank, as the gust's start
+LATER_GUST = GUST | {"wind_start": 4.13}
 CAR = {"speed": 80.0 * KMH, "disturbance_force": 200.0, "disturbance_moment": 350.0}
 CAR_LEVELS = {"force_sd": 200.0, "moment_sd": 350.0}
 CAR_FILTERS: Filters = {"exact-kf": ("exact-kf", CAR_LEVELS)}
@@ -114,21 +116,25 @@ CONDITIONS = (
     Condition("half the disturbances, three levels", CAMERA, pushed(0.5), THREE),
     Condition("twice the disturbances, three levels", CAMERA, pushed(2.0), THREE),
     Condition("a gust of unknown strength", CAMERA, MIX | GUST, foreseen=False),
-    Condition("the same gust, three levels", CAMERA, MIX | GUST, THREE, foreseen=False),
     Condition("the same gust, for a gust", CAMERA, MIX | GUST, GUSTY, foreseen=False),
+    Condition("the same gust, sudden", CAMERA, MIX | GUST, SUDDEN, foreseen=False),
+    Condition("a gust at 4.13 s, sudden", CAMERA, MIX | LATER_GUST, SUDDEN, foreseen=False),
     rolling("the gust, car that rolls", {}),
     rolling("the same, accelerometer", INERTIAL),
     rolling("the same, accelerometer, for a gust", INERTIAL | GUSTY),
     rolling("no gust, accelerometer, for a gust", INERTIAL | GUSTY, {}),
     Condition("camera, four members", CAMERA, MIX, FOUR),
     Condition("camera, three levels", CAMERA, MIX, THREE),
+    Condition("camera, sudden", CAMERA, MIX, SUDDEN),
     Condition("tyres change at 5 s, four members", CAMERA, MIX | CHANGE, FOUR),
+    Condition("the same, sudden", CAMERA, MIX | CHANGE, SUDDEN),
     Condition("the same, three levels", CAMERA, MIX | CHANGE, THREE),
     Condition("the same, one filter", CAMERA, MIX | CHANGE, foreseen=False),
     Condition("from the change on, four members", CAMERA, MIX | CHANGE, FOUR, CHANGED),
     Condition("from the change on, three levels", CAMERA, MIX | CHANGE, THREE, CHANGED),
     Condition("from the change on, one filter", CAMERA, MIX | CHANGE, {}, CHANGED, foreseen=False),
     Condition("tyres change at 5.37 s, four members", CAMERA, MIX | CHANGE | LATER, FOUR),
+    Condition("tyres change at 5.37 s, sudden", CAMERA, MIX | CHANGE | LATER, SUDDEN),
     Condition("Fiala tyres, friction 0.9", CAMERA, MIX | FIALA, LIMITED, bounded=False),
     Condition("slalom, Fiala tyres, friction 0.5", CAMERA, SLALOM, LIMITED, bounded=False),
 )

@@ -9,9 +9,16 @@ later; what is measured makes one or the other likelier. Members that would be t
 the start come with next to no weight, so that they begin anew first. Where members differ in the
 level of their disturbances, a place in the bank stays at its own. Layer 0 of an estimator
 with a bank is the mixture's mean and covariance, which nothing measures; its members follow.
+
+Or its four members interact, an interacting multiple model (Blom, Bar-Shalom 1988) of a Markov
+chain: nothing happens; a gust blows, whose force and moment walk; the tyres have just changed, and
+walk; they settle. Every fifth of a second each one is merged, mean and covariance, with what
+comes from the others at the chain's odds: a gust that begins adds its variance to the forces, one
+that ends leaves them as they are without it, tyres that change are forgotten. What a gust does is
+seen only after some tenths of a second: until then merging lets the hypothesis live.
 """
 
-from math import exp
+from math import exp, log
 from typing import Any
 
 from ...envs.backend.decorators import apart, copied, jit
@@ -26,6 +33,10 @@ from .speed import finite
 from .transition import BETA
 
 LEAST = -60.0  # of a member's weight, below the likeliest
+CALM, GUSTY, CHANGED, SETTLING = range(1, 5)
+"""Layers of the members that interact."""
+GUSTS, LULLS = 0.03, 0.3  # 1/s, of gusts that begin and end
+CHANGES, SETTLES, TRUSTS = 0.1, 2.0, 0.3  # 1/s, of tyres: into CHANGED, SETTLING, CALM
 
 
 @jit
@@ -106,6 +117,86 @@ def respawn(layers: Filters) -> None:
     for i in range(2):
         loosen(f, f.tyres + i, f.spread)
     f.weight, f.fresh = f.hazard, f.alert
+
+
+@jit
+def _copy_moments(source: Memory, target: Memory) -> None:
+    """Mean and covariance of states and clones."""
+    for j in range(0, source.total, 8):
+        put_eight(target.x, eight(source.x, j), j)
+        for i in range(source.total):
+            put_eight(target.P, eight(source.P, i, j), i, j)
+
+
+@jit
+def _give(source: Memory, share: Any) -> Any:
+    """The probability (a member's `weight`, here) that leaves it."""
+    left = share * source.weight
+    source.weight -= left
+    return left
+
+
+@jit
+def _merge(source: Memory, probability: Any, target: Memory) -> Any:
+    """Mean and covariance of a member with what comes from a source; the source's share."""
+    target.weight += probability
+    share = probability / target.weight
+    both = share * (1.0 - share)
+    for j in range(0, target.total, 8):
+        off = eight(source.x, j) - eight(target.x, j)
+        for i in range(target.total):
+            own, more = eight(target.P, i, j), (source.x[i] - target.x[i]) * off * both
+            put_eight(target.P, own + (eight(source.P, i, j) - own) * share + more, i, j)
+    for i in range(target.total):
+        target.x[i] += share * (source.x[i] - target.x[i])
+    return share
+
+
+@jit
+def _calm_down(f: Memory) -> None:
+    """Force and moment are what they are without a gust, whatever they were."""
+    for i in range(2):
+        at = f.dense + i
+        f.x[at] = 0.0
+        for j in range(f.total):
+            f.P[at, j] = 0.0
+            f.P[j, at] = 0.0
+        f.P[at, at] = f.q_known[i] / f.q_share
+
+
+@apart
+def interact(layers: Filters) -> None:
+    """The members' moments and weights after a step of the chain; layer 0 is its scratch."""
+    best, aside = _likeliest(layers), layers[0]
+    calm, gusty, changed = layers[CALM], layers[GUSTY], layers[CHANGED]
+    settling, top, time = layers[SETTLING], layers[best].weight, calm.respawn * calm.step
+    for m in range(1, len(layers)):
+        layers[m].weight = exp(maximum(layers[m].weight - top, LEAST))
+    _copy_moments(gusty, aside)
+    _calm_down(aside)
+    lulled = _give(gusty, LULLS * time)
+    share = _merge(calm, _give(calm, GUSTS * time), gusty)
+    for i in range(2):
+        loosen(gusty, gusty.dense + i, share * gusty.burst[i])
+    _merge(aside, lulled, calm)
+    _copy_moments(calm, aside)
+    forgotten = _give(calm, CHANGES * time)
+    _merge(settling, _give(settling, TRUSTS * time), calm)
+    _merge(changed, _give(changed, SETTLES * time), settling)
+    share = _merge(aside, forgotten, changed)
+    for i in range(2):
+        loosen(changed, changed.tyres + i, share * changed.spread)
+    for m in range(1, len(layers)):
+        layers[m].weight = log(layers[m].weight)
+
+
+@jit
+def renew(layers: Filters) -> None:
+    """The bank's own step, now and then."""
+    if layers[0].burst[0] > 0.0:
+        interact(layers)
+    else:
+        respawn(layers)
 
 
 @jit

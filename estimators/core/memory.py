@@ -131,6 +131,7 @@ _BANK = [  # several filters beside each other, of which the first record is the
     ("spread", _FLOAT),  # variance by which a new member forgets the tyres
     ("fresh", _FLOAT),  # variance of a step of a new member's tyres, until the next one begins
     ("alert", _FLOAT),  # what `fresh` is then
+    ("burst", _FLOAT, (2,)),  # variances of a gust's force, moment; 0: members do not interact
 ]
 _FAST = [  # inputs and fast measurements: sums of two columns of the fast row
     ("inputs", _INT),

@@ -15,7 +15,7 @@ from ...envs.backend.primitives import maximum, sqrt
 from ...envs.record import FAST, PACKET
 from .delay import BUFFER, latch_due
 from .fast import advance_state, correct_fast, read
-from .layers import mix, own, pass_on, receive_beside, respawn
+from .layers import mix, own, pass_on, receive_beside, renew
 from .memory import (
     CORE,
     COUNTERS,
@@ -217,7 +217,7 @@ def advance(
                 pass_on(f, layers[1], gains, packets[at])
             at += 1
         if first > 0 and f.tick % f.respawn == 0 and f.tick > f.start:
-            respawn(layers)
+            renew(layers)
         if first > 0 and (len(X) > 0 or j == rows - 1):
             mix(layers)
         if len(X) > 0:

@@ -12,7 +12,7 @@ from ...envs.sensors.slow import SLOW_NAMES
 from ...envs.vehicle.vehicle import GRAVITY, Vehicle
 from ..core.delay import CONSTANT, STORED
 from ..core.intersample import DUAL_RATE, NONE, PSEUDO
-from ..core.layers import LEAST
+from ..core.layers import CHANGED, GUSTY, LEAST
 from ..core.memory import FILTER, ROWS, Memory
 from ..core.transition import KINEMATIC, SLOWEST, VELOCITY_ROLL
 from .config import FilterConfig
@@ -29,6 +29,8 @@ RESPAWN = 0.5  # s between two members of a bank that begin anew
 HAZARD = 0.2  # 1/s, of tyres that change
 FORGOTTEN = 0.06  # variance of their factors
 ALERT = 0.02  # 1/s, of the factors of a new member until the next one: the change may be later
+INTERACT = 0.2  # s between two steps of members that interact
+GUST = (8.0, 2.0)  # times the usual force and moment
 
 
 def assemble(
@@ -93,7 +95,19 @@ def _members(layers: Any, config: FilterConfig, dt: float) -> Any:
             f.q_known *= f.level
             f.Q[both, both] *= f.level
             f.prior[both, both] *= f.level
+    if config.sudden:
+        _interacting(bank, dt)
     return bank
+
+
+def _interacting(bank: Any, dt: float) -> None:
+    """What the members that interact differ in."""
+    bank.respawn = round(INTERACT / dt)
+    for f in bank:
+        f.burst[:] = np.square(GUST) * f.q_known / f.q_share
+    gusty, changed = bank[GUSTY], bank[CHANGED]
+    gusty.decay[gusty.dense : gusty.dense + 2] = 1.0
+    changed.q_tyres[:2] += ALERT * changed.step
 
 
 def alone(config: FilterConfig) -> FilterConfig:

@@ -91,6 +91,8 @@ class FilterConfig:
         twice a second (default: one for each of `levels`).
     levels: of joint, factors on force_sd and moment_sd, or pairs of one for each, which its members
         take in turn; the likeliest counts most (default (1,)).
+    sudden: of joint, True runs four filters side by side that interact: nothing happens, a gust
+        blows, the tyres have just changed, they settle; then neither members nor levels.
     gate: a probability; a sample whose innovation is less likely than 1 - gate is skipped.
     wary: 0 is off (default; joint and joint-robust have 10). Above, with delay "clone" or "buffer":
         a packet that repeats the last one while the car moves is skipped; the gate is 1 - 1e-9
@@ -125,6 +127,7 @@ class FilterConfig:
     wary: int
     members: int
     levels: Array  # (count, 2), of force_sd, moment_sd
+    sudden: bool
     robust: float
     steer_rate: float
     model_error: float
@@ -174,7 +177,7 @@ def configure(
         hdop_table=hdop_table(row, read),
         satellites=read.number("satellites", SATELLITES),
         **_gate(rules["delay"], read),
-        **bank_of(states, models[0].forces, read),
+        **bank_of(states, models[0].forces, rules["delay"], read),
         robust=read.not_negative("robust", "standard deviations"),
         steer_rate=read.not_negative("steer_rate", "rad/s") if steered else 0.0,
         model_error=read.not_negative("model_error", "shares of a force"),

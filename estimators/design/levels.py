@@ -25,6 +25,7 @@ MORE_NOISE = {
     "wheel_noise": 0.015,  # m/s, of the mean of both front wheels
 } | {f"{row.noise}_noise": row.sd for row in _VELOCITIES}
 MOST_MEMBERS = 8
+INTERACTING = 4  # members
 DISTURBANCE = {"force_sd": 50.0, "moment_sd": 20.0, "disturbance_time": 0.3}  # N, N m, s
 
 
@@ -52,8 +53,11 @@ def hdop_table(row: Filter, read: Options) -> tuple[tuple[float, float], ...]:
     return tuple((float(hdop), float(factor)) for hdop, factor in knots)
 
 
-def bank_of(states: Sequence[str], forces: bool, read: Options) -> dict[str, Any]:
-    """`members` and `levels` of a `FilterConfig`; forces: whether its disturbances are."""
+def bank_of(states: Sequence[str], forces: bool, delay: str, read: Options) -> dict[str, Any]:
+    """`members`, `levels` and `sudden` of a `FilterConfig`; forces: whether its disturbances are.
+
+    delay: the rule for late samples.
+    """
     value = read.value("levels", (1.0,))
     levels = read.numbers("levels", value)
     pairs = levels.reshape(-1, 1).repeat(2, 1) if levels.ndim < 2 else levels
@@ -66,7 +70,11 @@ def bank_of(states: Sequence[str], forces: bool, read: Options) -> dict[str, Any
         raise read.wrong("members", "is 1 where tyres are known", count)
     if (pairs != 1.0).any() and not (forces and 1 < count >= len(pairs)):
         raise read.wrong("levels", "need disturbances='forces' and a member each", value)
-    return {"members": int(count), "levels": pairs}
+    sudden = bool(read.value("sudden", False))
+    if sudden and not (count == 1 and TYRES[0] in states and forces and delay == "clone"):
+        expected = "needs unknown tyres, disturbances='forces', delay='clone', no members or levels"
+        raise read.wrong("sudden", expected, sudden)
+    return {"members": INTERACTING if sudden else int(count), "levels": pairs, "sudden": sudden}
 
 
 def process_noise(states: Sequence[str], tuning: Mapping[str, float], read: Options) -> Array:

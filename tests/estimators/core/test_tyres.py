@@ -186,9 +186,10 @@ def test_a_member_that_begins_anew_stays_at_its_level() -> None:
         np.testing.assert_allclose(ratio, [force**2, moment**2], rtol=1e-12)
 
 
-def test_a_bank_step_by_step_and_from_a_snapshot_is_the_same() -> None:
+@pytest.mark.parametrize("options", [{"members": 3}, {"sudden": True}])
+def test_a_bank_step_by_step_and_from_a_snapshot_is_the_same(options: dict[str, Any]) -> None:
     base, ((log, _), *_) = drives(1, **CHANGED)
-    whole, parts = built(base, log, members=3), built(base, log, members=3)
+    whole, parts = built(base, log, **options), built(base, log, **options)
     expected = whole.run(log).x
     record = parts.accept(log)
     ends = np.searchsorted(record.packets[:, PACKET.arrived], record.ticks, "right")
@@ -197,7 +198,7 @@ def test_a_bank_step_by_step_and_from_a_snapshot_is_the_same() -> None:
         rows = slice(k, k + 7)
         end = int(ends[min(k + 6, len(ends) - 1)])
         if k == 3500:
-            other = built(base, log, members=3)
+            other = built(base, log, **options)
             other.reset(log.slow, record.first)
             other.set_state(parts.get_state())
             parts = other
@@ -219,6 +220,8 @@ def test_a_bank_step_by_step_and_from_a_snapshot_is_the_same() -> None:
         ({"levels": 2.0}, "a member each"),
         ({"levels": (0.5, 1.0), "disturbances": "walk"}, "a member each"),
         ({"levels": (0.5, 1.0, 2.0), "members": 2}, "a member each"),
+        ({"sudden": True, "members": 2}, "no members or levels"),
+        ({"sudden": True, "delay": "buffer"}, "delay='clone'"),
     ],
 )
 def test_bad_options(options: dict[str, Any], message: str) -> None:
