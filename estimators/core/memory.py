@@ -16,8 +16,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ...envs.backend.decorators import jit
-from ...envs.backend.eights import prefetch
 from ...envs.record import PACKET_WIDTH
 from ...envs.sensors.slow import SLOW_NAMES
 
@@ -290,18 +288,3 @@ def _size(field: Any) -> int:
 _AHEAD = ("ahead", _FLOAT, (1,))  # where small fields begin, all that a tick reads next to another
 FILTER = np.dtype([_AHEAD, *sorted(_FIELDS, key=_size), *_WINDOW], align=True)
 HEAD = sum(_size(field) for field in _FIELDS if _size(field) <= 64)  # numbers of the small fields
-
-
-@jit
-def fetch(f: Memory, like: Memory) -> None:
-    """Have the caches fetch what a tick reads of a filter, whose states are as many as `like`'s."""
-    for i in range(0, HEAD, 8):
-        prefetch(f.ahead, i)
-    for j in range(0, like.total, 8):
-        for i in range(like.total):
-            prefetch(f.P, i, j)
-    for j in range(0, like.n, 8):
-        for i in range(like.n):
-            prefetch(f.Q, i, j)
-            prefetch(f.G, i, j)
-            prefetch(f.GT, i, j)

@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from ...envs.backend.decorators import counted
+from ...envs.backend.decorators import counted, jit
+from ...envs.backend.eights import prefetch
 from ...envs.backend.primitives import maximum
-from ..core.memory import FILTER, fetch
+from ..core.memory import FILTER, HEAD, Memory
 from ..entry import entry
 from ..wrappers.kernel import observe
 
@@ -20,6 +21,21 @@ def gains_of(pool: Any, place: Any) -> Any:
     """The gains that lie in the pool at a place: (offset, then their shape)."""
     start, cells, height, width = place[0], place[1], place[2], place[3]
     return pool[start : start + cells * height * width].reshape((cells, height, width))
+
+
+@jit
+def _fetch(f: Memory, like: Memory) -> None:
+    """Have the caches fetch what a tick reads of a filter, whose states are as many as `like`'s."""
+    for i in range(0, HEAD, 8):
+        prefetch(f.ahead, i)
+    for j in range(0, like.total, 8):
+        for i in range(like.total):
+            prefetch(f.P, i, j)
+    for j in range(0, like.n, 8):
+        for i in range(like.n):
+            prefetch(f.Q, i, j)
+            prefetch(f.G, i, j)
+            prefetch(f.GT, i, j)
 
 
 @counted
@@ -53,7 +69,7 @@ def observe_batch(
             f, gains, start = filters[i], gains_of(pool, places[i]), maximum(done[i], 0)
             own = obs[i], inner, plan, limits, beta[i], gamma[i], out[i], summary[i]
             for layer in range(len(f) if i + 1 < len(filters) else 0):
-                fetch(filters[i + 1, layer], f[layer])
+                _fetch(filters[i + 1, layer], f[layer])
             done[i] = observe(f, gains, fast[i], rows[i], packets[i], counts[i], start, *own)
             waiting += 1 if done[i] < rows[i] else 0
     return waiting
