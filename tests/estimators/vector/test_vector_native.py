@@ -51,6 +51,14 @@ def test_every_filter_says_the_same(name: Any, mode: str) -> None:
     assert drive(alone, together, 60) > 6
 
 
+def test_members_that_interact_have_the_same_bits() -> None:
+    """Over several steps of their chain."""
+    layer = {"estimator": "joint", "options": {"sudden": True}}
+    alone, together = wrapped(home("joint")[0], 3, MODES[0], layer)
+    same_bits(alone.reset(seed=[1, 2, 3]), together.reset(seed=[1, 2, 3]))
+    drive(alone, together, 60)
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("env_id", IDS)
