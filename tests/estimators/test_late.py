@@ -55,7 +55,7 @@ def drive() -> tuple[Log, dict[str, Any]]:
     log = simulate(FIG7, sensors, 3)
     packets = log.record.packets.copy()
     packets[5, PACKET.value], packets[9, PACKET.captured] = np.nan, 1e9
-    record = Record(log.record.fast[:2000], packets[packets[:, PACKET.arrived] < 2000])
+    record = Record(log.record.fast[:1990], packets[packets[:, PACKET.arrived] < 1990])
     facts = {"vehicle": FIG7.truth, "sensors": sensors, "speed": FIG7.speed}
     return later(dataclasses.replace(log, record=record), LATE), facts
 
@@ -72,14 +72,15 @@ def stepped(filter_: Any, record: Record, width: int) -> None:
 @pytest.mark.parametrize("latency", [LATE, {"gyro": "find"}])
 def test_a_run_is_its_steps_whatever_their_length_and_so_is_a_batch(latency: Any) -> None:
     log, facts = drive()
-    filter_ = make_estimator("joint", **facts, latency=latency)
+    filter_: Any = make_estimator("joint", **facts, latency=latency)
     end = filter_.run(log)
+    assert filter_.latency["gyro"] == pytest.approx(0.06, abs=0.004)
     batch = make_batch("joint", 2, **facts, latency=latency)
-    for width in (10, 37, 2000):
+    for width in (10, 37, 1990):
         stepped(filter_, log.record, width)
-        assert (filter_.x == end.x[-1]).all() and filter_.tick == 1999
+        assert (filter_.x == end.x[-1]).all() and filter_.tick == 1989
         assert filter_.invalid == filter_.unknown == 1
-    for first in range(0, 2000, 500):
+    for first in range(0, 1990, 500):
         arrived = log.record.packets[:, PACKET.arrived]
         new = log.record.packets[(arrived >= first) & (arrived < first + 500)]
         fast = log.record.fast[first : first + 500]
@@ -125,10 +126,10 @@ def test_behind_it_is_the_punctual_filter_on_the_punctual_record() -> None:
     log, facts = drive()
     punctual = log.record.fast.copy()
     punctual[:-60, FAST.gyro] = log.record.fast[60:, FAST.gyro]
-    here = log.record.packets[:, PACKET.arrived] < 1940
+    here = log.record.packets[:, PACKET.arrived] < 1930
     late, plain = (make_estimator("joint", **facts, latency=each) for each in (LATE, {}))
     late.run(log)
-    plain.run(Log(Record(punctual[:1940], log.record.packets[here]), log.slow))
+    plain.run(Log(Record(punctual[:1930], log.record.packets[here]), log.slow))
     assert isinstance(late, LateEstimator)
     assert (late.behind[0].x[:8] == plain.x).all()
 
