@@ -51,6 +51,14 @@ def test_the_noise_has_the_same_words_and_the_same_numbers_to_rounding(device: s
         assert np.abs(single[:, i] - wanted).max() < 2e-5
 
 
+@pytest.mark.plain
+def test_the_largest_word_has_a_normal_number_in_float32() -> None:
+    """Its logarithm is rounded to above zero there."""
+    (pair,) = on_tensors(torch.float32, noise._normal_pair)
+    words = torch.full((4,), 2**32 - 1), torch.arange(4) << 30
+    assert torch.isfinite(torch.stack(pair(*words))).all()
+
+
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("name", IDS)
 def test_a_step_from_the_same_state_is_the_same_on_every_id(name: str, device: str) -> None:
