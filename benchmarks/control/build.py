@@ -21,6 +21,7 @@ from ...envs.sensors.slow import SENSOR_SETS
 from ...envs.task.observation import Entry
 from ...estimators.design.models import TYRES
 from ...estimators.filters import FILTERS
+from ...estimators.learned.files import load_correction
 from ...estimators.vector.estimate import EstimateObservation
 from ..harness.drives import quietly
 from .cells import ADAPTIVE, REFERENCE_CONTROLLER, REFERENCE_FILTER, SETUPS, TRUTH, Cell
@@ -64,8 +65,12 @@ class TrueState(VectorWrapper[Any, Any, Any, Any, Any]):
 
 def outputs_for(estimator: str) -> tuple[str, ...]:
     """The estimates that controllers read: beta, gamma, and disturbances if there are any."""
-    row = FILTERS.get(name_of(estimator).removeprefix("learned-"))  # a user's own has none
+    name = name_of(estimator)
+    base = name.removeprefix("learned-")
+    row = FILTERS.get(base)  # a user's own has none
     options = SETUPS.get(estimator, ("", {}))[1] | dict(row.options if row else ())
+    if row and base != name:
+        options |= load_correction(base).card.base_options
     tyres = tuple(name for name in TYRES if f"{name}_sd" in options)
     return ("beta", "gamma", *_DISTURBANCES.get(row.disturbances if row else "", ()), *tyres)
 

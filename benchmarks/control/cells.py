@@ -23,12 +23,22 @@ SETUPS: dict[str, tuple[str, dict[str, Any]]] = {
     "multirate-kf, camera and gps": ("multirate-kf", {"slow": ["camera", "gps"]}),
     "joint": ("joint", {"slow": ["camera", "gps"]}),
     "joint, friction": ("joint", {"slow": ["camera", "gps"], "inverse_friction_sd": 0.3}),
+    "learned-joint": ("learned-joint", {"slow": ["camera", "gps"]}),
 }
 """Filters by what they are called in the tables: a name of `make_estimator` and its options, over
 the contestant's tuned ones where the filter is `exact-kf`."""
 ADAPTIVE = {"joint": "adaptive-lqr", "joint, friction": "adaptive-nmpc"}
 """By the filter whose tyres they follow."""
-ESTIMATORS = (*SETUPS, "single-rate-kf", "uneven-delay-kf", "dakf", "bicycle-kf", TRUTH)
+CORRECTED = ("learned-joint", "adaptive-nmpc")
+"""The same controller on that filter with a network behind it."""
+ESTIMATORS = (
+    *(name for name in SETUPS if name != CORRECTED[0]),
+    "single-rate-kf",
+    "uneven-delay-kf",
+    "dakf",
+    "bicycle-kf",
+    TRUTH,
+)
 CONTROLLERS: dict[str, tuple[str, ...]] = {
     YAW: ("two-dof", "esc", "sliding-mode", "mpc", "nmpc"),
     STEERING: ("two-dof", "esc", "model-following", "nmpc"),
@@ -146,7 +156,7 @@ def cells(contests: Sequence[Contest], quick: bool = False) -> Iterator[Cell]:
         filters = ESTIMATORS if first else (REFERENCE_FILTER, TRUTH)
         made += [Cell(contest, name, REFERENCE_CONTROLLER) for name in filters]
         made += [Cell(contest, REFERENCE_FILTER, who) for who in CONTROLLERS[contest.env_id]]
-        made += [Cell(contest, name, who) for name, who in ADAPTIVE.items()]
+        made += [Cell(contest, *pair) for pair in (*ADAPTIVE.items(), CORRECTED)]
         if contest.tier:
             made += [Cell(contest, *pair) for pair in LEARNED.get(contest.kind, ())]
         yield from (cell for cell in made if not (quick and cell.slow and not cell.rung))
