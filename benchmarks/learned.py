@@ -18,7 +18,7 @@ from ..envs.record import Array
 from ..envs.scenarios.manoeuvres import scenario_from
 from ..envs.vehicle.vehicles import VEHICLES
 from .control.cells import ADAPTIVE, CONTROLLERS, LEARNED, REFERENCE_FILTER, Cell
-from .control.contests import NOMINAL, PARAMETERS, STATE, Contest, contests
+from .control.contests import NOMINAL, PARAMETERS, Contest, contests
 from .control.episodes import Driven
 from .control.run import Results, measure
 from .control.scores import FLOOR, Yardstick, score
@@ -69,12 +69,11 @@ def scenario_in(contest: Contest, condition: str) -> dict[str, Any]:
 
 
 def contestants(contest: Contest) -> list[tuple[str, str]]:
-    """(estimator, controller) of everybody who drives a contest: rungs, classics, the policies."""
+    """(estimator, controller) of everybody who drives a contest: rungs, classics, policies."""
     classics = [who for who in ("two-dof", "model-following") if who in CONTROLLERS[contest.env_id]]
     return [
         ("", NOMINAL),
         ("", PARAMETERS),
-        ("", STATE),
         *((REFERENCE_FILTER, who) for who in classics),
         *ADAPTIVE.items(),
         *LEARNED[contest.kind],
