@@ -109,11 +109,14 @@ def respawn(layers: Filters) -> None:
         if layers[m].weight <= layers[worst].weight and m != best:
             worst = m
     f = layers[worst]
-    force, moment = f.level[0], f.level[1]
+    force, moment, odds, i = f.level[0], f.level[1], f.odds, f.dense
+    first = f.prior[i, i], f.prior[i + 1, i + 1]
     layers[worst] = layers[best]
+    f.odds = odds  # with which the place, not the member, begins
     if f.forces == 1:
         _set_level(f, 0, force)
         _set_level(f, 1, moment)
+        f.prior[i, i], f.prior[i + 1, i + 1] = first
     for i in range(2):
         loosen(f, f.tyres + i, f.spread)
     f.weight, f.fresh = f.hazard, f.alert

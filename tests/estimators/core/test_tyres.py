@@ -186,6 +186,14 @@ def test_a_member_that_begins_anew_stays_at_its_level() -> None:
         np.testing.assert_allclose(ratio, [force**2, moment**2], rtol=1e-12)
 
 
+@pytest.mark.parametrize("options", [{"members": 4}, {"members": 4, "levels": (0.5, 2.0)}])
+def test_a_bank_that_begins_again_is_the_one_that_was_made(options: dict[str, Any]) -> None:
+    base, made = drives(1, **CHANGED)
+    filter_ = built(base, made[0][0], **options)
+    first, again = (filter_.run(made[0][0]) for _ in range(2))
+    assert np.array_equal(first.x, again.x) and np.array_equal(first.std, again.std)
+
+
 @pytest.mark.parametrize("options", [{"members": 3}, {"sudden": True}])
 def test_a_bank_step_by_step_and_from_a_snapshot_is_the_same(options: dict[str, Any]) -> None:
     base, ((log, _), *_) = drives(1, **CHANGED)
