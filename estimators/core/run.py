@@ -83,6 +83,8 @@ def begin(f: Memory, first: int) -> None:
         f.r_fast[f.accel_row] = f.r_told
         _fill(f.y_past, np.nan)
     f.steer_before = np.nan
+    if f.scaled > 0:
+        f.C_fast[f.accel_row, f.scaled] = 0.0
     if f.tyres > 0:
         linearise(f, 0.0)
     if f.measured == 1:

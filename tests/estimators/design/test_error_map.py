@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sideslip.benchmarks.papers.ledger.filters import tuned_for_paper
 from sideslip.envs.record import FAST, FAST_WIDTH, PACKET_WIDTH
 from sideslip.envs.sensors.link import SlowSensor
 from sideslip.envs.vehicle.vehicle import COMS
@@ -115,8 +116,12 @@ def test_a_gyro_bias_drives_dakf_off() -> None:
     bias = np.radians(0.05)
     log = simulate(still, {"gps": GPS}, 0, gyro_bias=bias, disturbed=False, quiet=True)
     common: dict[str, Any] = {"vehicle": FIG6.told, "sensors": log.slow, "speed": still.speed}
-    dakf = make_estimator("dakf", q_psi=1e-8, **common).run(log)["beta"]  # psi is gamma's integral
-    three = make_estimator("course-kf", **common).run(log)["beta"]
+    tuned = {name: dict(tuned_for_paper(name)) for name in ("dakf", "course-kf")}
+    tuned["dakf"]["q_psi"] = 1e-8  # psi is gamma's integral
+    dakf, three = (
+        make_estimator(name, **common, **options).run(log)["beta"]
+        for name, options in tuned.items()
+    )
     assert dakf[-1] == pytest.approx(-120.0 * bias, rel=0.02)  # the whole integral of the bias
     assert abs(three[-1]) < 0.02
     assert abs(three[-1] - three[90_000]) < 1e-3 < abs(dakf[-1] - dakf[90_000])

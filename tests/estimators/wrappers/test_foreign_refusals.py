@@ -92,7 +92,7 @@ def test_other_bad_arguments() -> None:
     with pytest.raises(ValueError, match="tick of 0"):
         make_estimator(Constant, dt=0.0)
     register_estimator("constant", Constant)
-    with pytest.raises(TypeError, match="needs a filter of the catalogue, got <constant: mu"):
+    with pytest.raises(TypeError, match="catalogue without latency, got <constant: mu"):
         smooth("constant", rollout(gym.make(VISION), options={"duration": 0.05}).log, gain=2)
 
 
