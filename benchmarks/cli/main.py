@@ -13,6 +13,7 @@ from rich.table import Table
 from ... import __version__
 from ...envs.arguments import check_choice
 from ..harness.engines import PROCESSES, engine
+from ..report.page import check_page, write_page
 from ..suites import SUITES, Request, run_suites
 from .calibrate import calibrate_command
 from .challenge import Agents, EnvId, Estimators, Fresh, Limit, Scenarios, challenge_of
@@ -188,6 +189,9 @@ def bench(
     json: Json = None,
     parquet: Parquet = None,
     picture: Annotated[Path | None, typer.Option(help="The summary: PNG, PDF or SVG.")] = None,
+    page: Annotated[
+        Path | None, typer.Option(help="Put the tables between this Markdown page's marks.")
+    ] = None,
     jobs: Jobs = None,
     episodes: Annotated[
         int | None, typer.Option(min=4, help="A cell of control (1000), or seeds of other suites.")
@@ -226,7 +230,8 @@ def bench(
     names = suites or (["control"] if challenge else list(SUITES))
     for name in names:
         check_choice("suite", name, SUITES)
-    check_files(html=html, json=json, parquet=parquet, picture=picture)
+    check_files(html=html, json=json, parquet=parquet, picture=picture, page=page)
+    check_page(page, names)
     done = []
     if log is not None:  # first: a log that cannot be read should not cost minutes
         from ..recorded.replay_file import replay_file
@@ -243,3 +248,6 @@ def bench(
 
         write_picture(picture, done)
         wrote(console, picture)
+    if page is not None:
+        write_page(page, done)
+        wrote(console, page)

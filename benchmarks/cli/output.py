@@ -38,6 +38,7 @@ _ENDINGS = {
     "image": (".png", ".jpg", ".jpeg"),
     "json": (".json",),
     "kml": (".kml",),
+    "page": (".md",),
     "parquet": (".parquet",),
     "picture": (".png", ".pdf", ".svg"),
     "plot": (".png", ".pdf", ".svg"),

@@ -1,0 +1,50 @@
+"""Tables of suites in a Markdown page, between the marks that ask for them.
+
+A page has `<!-- tables of SUITE -->` and `<!-- end -->`, each on a line of its own; what stands
+between them is the suite's, the rest its author's.
+"""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from ..harness.results import Suite, Table, write_text
+
+_MARKED = r"(?<=^<!-- tables of {} -->\n).*?(?=^<!-- end -->$)"
+
+
+def table_markdown(table: Table) -> str:
+    """A heading, the table, and its note."""
+    head, *rows = (
+        [text.replace("|", r"\|") for text in row] for row in (table.header, *table.cells)
+    )
+    lines = [f"| {' | '.join(row)} |" for row in (head, *rows)]
+    lines.insert(1, "|---" * len(head) + "|")
+    note = f"\n{table.note}\n" if table.note else ""
+    return "\n".join([f"## {table.title}", "", *lines, ""]) + note
+
+
+def check_page(path: Path | None, names: Sequence[str]) -> None:
+    """Before the work: the page has marks for a suite that is asked for; ValueError otherwise."""
+    if path is not None:
+        text = path.read_text(encoding="utf-8")
+        if not any(_pattern(name).search(text) for name in names):
+            raise ValueError(
+                f"{path}: expected the lines <!-- tables of SUITE --> and <!-- end --> for one of "
+                f"{', '.join(names)}"
+            )
+
+
+def write_page(path: Path, suites: Sequence[Suite]) -> None:
+    """The page with each marked suite's tables anew; details, which only the report shows, are
+    left out."""
+    text = path.read_text(encoding="utf-8")
+    for suite in suites:
+        made = "\n".join(table_markdown(each) for each in suite.tables if not each.detail)
+        before, *marked = _pattern(suite.name).split(text, maxsplit=1)
+        text = f"\n{made}\n".join((before, *marked))
+    write_text(path, text)
+
+
+def _pattern(name: str) -> re.Pattern[str]:
+    return re.compile(_MARKED.format(re.escape(name)), re.MULTILINE | re.DOTALL)
