@@ -21,16 +21,17 @@ from .control.cells import ADAPTIVE, CONTROLLERS, LEARNED, REFERENCE_FILTER, Cel
 from .control.contests import NOMINAL, PARAMETERS, Contest, contests
 from .control.episodes import Driven
 from .control.run import Results, measure
-from .control.scores import FLOOR, Yardstick, score
+from .control.scores import FAILED, FLOOR, Yardstick, score
 from .control.seeds import salt_of, seeds_of_contests
 from .harness.results import Row, Suite, Table
-from .harness.stats import Estimate, share, won, worst
+from .harness.stats import Estimate, geometric_mean, profile, share, won, worst
 from .harness.verdict import verdict
 
 NAME, TRAINED = "learned", "as trained"
 EPISODES, QUICK_EPISODES = 32, 4
 RIVALS = tuple(ADAPTIVE.values())
 """Against whom episodes are counted."""
+_LEVELS = np.geomspace(0.1, 10.0, 41)
 _TEXT = (
     "The shipped policies beside controllers on the same late sensors, on salted seeds and in "
     "conditions that no training had; of each tier of a policy's class one contest. Share: of the "
@@ -102,6 +103,12 @@ class Found:
         ]
         return score(found)
 
+    def ratios(self, name: str) -> Array:
+        """Cost over nominal's, of each episode in all conditions and contests; infinite where it
+        ended by a failure."""
+        ratios = (self.costs(name) + FLOOR) / (self.costs(NOMINAL) + FLOOR)
+        return np.where(self.failed(name), np.inf, ratios)
+
     def costs(self, name: str) -> Array:
         """A contestant's in all conditions and contests, one behind the other."""
         return np.concatenate([each[name].costs for each in self._all()])
@@ -141,6 +148,7 @@ def run(
     for each in found:
         _tabled(suite, each)
     suite.verdict = answer(found)
+    _illustrated(suite, found)
     return suite
 
 
@@ -205,3 +213,29 @@ def _tabled(suite: Suite, found: Found) -> None:
             f"Of {episodes} episodes. worst 5 %: mean of the largest ratios to nominal's cost.",
         ),
     ]
+
+
+def _illustrated(suite: Suite, found: Sequence[Found]) -> None:
+    """What each costs, and how often it costs how much; nothing without plotly."""
+    try:
+        from .report.figures import curves, groups_with_interval
+    except ModuleNotFoundError:
+        return
+    names = {each.kind: [w for _, w in contestants(chosen(each.kind)[0])] for each in found}
+    costs: dict[str, dict[str, Estimate]] = {}
+    for each in found:
+        logs = {who: np.log(np.minimum(each.ratios(who), FAILED)) for who in names[each.kind]}
+        costs[each.kind] = {
+            who: Estimate(*(100.0 * end for end in geometric_mean(log)))
+            for who, log in logs.items()
+        }
+    label = "cost / nominal's, %: less is better"
+    figure = groups_with_interval(costs, label, {100.0: NOMINAL})
+    text = f"Geometric means over all conditions; a failure costs {FAILED:.0f} times nominal's."
+    suite.answers.append(("Who holds the car where training never was?", figure, text))
+    for each in found:
+        lines = {who: profile(each.ratios(who), _LEVELS) for who in names[each.kind]}
+        label = "share of episodes that cost no more"
+        figure = curves(_LEVELS, lines, "cost / nominal's on the same seed", label, "x")
+        text = "A performance profile: the higher the better; a failure is never reached."
+        suite.figures.append((f"{each.kind}: how often at what cost", figure, text))

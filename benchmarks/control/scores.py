@@ -18,7 +18,7 @@ from .episodes import Array, Driven
 NOTHING = 0.05
 """A mean gap below which there is nothing to win."""
 FLOOR, _CLIP = 0.001, 3.0
-_FAILED = math.log(1.0 / 20.0)
+FAILED = 20.0  # times nominal's cost, of an episode that ends by a failure
 
 
 def survived(driven: Driven) -> npt.NDArray[np.bool_]:
@@ -31,7 +31,7 @@ def gains(nominal: Array, driven: Driven) -> Array:
     n = len(nominal)
     with np.errstate(invalid="ignore"):
         r = np.log((nominal + FLOOR) / (driven.costs[:n] + FLOOR))
-    return np.where(survived(driven)[:n], np.clip(r, -_CLIP, _CLIP), _FAILED)
+    return np.where(survived(driven)[:n], np.clip(r, -_CLIP, _CLIP), -math.log(FAILED))
 
 
 @dataclass(frozen=True)

@@ -130,6 +130,13 @@ def won(costs: Array, others: Array) -> Estimate:
     return share(np.where(costs == others, 0.5, np.less(costs, others)))
 
 
+def profile(values: Array, levels: Array) -> tuple[Array, Array, Array]:
+    """The share of (n,) numbers that are at most each level (k,), with Wilson's interval: a
+    performance profile (Dolan and Moré 2002). (k,) each: value, low, high; NaN counts as above."""
+    value, low, high = np.array([share(values <= level) for level in levels]).T
+    return value, low, high
+
+
 def worst(costs: Array) -> Estimate:
     """The mean of the largest `WORST` of positive numbers (n,): the conditional value at risk.
 

@@ -58,3 +58,6 @@ def test_the_share_is_of_the_gap_between_nominal_and_the_car_that_is_known() -> 
         assert found.shared(name, TRAINED).value == pytest.approx(share, abs=2e-3)
     assert found.shared("fails", TRAINED).high < 0.9
     assert found.failed("fails").mean() == pytest.approx(0.1, abs=0.05)
+    ratios = found.ratios("fails")
+    assert np.isinf(ratios).mean() == found.failed("fails").mean()
+    assert ratios[np.isfinite(ratios)] == pytest.approx(0.25, abs=1e-3)

@@ -2,9 +2,17 @@
 
 import numpy as np
 import pytest
+from scipy.stats import mannwhitneyu
 
 from sideslip.benchmarks.harness.parallel import run_cases
-from sideslip.benchmarks.harness.stats import interval, mean, ratio_of_roots, root_mean
+from sideslip.benchmarks.harness.stats import (
+    interval,
+    mean,
+    profile,
+    ratio_of_roots,
+    root_mean,
+    won,
+)
 
 
 def test_interval_covers_the_mean_nineteen_times_in_twenty() -> None:
@@ -59,3 +67,23 @@ def _square(value: int) -> int:
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_cases_come_back_in_order(jobs: int) -> None:
     assert run_cases(_square, range(7), "squares", jobs) == [0, 1, 4, 9, 16, 25, 36]
+
+
+def test_definitions_are_those_of_rliable() -> None:
+    """Agarwal et al., NeurIPS 2021: the probability of improvement is the mean over tasks of
+    Mann and Whitney's U over the number of pairs, the score distribution the share of runs above
+    a level. Our task is a seed, with one run each."""
+    rng = np.random.default_rng(7)
+    costs, others = (rng.integers(0, 6, 80).astype(float) for _ in range(2))
+    U = [mannwhitneyu([-a], [-b]).statistic for a, b in zip(costs, others, strict=True)]
+    assert won(costs, others).value == pytest.approx(np.mean(U), abs=1e-12)
+    levels = np.array([-1.0, 0.0, 2.5, 5.0])
+    above = [np.mean(-costs >= -level) for level in levels]
+    assert profile(costs, levels)[0] == pytest.approx(above, abs=1e-12)
+
+
+def test_a_profile_rises_to_all_that_do_not_fail() -> None:
+    values = np.array([0.5, 1.0, 2.0, np.inf, np.nan])
+    value, low, high = profile(values, np.array([0.1, 0.5, 1.0, 100.0]))
+    assert value == pytest.approx([0.0, 0.2, 0.4, 0.6])
+    assert np.all(low <= value) and np.all(value <= high)
