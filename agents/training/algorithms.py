@@ -1,88 +1,54 @@
 """The algorithms of `sideslip train`: stable-baselines3's, with settings that learn here.
 
-The settings were chosen on YawVision-v0 (seed 0, 600,000 steps, about 20 CPU-s; mean cost over
-none's on 256 drives). With a step size of 1e-3: rewards as they come and a horizon of 0.5 s 0.22,
-times ten 0.18, with 0.2 s 0.16, rewards per second (times a hundred) 0.13. A step size of 2e-3
-0.125; then 0.12 after three times the steps. Worse were a horizon of 0.1 s, 16 steps a rollout, a
-first deviation of 0.14; running normalisation was no better and costs 0.2 ms a step of 256.
+The settings are those of `hyperparams/`, in rl-baselines3-zoo's format.
 """
 
+import inspect
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
 from typing import Any
 
-from stable_baselines3 import PPO  # isort: skip
+from ...envs.backend.extras import extra
+from .normalise import Scaling, Standardised  # first: it says which extra is missing
+
 from stable_baselines3.common.base_class import BaseAlgorithm  # isort: skip
 from stable_baselines3.common.utils import LinearSchedule  # isort: skip
 from stable_baselines3.common.vec_env import VecEnv  # isort: skip
-from torch import nn  # isort: skip
 
-from .normalise import Standardised  # first: it says which extra is missing
+Settings = dict[str, Any]
 
-HORIZON = 0.2
-"""s, in which a reward's weight falls to 1/e: the car answers a yaw moment within a tenth."""
+HYPERPARAMS = Path(__file__).parent / "hyperparams"
+PERIOD = 0.01  # s, of control: of the environments whose discount stands in the files
+EVENLY = -0.55  # log of the deviation of actions drawn evenly
+
+_OF_TRAINING = ("n_timesteps", "n_envs", "policy", "normalize")
+_SCHEDULED = ("learning_rate", "clip_range")
+_OURS = {"env", "seed", "device", "verbose", "tensorboard_log", "stats_window_size"}
 
 
 @dataclass(frozen=True)
 class Algorithm:
-    """A class of stable-baselines3, the step size it begins with, and its other settings.
+    """Where the class is, "module:name", and how rl-baselines3-zoo calls it."""
 
-    batch: at most so many samples of a rollout at once. hidden: sizes of the layers. log_std: of
-    the first actions' deviation.
-    """
+    kind: str
+    zoo: str
 
-    kind: Callable[..., BaseAlgorithm]
-    learning_rate: float
-    batch: int
-    settings: dict[str, Any] = field(default_factory=dict)
-    hidden: tuple[int, ...] = (64, 64)
-    log_std: float = -1.0
-
-    def options(self, seconds: float, num_envs: int) -> dict[str, Any]:
-        """Further arguments of the class, from a control period and a number of environments."""
-        rollout = num_envs * self.settings["n_steps"]
-        return {
-            **self.settings,
-            "gamma": math.exp(-seconds / HORIZON),
-            "batch_size": max(n for n in range(1, self.batch + 1) if rollout % n == 0),
-        }
-
-    def described(self, seconds: float, num_envs: int) -> dict[str, Any]:
-        """All settings, in JSON types, for a card."""
-        return {
-            **self.options(seconds, num_envs),
-            "num_envs": num_envs,
-            "learning_rate": f"{self.learning_rate} to 0",
-            "hidden": list(self.hidden),
-            "log_std_init": self.log_std,
-        }
-
-    def make(
-        self, env: VecEnv, seconds: float, scaling: tuple[list[float], list[float]], seed: int
-    ) -> BaseAlgorithm:
-        """An untrained model. seconds: of a control period. scaling: mean and scale of entries."""
-        mean, scale = scaling
-        return self.kind(
-            "MlpPolicy",
-            env,
-            learning_rate=LinearSchedule(self.learning_rate, 0.0, 1.0),
-            policy_kwargs={
-                "net_arch": list(self.hidden),
-                "activation_fn": nn.Tanh,
-                "log_std_init": self.log_std,
-                "features_extractor_class": Standardised,
-                "features_extractor_kwargs": {"mean": mean, "scale": scale},
-            },
-            stats_window_size=env.num_envs,
-            seed=seed,
-            device="cpu",
-            **self.options(seconds, env.num_envs),
-        )
+    def load(self) -> Callable[..., BaseAlgorithm]:
+        """The class; ModuleNotFoundError without its package."""
+        module, name = self.kind.split(":")
+        with extra("train", "training needs {}"):
+            found: Callable[..., BaseAlgorithm] = getattr(import_module(module), name)
+        return found
 
 
-ALGORITHMS: dict[str, Algorithm] = {
-    "ppo": Algorithm(PPO, 2e-3, 1024, {"n_steps": 32, "n_epochs": 4}),
+ALGORITHMS = {
+    "ppo": Algorithm("stable_baselines3:PPO", "ppo"),
+    "sac": Algorithm("stable_baselines3:SAC", "sac"),
+    "tqc": Algorithm("sb3_contrib:TQC", "tqc"),
+    "recurrent-ppo": Algorithm("sb3_contrib:RecurrentPPO", "ppo_lstm"),
 }
 
 
@@ -91,3 +57,102 @@ def algorithm_of(name: str) -> Algorithm:
     if name not in ALGORITHMS:
         raise ValueError(f"unknown algorithm {name!r}; known: {', '.join(ALGORITHMS)}")
     return ALGORITHMS[name]
+
+
+def settings_of(algo: str, env_id: str, file: str | Path | None = None) -> Settings:
+    """An environment's settings, or those of "default", from a file of rl-baselines3-zoo's format.
+
+    file: default: the package's own. Raises what `check_settings` raises, FileNotFoundError, and
+    ValueError for a file that is no such YAML or has neither entry.
+    """
+    with extra("train", "settings need {}"):
+        import yaml
+    path = HYPERPARAMS / f"{algorithm_of(algo).zoo}.yml" if file is None else Path(file)
+    try:
+        entries = yaml.safe_load(path.read_text())
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        text = " ".join(str(error).split())
+        raise ValueError(f"{path} is no YAML of settings: {text}") from None
+    if not isinstance(entries, dict):
+        raise ValueError(f"{path} is no YAML of settings: {{id: {{name: value}}}} is expected")
+    key = env_id if env_id in entries else "default"
+    if key not in entries:
+        raise ValueError(f"{path} has no settings of {env_id}, and no 'default'")
+    found = entries[key]
+    try:
+        check_settings(algo, found)
+    except ValueError as error:
+        raise ValueError(f"{path}, {key}: {error}") from None
+    return dict(found)
+
+
+def check_settings(algo: str, settings: Any) -> None:
+    """ValueError for settings that the algorithm has not, or that say code instead of a value."""
+    if not isinstance(settings, Mapping):
+        raise ValueError(f"settings are {{name: value}}, got {settings!r}")
+    arguments = set(inspect.signature(algorithm_of(algo).load()).parameters)
+    known = sorted((arguments - _OURS) | set(_OF_TRAINING))
+    for name, value in settings.items():
+        if name not in known:
+            raise ValueError(f"unknown option {name!r} of {algo}; known: {', '.join(known)}")
+        if name.endswith("_kwargs") and not isinstance(value, Mapping):
+            raise ValueError(f"{name} is {{name: value}}, which is no code to run, got {value!r}")
+        if name in _SCHEDULED:
+            _schedule(name, value)
+    missing = [each for each in ("n_envs", "n_timesteps", "policy") if each not in settings]
+    if missing:
+        raise ValueError(f"no {', '.join(missing)}")
+
+
+def spread_of(settings: Settings) -> float:
+    """Standard deviation of the actions that a training begins with."""
+    return math.exp(settings.get("policy_kwargs", {}).get("log_std_init", EVENLY))
+
+
+def options_of(settings: Settings, seconds: float, num_envs: int) -> Settings:
+    """Arguments of the class, in JSON types, for a control period and a number of environments:
+    gamma forgets as much in a second as in the file, a batch divides a rollout."""
+    found = {name: value for name, value in settings.items() if name not in _OF_TRAINING}
+    if "gamma" in found:
+        found["gamma"] = found["gamma"] ** (seconds / PERIOD)
+    if "n_steps" in found and "batch_size" in found:
+        rollout = num_envs * found["n_steps"]
+        most = min(found["batch_size"], rollout)
+        found["batch_size"] = max(n for n in range(1, most + 1) if rollout % n == 0)
+    return found
+
+
+def make_model(
+    algo: str,
+    settings: Settings,
+    env: VecEnv,
+    seconds: float,
+    scaling: Scaling,
+    seed: int,
+    **rest: Any,
+) -> BaseAlgorithm:
+    """An untrained model. settings: of `settings_of`. seconds: of a control period. scaling: of
+    `Standardised`. rest: further arguments of the class, as its device."""
+    options = options_of(settings, seconds, env.num_envs)
+    options |= {name: _schedule(name, options[name]) for name in _SCHEDULED if name in options}
+    mean, scale, clip = scaling
+    options["policy_kwargs"] = {
+        **options.get("policy_kwargs", {}),
+        "features_extractor_class": Standardised,
+        "features_extractor_kwargs": {"mean": mean, "scale": scale, "clip": clip},
+    }
+    kind = algorithm_of(algo).load()
+    window = env.num_envs
+    return kind(settings["policy"], env, stats_window_size=window, seed=seed, **options, **rest)
+
+
+def _schedule(name: str, value: Any) -> Any:
+    """A number as it is, "lin_NUMBER" as a schedule that falls to zero."""
+    word, _, number = str(value).rpartition("_")
+    try:
+        start = float(number)
+    except ValueError:
+        start = math.nan
+    if word not in ("", "lin") or not 0.0 < start < math.inf:
+        raise ValueError(f"{name} is a positive number or lin_NUMBER, got {value!r}")
+    return LinearSchedule(start, 0.0, 1.0) if word else start

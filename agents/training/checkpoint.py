@@ -7,13 +7,18 @@ import json
 from pathlib import Path
 from typing import Any
 
-import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
 
+from ...envs.backend.extras import extra
 from ...envs.backend.files import write_whole
 
+with extra("train", "training needs {}"):
+    import torch
+    from safetensors.torch import save
+
 FORMAT = 1
+VARIABLES = "variables"
+"""The part of the tensors that belong to no module, as the logarithm of an entropy's weight."""
 STATE = {"groups", "sideslip", "task", "steps", "none", "scaling", "evaluations"}
 """What a training goes on from, besides the tensors."""
 
@@ -30,6 +35,7 @@ def save_checkpoint(path: Path, model: Any, rest: dict[str, Any]) -> None:
                 tensors |= {f"{part}/{i}/{key}": value for key, value in values.items()}
         else:
             tensors |= {f"{part}/{name}": value for name, value in state.items()}
+    tensors |= {f"{VARIABLES}/{name}": value for name, value in _variables(model).items()}
     plain = {name: value.detach().cpu().clone() for name, value in tensors.items()}
     content = json.dumps({"format": FORMAT, "groups": groups, **rest}, allow_nan=False)
     write_whole(path, save(plain, {"checkpoint": content}))
@@ -54,18 +60,26 @@ def read_state(path: Path) -> dict[str, Any]:
     return state
 
 
+def _variables(model: Any) -> dict[str, torch.Tensor]:
+    """What `get_parameters` leaves out, though a model's zip has it."""
+    return {name: getattr(model, name) for name in model._get_torch_save_params()[1]}
+
+
 def load_parameters(path: Path, model: Any) -> None:
     """Give a model the parameters and the state of the optimisers of a checkpoint."""
     groups = read_state(path)["groups"]
     parts: dict[str, dict[str, Any]] = {part: {} for part in model.get_parameters()}
+    variables = _variables(model)
     for part, group in groups.items():
         parts[part] = {"param_groups": group, "state": {}}
     with safe_open(path, "pt") as file:
         for name in file.keys():  # noqa: SIM118  it is no mapping
             part, key = name.split("/", 1)
-            if part in groups:
+            if part == VARIABLES:
+                variables[key].data.copy_(file.get_tensor(name))
+            elif part in groups:
                 i, key = key.split("/", 1)
                 parts[part]["state"].setdefault(int(i), {})[key] = file.get_tensor(name)
             else:
                 parts[part][key] = file.get_tensor(name)
-    model.set_parameters(parts, device="cpu")
+    model.set_parameters(parts, device=model.device)

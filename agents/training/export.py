@@ -42,7 +42,7 @@ def network_from_sb3(model: Any, normaliser: Any = None, history: int = 1) -> Ne
         raise ValueError(f"one activation in all layers, got {', '.join(activations)}")
     cells = _cells(actor.recurrent)
     wide = (cells[0].weight_in if cells else weights[0]).shape[1]
-    mean, scale, clip = _normalisation(normaliser, wide, history)
+    mean, scale, clip = normalisation(normaliser, wide, history)
     if isinstance(actor.extractor, Standardised):
         if clip is not None:
             raise ValueError("the observation is normalised twice: outside and by the network")
@@ -164,8 +164,11 @@ def _plain(activation: Any) -> bool:
     )
 
 
-def _normalisation(normaliser: Any, wide: int, history: int) -> tuple[Any, Any, float | None]:
-    """(mean, scale, clip) of a VecNormalize, around the stack of frames or inside of it."""
+def normalisation(normaliser: Any, wide: int, history: int) -> tuple[Any, Any, float | None]:
+    """(mean, scale, clip) of a VecNormalize or None, around the stack of frames or inside of it.
+
+    wide: entries that the network reads, of all frames together. history: frames.
+    """
     if normaliser is None or not normaliser.norm_obs:
         return np.zeros(wide), np.ones(wide), None
     stats = normaliser.obs_rms

@@ -4,6 +4,7 @@ The scales are measured once, before the training, and stay: they are part of th
 reads plain observations.
 """
 
+import math
 from typing import Any
 
 import gymnasium as gym
@@ -11,13 +12,17 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.vector import VectorEnv
 
-import torch  # isort: skip
-from stable_baselines3.common.torch_layers import FlattenExtractor  # isort: skip
-from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper  # isort: skip
+from ...envs.backend.extras import extra
+from ..vec_env.env import Observations
 
-from ..vec_env.env import Observations  # first: it says which extra is missing
+with extra("train", "training needs {}"):
+    import torch
+    from stable_baselines3.common.torch_layers import FlattenExtractor
+    from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
 Array = npt.NDArray[np.float64]
+Scaling = tuple[list[float], list[float], float | None]
+"""Mean, scale and clip of `Standardised`, in JSON types."""
 
 CLIP = 10.0  # standard deviations
 _WARM_UP = 20  # steps until every sensor has spoken
@@ -26,33 +31,40 @@ _CONSTANT = 1e-9  # what varies less is not read
 
 
 class Standardised(FlattenExtractor):
-    """A network's first layer, which is not trained: clip((x - mean) scale, +-CLIP).
+    """A network's first layer, which is not trained: clip((x - mean) scale, +-clip).
 
-    mean, scale: one number an entry of the observation; an entry of scale 0 is not read.
+    mean, scale: one number an entry of the observation; an entry of scale 0 is not read. clip: None
+    for none.
     """
 
     def __init__(
-        self, observation_space: gym.Space[Any], mean: list[float], scale: list[float]
+        self,
+        observation_space: gym.Space[Any],
+        mean: list[float],
+        scale: list[float],
+        clip: float | None = CLIP,
     ) -> None:
         super().__init__(observation_space)
         self.mean: torch.Tensor
         self.scale: torch.Tensor
         self.register_buffer("mean", torch.tensor(mean, dtype=torch.float32))
+        self.clip: torch.Tensor
         self.register_buffer("scale", torch.tensor(scale, dtype=torch.float32))
+        self.register_buffer("clip", torch.tensor(math.inf if clip is None else clip))
 
     @property
-    def numbers(self) -> tuple[Array, Array, float]:
+    def numbers(self) -> tuple[Array, Array, float | None]:
         """(mean, scale, clip) as they are used."""
         mean, scale = (each.cpu().numpy().astype(np.float64) for each in (self.mean, self.scale))
-        return mean, scale, CLIP
+        return mean, scale, float(self.clip) if self.clip.isfinite() else None
 
     def forward(self, observations: torch.Tensor) -> torch.Tensor:
         """(N, k) of observations (N, k)."""
-        return torch.clamp((observations - self.mean) * self.scale, -CLIP, CLIP)
+        return torch.clamp((observations - self.mean) * self.scale, -self.clip, self.clip)
 
 
-def measured(env: VectorEnv[Any, Any, Any], spread: float, seed: int) -> tuple[Array, Array]:
-    """(mean, scale) of each entry, under random actions of this standard deviation."""
+def measured(env: VectorEnv[Any, Any, Any], spread: float, seed: int) -> Scaling:
+    """Of each entry, under random actions of this standard deviation."""
     rng = np.random.default_rng(seed)
     shape = env.action_space.shape or ()
     env.reset(seed=seed)
@@ -65,7 +77,8 @@ def measured(env: VectorEnv[Any, Any, Any], spread: float, seed: int) -> tuple[A
     samples = np.concatenate(seen).astype(np.float64)
     deviation = samples.std(axis=0)
     varies = deviation > _CONSTANT
-    return samples.mean(axis=0), np.where(varies, 1.0 / np.where(varies, deviation, 1.0), 0.0)
+    scale = np.where(varies, 1.0 / np.where(varies, deviation, 1.0), 0.0)
+    return samples.mean(axis=0).tolist(), scale.tolist(), CLIP
 
 
 class PerSecond(VecEnvWrapper):

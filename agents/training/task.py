@@ -8,7 +8,7 @@ from gymnasium.vector import VectorEnv
 
 from ...envs.scenarios.manoeuvres import scenario_from
 from ..vec_env.env import make_native_env
-from .algorithms import algorithm_of
+from .algorithms import Settings, check_settings, settings_of
 
 
 @dataclass(frozen=True)
@@ -16,12 +16,14 @@ class Task:
     """What is trained: it stays the same when a training goes on.
 
     env_id: of a native vector env. algo: a name of `ALGORITHMS`. estimator: of
-    `EstimateObservation`, "" for none. env_options: of `gym.make`, JSON types. seed: of the
-    weights, the episodes and the exploration. num_envs: side by side. scenarios: a mixture, which
-    the environments have in turn, each one for all its episodes.
+    `EstimateObservation`, "" for none, and estimator_options its other arguments. env_options: of
+    `gym.make`; JSON types. seed: of the weights, the episodes and the exploration. num_envs: side
+    by side, 0: as many as the settings say. scenarios: a mixture, which the environments have in
+    turn, each one for all its episodes. settings: of `settings_of`; empty: the package's own.
+    n_eval_envs: episodes of an evaluation, side by side.
 
-    Raises ValueError for an unknown algorithm or scenario, a negative seed, no environment, or
-    fewer of them than scenarios.
+    Raises ValueError for an unknown algorithm, setting or scenario, a negative seed, no
+    environment, or fewer of them than scenarios.
     """
 
     env_id: str = "sideslip/YawVision-v0"
@@ -29,15 +31,24 @@ class Task:
     estimator: str = ""
     env_options: dict[str, Any] = field(default_factory=dict)
     seed: int = 0
-    num_envs: int = 256
+    num_envs: int = 0
     scenarios: list[Any] = field(default_factory=list)
+    estimator_options: dict[str, Any] = field(default_factory=dict)
+    settings: Settings = field(default_factory=dict)
+    n_eval_envs: int = 256
 
     def __post_init__(self) -> None:
-        algorithm_of(self.algo)
+        settings = self.settings or settings_of(self.algo, self.env_id)
+        check_settings(self.algo, settings)
+        object.__setattr__(self, "settings", settings)
+        object.__setattr__(self, "num_envs", self.num_envs or settings["n_envs"])
         if self.seed < 0:
             raise ValueError(f"seed is at least 0, got {self.seed}")
-        if self.num_envs < 1:
-            raise ValueError(f"num_envs is at least 1, got {self.num_envs}")
+        for name in ("num_envs", "n_eval_envs"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} is at least 1, got {getattr(self, name)}")
+        if self.estimator_options and not self.estimator:
+            raise ValueError("options of an estimator need an estimator")
         if self.num_envs < len(self.scenarios):
             raise ValueError(
                 f"an environment has one scenario for all its episodes: {len(self.scenarios)} "
@@ -49,6 +60,11 @@ class Task:
             except (TypeError, ValueError) as error:
                 raise ValueError(f"scenario {i} of the mixture: {error}") from None
 
+    @property
+    def around(self) -> dict[str, Any] | None:
+        """Arguments of `EstimateObservation`, None without an estimator."""
+        return {"estimator": self.estimator} | self.estimator_options if self.estimator else None
+
     def options(self, num_envs: int) -> dict[str, Any]:
         """Options of a vector env of so many rows."""
         if not self.scenarios:
@@ -59,4 +75,4 @@ class Task:
     def vector_env(self, num_envs: int) -> VectorEnv[Any, Any, Any]:
         """Another vector env of the task, not the one that is trained on."""
         options = self.options(num_envs)
-        return make_native_env(self.env_id, num_envs, self.estimator or None, options)
+        return make_native_env(self.env_id, num_envs, self.around, options)

@@ -1,67 +1,28 @@
 """Training of a policy: rollouts on the batch engine, evaluations on other seeds, a checkpoint.
 
-A training's folder holds `checkpoint.safetensors` (all that `resume` needs), `policy.safetensors`
-(the network of the best evaluation, with its card), `best.zip` (the same model in
+A training's folder holds `checkpoint.safetensors` (what `resume` needs), `policy.safetensors` (the
+network of the best evaluation, with its card), `best_model.zip` (the same model in
 stable-baselines3's format) and `curve.jsonl` (the evaluations).
 """
 
-import json
-import time
-from collections.abc import Callable, Mapping
 from dataclasses import asdict, fields
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from ... import __version__
-from ...envs.backend.files import whole, write_whole
-from ..controllers.base import NoControl
-from ..learned.card import Card
-from ..learned.files import save_policy
-from ..rollout import costs_of
-from ..vec_env.env import make_vec_env
-from .algorithms import algorithm_of
-from .checkpoint import load_parameters, read_state, save_checkpoint
-from .export import network_from_sb3
-from .normalise import PerSecond, measured
-from .task import Task as Task
+from .checkpoint import read_state
+from .keeper import BEST, CHECKPOINT, CURVE, POLICY, Evaluation, Keeper, Means, Progress
+from .task import Task
+from .zips import check_zip
 
 import torch  # isort: skip  # after ours, which say which extra is missing
 from stable_baselines3.common.base_class import BaseAlgorithm  # isort: skip
-from stable_baselines3.common.callbacks import BaseCallback  # isort: skip
 
-CHECKPOINT, CURVE = "checkpoint.safetensors", "curve.jsonl"
-POLICY, BEST = "policy.safetensors", "best.zip"
-
-EPISODES = 256  # of an evaluation
-EVERY = 250_000  # steps from one evaluation to the next
-_MEASURED = 64  # environments whose observations make the scaling
-
-# No other seeds are as large: those of tests and of the calibration are below 2^63.
-_EVALUATION, _SCALING, _TRAINING = 2**64, 2**65, 2**66
-_ROOM = 2**40  # seeds of a training: it takes those from its steps on when it starts or goes on
-
-
-class Evaluation(NamedTuple):
-    """Of the deterministic policy: mean cost, its share of the uncontrolled car's on these seeds.
-
-    cpu_seconds: of the training up to here, evaluations apart.
-    """
-
-    steps: int
-    cpu_seconds: float
-    cost: float
-    of_none: float
-
-
-class Progress(NamedTuple):
-    """Where a training stands: its newest episodes' mean cost with exploration (None: no episode
-    ended yet), and its evaluations."""
-
-    steps: int
-    cost: float | None
-    evaluations: tuple[Evaluation, ...]
+__all__ = [
+    "BEST", "CHECKPOINT", "CURVE", "POLICY",
+    "Keeper", "Means", "Progress", "Task", "Trained", "task_in", "train",
+]  # fmt: skip
 
 
 class Trained(NamedTuple):
@@ -81,31 +42,44 @@ def train(
     steps: int,
     folder: str | Path,
     resume: bool = False,
-    report: Callable[[Progress], None] | None = None,
-    command: str = "",
+    means: Means | None = None,
+    trained_agent: str | Path | None = None,
+    trust: bool = False,
 ) -> Trained:
     """Train up to a number of steps (rounded up to whole rollouts), in a folder.
 
-    resume: go on from the folder's checkpoint: weights, optimiser, step size, steps and evaluations
-    are those of the checkpoint, episodes are new. report: called after every rollout. command: for
-    the policy's card.
+    resume: go on from the folder's checkpoint: weights, optimisers, step size, steps and
+    evaluations are those of the checkpoint, episodes are new; a replay buffer begins empty and is
+    filled as at the start, by `learning_starts` steps of random actions, before weights change.
+    trained_agent: a zip of stable-baselines3 whose weights a new training begins with; trust: of
+    `zips.start_of`.
 
     Raises ValueError where the folder holds another training, FileNotFoundError where there is
     none to go on with, FloatingPointError, with the step, where weights are not finite any more
-    (the folder holds the last evaluation's), and what `make_vec_env` raises.
+    (the folder holds the last evaluation's), and what `make_vec_env` and `start_of` raise.
     """
+    how = means or Means()
     if steps < 1:
         raise ValueError(f"steps is at least 1, got {steps}")
+    if trained_agent is not None:
+        if resume:
+            raise ValueError("a training goes on from its checkpoint or from a zip, not from both")
+        check_zip(Path(trained_agent), trust=True)
+    if how.tensorboard_log is not None and find_spec("tensorboard") is None:
+        raise ModuleNotFoundError("a log for TensorBoard needs it: pip install tensorboard")
     torch.set_num_threads(1)  # on small matrices threads only wait for each other
     place = Path(folder)
     checkpoint = _start(task, place, resume)
-    keeper = _Keeper(task, place, checkpoint, report, command)
-    model = keeper.build(checkpoint)
+    keeper = Keeper(task, place, checkpoint, how)
+    model = keeper.build(checkpoint, trained_agent, trust)
     done = model.num_timesteps
     if done < steps:
         try:
-            model.learn(steps - done, callback=keeper, reset_num_timesteps=done == 0)
-        except ValueError:  # torch's, of a distribution that is none
+            first = done == 0
+            model.learn(
+                steps - done, callback=keeper, reset_num_timesteps=first, tb_log_name=task.algo
+            )
+        except ValueError:  # torch's, of a distribution that is none, or the env's, of actions
             keeper.check()
             raise
         keeper.evaluate()
@@ -151,122 +125,3 @@ def _start(task: Task, folder: Path, resume: bool) -> dict[str, Any] | None:
         )
     folder.mkdir(parents=True, exist_ok=True)
     return None
-
-
-class _Keeper(BaseCallback):
-    """Builds the model; evaluates it between rollouts and keeps what is needed to go on."""
-
-    def __init__(
-        self,
-        task: Task,
-        folder: Path,
-        checkpoint: Mapping[str, Any] | None,
-        report: Callable[[Progress], None] | None,
-        command: str,
-    ) -> None:
-        super().__init__()
-        self.task, self.folder, self.report, self.command = task, folder, report, command
-        self.seeds = [_EVALUATION + i for i in range(EPISODES)]
-        self.tested = task.vector_env(EPISODES)
-        base: Any = self.tested.unwrapped
-        self.period: float = base.control_period * base.dt  # s
-        saved = {} if checkpoint is None else checkpoint
-        self.evaluations = [Evaluation(*each) for each in saved.get("evaluations", [])]
-        self.none: float = saved.get("none") or self._cost(NoControl(self.tested))
-        self.scaling: Any = saved.get("scaling")
-        self.spent = self.evaluations[-1].cpu_seconds if self.evaluations else 0.0
-        self.since = time.process_time()
-
-    def build(self, checkpoint: Mapping[str, Any] | None) -> BaseAlgorithm:
-        """The model, new or of the checkpoint, with the environments it is trained on."""
-        task, algorithm = self.task, algorithm_of(self.task.algo)
-        if self.scaling is None:
-            spread, seed = float(np.exp(algorithm.log_std)), _SCALING + task.seed
-            found = measured(task.vector_env(_MEASURED), spread, seed)
-            self.scaling = [each.tolist() for each in found]
-        env = make_vec_env(
-            task.env_id,
-            task.num_envs,
-            estimator=task.estimator or None,
-            env_kwargs=task.options(task.num_envs),
-        )
-        period = self.period
-        steps = 0 if checkpoint is None else int(checkpoint["steps"])
-        seed = (task.seed + steps) % 2**32
-        model = algorithm.make(PerSecond(env, period), period, self.scaling, seed)
-        if checkpoint is not None:
-            load_parameters(self.folder / CHECKPOINT, model)
-        model.num_timesteps = steps
-        env.seed(_TRAINING + task.seed * _ROOM + steps)
-        self.init_callback(model)
-        return model
-
-    def _cost(self, agent: Any) -> float:
-        """Mean over the evaluation's drives."""
-        return float(costs_of(self.tested, agent, self.seeds).mean())
-
-    def _on_step(self) -> bool:
-        return True
-
-    def _on_rollout_start(self) -> None:
-        self.check()
-        last = self.evaluations[-1].steps if self.evaluations else -EVERY
-        if self.model.num_timesteps - last >= EVERY:
-            self.evaluate()
-
-    def _on_rollout_end(self) -> None:
-        if self.report is not None:
-            ended = self.model.ep_info_buffer
-            cost = -float(np.mean([each["r"] for each in ended])) if ended else None
-            progress = Progress(self.model.num_timesteps, cost, tuple(self.evaluations))
-            self.report(progress)
-
-    def check(self) -> None:
-        """FloatingPointError where the weights are not finite."""
-        if not all(bool(each.isfinite().all()) for each in self.model.policy.parameters()):
-            raise FloatingPointError(
-                f"the weights are not finite after step {self.model.num_timesteps}; "
-                f"{self.folder / CHECKPOINT} holds them as they were at the last evaluation"
-            )
-
-    def evaluate(self) -> None:
-        """Cost of the policy as it is; the best one so far and the checkpoint are written."""
-        self.check()
-        self.spent += time.process_time() - self.since
-        cost = self._cost(self.model)
-        now = Evaluation(self.model.num_timesteps, round(self.spent, 3), cost, cost / self.none)
-        if all(cost < each.cost for each in self.evaluations):
-            self._keep_best(now)
-        self.evaluations.append(now)
-        checkpoint = {
-            "sideslip": __version__,
-            "task": asdict(self.task),
-            "steps": self.model.num_timesteps,
-            "none": self.none,
-            "scaling": self.scaling,
-            "evaluations": self.evaluations,
-        }
-        save_checkpoint(self.folder / CHECKPOINT, self.model, checkpoint)
-        lines = "".join(json.dumps(each._asdict()) + "\n" for each in self.evaluations)
-        write_whole(self.folder / CURVE, lines.encode())
-        self.since = time.process_time()
-
-    def _keep_best(self, now: Evaluation) -> None:
-        task = self.task
-        described = algorithm_of(task.algo).described(self.period, task.num_envs)
-        mixture: dict[str, Any] = {"scenarios": task.scenarios} if task.scenarios else {}
-        first = {"scenario": task.scenarios[0]} if task.scenarios else {}
-        card = Card.of(
-            task.env_id,
-            task.env_options | first,
-            task.estimator,
-            algorithm=task.algo,
-            algorithm_options=described | mixture,
-            command=self.command,
-            seeds={"training": task.seed, "from": _TRAINING + task.seed * _ROOM},
-            steps=now.steps,
-            cpu_seconds=now.cpu_seconds,
-        )
-        save_policy(self.folder / POLICY, network_from_sb3(self.model), card)
-        with whole(self.folder / BEST) as file:
-            self.model.save(file)

@@ -5,12 +5,13 @@ without `trust`, and `export_zip` writes a file that anybody can read without it
 """
 
 import json
+import math
 import pickle
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 from zipfile import BadZipFile, ZipFile
 
 import gymnasium as gym
@@ -20,7 +21,10 @@ from ...estimators.wrappers.estimate import EstimateObservation
 from ..env_facts import AnyEnv, facts_of
 from ..learned.card import Card
 from ..learned.files import ENDING, Policy, save_policy
-from .export import known_policy, network_from_sb3
+from .export import known_policy, network_from_sb3, normalisation
+
+if TYPE_CHECKING:
+    from .normalise import Scaling
 
 _NEEDED = ("policy_class", "policy_kwargs", "observation_space", "action_space")
 _MEMBERS = {"data", "policy.pth"}
@@ -62,6 +66,67 @@ def policy_from_zip(
     return Policy(file.stem, network, Card.seen(env, **{"env_id": "", **described, **about}))
 
 
+class Start(NamedTuple):
+    """What a training begins with: a zip's weights and optimisers, by their names in
+    `get_parameters`, its further tensors, and the scaling of what they read."""
+
+    path: Path
+    parameters: dict[str, Any]
+    variables: dict[str, Any]
+    scaling: "Scaling"
+
+
+def start_of(path: str | Path, width: int, trust: bool = False) -> Start:
+    """The tensors of a zip, which are read without running code of its maker's.
+
+    width: of the observation. trust: whether a pickle of VecNormalize beside the zip may be read.
+    Raises what `check_zip` raises; PermissionError for such a pickle without trust.
+    """
+    from .normalise import Scaling  # noqa: F401  first: it says which extra is missing
+
+    from stable_baselines3.common.save_util import load_from_zip_file  # isort: skip
+
+    file = Path(path)
+    check_zip(file, trust=True)
+    try:
+        _, found, variables = load_from_zip_file(file, load_data=False, device="cpu")
+        parameters: dict[str, Any] = found
+        policy = parameters["policy"]
+    except Exception as error:  # torch raises many for one that is cut short
+        raise ValueError(f"{file} cannot be read: {' '.join(str(error).split())}") from error
+    own = {
+        name.rpartition(".")[2]: x for name, x in policy.items() if "features_extractor." in name
+    }
+    if own.keys() == {"mean", "scale", "clip"}:  # every network of the policy has the same
+        bound = float(own["clip"])
+        ours = own["mean"].tolist(), own["scale"].tolist(), bound if bound < math.inf else None
+        return Start(file, parameters, variables or {}, ours)
+    beside = normaliser_of(file)
+    if beside is not None and not trust:
+        raise PermissionError(f"{beside} is a pickle, which may run code: say --trust to read it")
+    mean, scale, clip = normalisation(_unpickled(beside) if beside else None, width, 1)
+    return Start(file, parameters, variables or {}, (mean.tolist(), scale.tolist(), clip))
+
+
+def give(start: Start, model: Any) -> None:
+    """Give a model what it starts with; ValueError where that is of another network."""
+    scaling = {
+        name: x
+        for name, x in model.get_parameters()["policy"].items()
+        if "features_extractor." in name  # what a zip from elsewhere has outside of its policy
+    }
+    policy = scaling | start.parameters["policy"]
+    try:
+        model.set_parameters({**start.parameters, "policy": policy}, device=model.device)
+        for name, tensor in start.variables.items():
+            getattr(model, name).data.copy_(tensor)
+    except (AttributeError, KeyError, RuntimeError, ValueError) as error:
+        raise ValueError(
+            f"{start.path} holds other networks than this training's {type(model).__name__} (its "
+            f"settings say which): {' '.join(str(error).split())[:300]}"
+        ) from error
+
+
 def export_zip(
     path: str | Path,
     target: str | Path,
@@ -96,7 +161,11 @@ def normaliser_of(path: Path, normalise: str | Path | None = None) -> Path | Non
     """The pickle of a zip's VecNormalize: the argument, else one beside the zip, else None."""
     if normalise is not None:
         return Path(normalise)
-    beside = (path.with_suffix(".pkl"), path.with_name(_NORMALISER))
+    beside = (
+        path.with_suffix(".pkl"),
+        path.with_name(_NORMALISER),
+        path.with_suffix("") / _NORMALISER,  # where rl-baselines3-zoo puts it
+    )
     return next((file for file in beside if file.is_file()), None)
 
 

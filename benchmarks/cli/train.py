@@ -14,6 +14,7 @@ from rich.table import Table
 
 from ... import __version__
 from ...envs.sensors.slow import SENSOR_SETS
+from .export import Trust
 from .names import check_env, complete
 from .output import check_files, command_line, options_of, wrote
 
@@ -21,15 +22,18 @@ if TYPE_CHECKING:
     from ...agents.training.train import Progress as Now
     from ...agents.training.train import Task, Trained
 
-STEPS = 2_000_000
 EPISODES = 256  # of the policy's test
 _Text = str | None
 
 
 def train_command(
-    algo: Annotated[_Text, typer.Option(help="An algorithm's name (ppo).")] = None,
+    algo: Annotated[_Text, typer.Option(help="ppo (default), sac, tqc or recurrent-ppo.")] = None,
     env: Annotated[_Text, typer.Option(help="An environment's id (sideslip/YawVision-v0).")] = None,
     estimator: Annotated[_Text, typer.Option(help="An estimator's name (none).")] = None,
+    estimator_option: Annotated[
+        list[str] | None,
+        typer.Option(help='NAME=VALUE of EstimateObservation, as outputs=["beta","F_d"].'),
+    ] = None,
     option: Annotated[
         list[str] | None,
         typer.Option(help="NAME=VALUE of the environment, as scenario=gust; repeatable."),
@@ -37,9 +41,34 @@ def train_command(
     scenarios: Annotated[
         list[str] | None, typer.Option(help="Of a mixture: a name or a file; repeatable.")
     ] = None,
-    steps: Annotated[int, typer.Option(help="Control periods, all in all.")] = STEPS,
+    steps: Annotated[
+        int | None,
+        typer.Option("--steps", "--n-timesteps", "-n", help="Control periods, all in all."),
+    ] = None,
     seed: Annotated[int | None, typer.Option(help="Of weights and episodes (0).")] = None,
-    num_envs: Annotated[int | None, typer.Option(help="Side by side (256).")] = None,
+    num_envs: Annotated[
+        int | None, typer.Option(min=1, help="Side by side; default: of the settings.")
+    ] = None,
+    conf_file: Annotated[
+        Path | None,
+        typer.Option("--conf-file", "-conf", help="YAML of settings; default: the package's own."),
+    ] = None,
+    eval_freq: Annotated[int, typer.Option(help="Steps between two evaluations.")] = 250_000,
+    n_eval_envs: Annotated[
+        int | None, typer.Option(min=1, help="Episodes of an evaluation (256).")
+    ] = None,
+    tensorboard_log: Annotated[
+        _Text, typer.Option("--tensorboard-log", "-tb", help="A folder for TensorBoard.")
+    ] = None,
+    device: Annotated[str, typer.Option(help="Of the networks, as torch calls it.")] = "cpu",
+    progress: Annotated[
+        bool, typer.Option("--progress/--no-progress", "-P", help="Show a bar.")
+    ] = True,
+    trained_agent: Annotated[
+        Path | None,
+        typer.Option("--trained-agent", "-i", help="Begin with the weights of an sb3 zip."),
+    ] = None,
+    trust: Trust = False,
     out: Annotated[
         Path | None, typer.Option(help="Folder; default: train-ENV-ALGO...-SEED here.")
     ] = None,
@@ -51,32 +80,41 @@ def train_command(
 
     With --resume the options left out are those of the training in the folder.
     """
-    from ...agents.training.train import CURVE, POLICY, Task, task_in, train
+    from ...agents.training.algorithms import settings_of
+    from ...agents.training.train import CURVE, POLICY, Means, Task, task_in, train
     from ..policies import evaluate, evaluation
 
     options: dict[str, Any] = {
         "env_id": env,
         "algo": algo,
         "estimator": estimator,
+        "estimator_options": options_of(estimator_option) or None,
         "env_options": options_of(option) or None,
         "scenarios": scenarios or None,
         "seed": seed,
         "num_envs": num_envs,
+        "n_eval_envs": n_eval_envs,
     }
     options = {name: value for name, value in options.items() if value is not None}
     if env is not None:
         check_env(env)
+    if conf_file is not None:
+        options["settings"] = settings_of(algo or Task.algo, env or Task.env_id, conf_file)
     task = Task(**options)
     folder = out or Path(_name_of(task))
     if resume:
         task = task_in(folder, **options)
+    steps = task.settings["n_timesteps"] if steps is None else steps
+    words = [*_words(task, steps), *(["--conf-file", str(conf_file)] if conf_file else [])]
+    words += ["--trained-agent", str(trained_agent)] if trained_agent else []
     console = Console()
-    with _Bar(console, steps) as bar:
-        trained = train(task, steps, folder, resume, bar.show, shlex.join(_words(task, steps)))
+    with _Bar(console, steps, disable=not progress) as bar:
+        means = Means(eval_freq, device, tensorboard_log, bar.show, shlex.join(words))
+        trained = train(task, steps, folder, resume, means, trained_agent, trust)
     console.print(_table(trained))
     costs = evaluation(evaluate(folder / POLICY, EPISODES))["cost"]
-    means = ", ".join(f"{name} {each['mean']:.4g}" for name, each in costs.items())
-    console.print(f"mean cost on test seeds: {means}", highlight=False, soft_wrap=True)
+    shown = ", ".join(f"{name} {each['mean']:.4g}" for name, each in costs.items())
+    console.print(f"mean cost on test seeds: {shown}", highlight=False, soft_wrap=True)
     wrote(console, folder / POLICY)
     wrote(console, folder / CURVE)
 
@@ -93,8 +131,10 @@ def _words(task: "Task", steps: int) -> list[str]:
     """The command that trains this from the start."""
     words = ["sideslip", "train", "--algo", task.algo, "--env", task.env_id]
     words += ["--estimator", task.estimator] if task.estimator else []
-    for name, value in task.env_options.items():
-        words += ["--option", f"{name}={value if isinstance(value, str) else json.dumps(value)}"]
+    given = {"--estimator-option": task.estimator_options, "--option": task.env_options}
+    for option, values in given.items():
+        for name, value in values.items():
+            words += [option, f"{name}={value if isinstance(value, str) else json.dumps(value)}"]
     words += [word for each in task.scenarios for word in ("--scenarios", str(each))]
     numbers = {"--steps": steps, "--seed": task.seed, "--num-envs": task.num_envs}
     return words + [word for name, value in numbers.items() for word in (name, str(value))]
@@ -103,7 +143,7 @@ def _words(task: "Task", steps: int) -> list[str]:
 class _Bar(Progress):
     """Steps, the cost of the newest episodes, and the newest and the best evaluation."""
 
-    def __init__(self, console: Console, steps: int) -> None:
+    def __init__(self, console: Console, steps: int, disable: bool) -> None:
         columns = (
             TextColumn("{task.completed:,.0f} steps"),
             BarColumn(20),
@@ -111,7 +151,7 @@ class _Bar(Progress):
             TimeElapsedColumn(),
             TimeRemainingColumn(),
         )
-        super().__init__(*columns, console=console)
+        super().__init__(*columns, console=console, disable=disable)
         self._task = self.add_task("", total=steps)
 
     def show(self, now: "Now") -> None:

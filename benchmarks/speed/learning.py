@@ -13,6 +13,7 @@ from ..harness.results import Suite
 from .contestants import Field
 from .timing import Contestant, Effort, Taken
 
+YAW = "sideslip/YawFusion-v0"
 OURS = "PPO, YawFusion-v0"
 PENDULUM = "PPO, Pendulum-v1"
 
@@ -36,15 +37,16 @@ def _ours() -> Contestant:
     from ...agents.vec_env.env import make_vec_env
 
     settings = _settings()
-    env = make_vec_env("sideslip/YawFusion-v0", COUNT, seed=0)
+    env = make_vec_env(YAW, COUNT, seed=0)
     return _learner(env, COUNT * settings["n_steps"], **settings)
 
 
 def _settings() -> dict[str, Any]:
     """Those of `sideslip train`."""
-    from ...agents.training.algorithms import algorithm_of
+    from ...agents.training.algorithms import options_of, settings_of
 
-    return algorithm_of("ppo").options(10 * TICK, COUNT)
+    options = options_of(settings_of("ppo", YAW), 10 * TICK, COUNT)
+    return {name: options[name] for name in ("n_steps", "n_epochs", "batch_size", "gamma")}
 
 
 def add(suite: Suite, effort: Effort) -> tuple[dict[str, Taken], dict[str, str]]:

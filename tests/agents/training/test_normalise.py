@@ -12,12 +12,15 @@ from sideslip.agents.training.train import Task
 
 def test_observations_are_standardised_by_the_network() -> None:
     env = Task(env_options={"scenario": "sine-with-dwell"}, seed=3).vector_env(16)
-    mean, scale = measured(env, 0.4, 5)
+    mean, scale, clip = measured(env, 0.4, 5)
     names = [entry.name for entry in env.unwrapped.layout]  # type: ignore[attr-defined]
     assert scale[names.index("gamma_ref")] == 0.0  # zero-slip: it never varies
-    layer = Standardised(env.single_observation_space, mean.tolist(), scale.tolist())
+    layer = Standardised(env.single_observation_space, mean, scale, clip)
     obs = 30.0 * np.random.default_rng(0).standard_normal((50, len(mean)))
-    wanted = np.clip((obs - mean) * scale, -CLIP, CLIP)
+    wanted = np.clip((obs - np.array(mean)) * np.array(scale), -CLIP, CLIP)
     given = layer(torch.tensor(obs, dtype=torch.float32)).numpy()
     assert given == pytest.approx(wanted, abs=1e-3)
     assert np.abs(wanted).max() == CLIP and not list(layer.parameters())
+    free = Standardised(env.single_observation_space, mean, scale, None)
+    assert float(free(torch.tensor(obs, dtype=torch.float32)).abs().max()) > CLIP
+    assert free.numbers[2] is None and layer.numbers[2] == clip

@@ -9,11 +9,11 @@ import pytest
 
 pytest.importorskip("stable_baselines3")
 from sideslip.agents.learned.files import load_policy
-from sideslip.agents.training import train
+from sideslip.agents.training import keeper, train
 from sideslip.agents.training.task import Task
 from sideslip.agents.training.train import POLICY, task_in
 
-TINY, ROLLOUT = Task(num_envs=8, seed=3), 256  # steps of 8 environments
+TINY, ROLLOUT = Task(num_envs=8, seed=3, n_eval_envs=4), 256  # steps of 8 environments
 MIXTURE: list[Any] = ["coms-slalom", {"base": "coms-step", "duration": 0.3}]
 
 
@@ -33,8 +33,7 @@ def test_a_mixture_survives_autoreset() -> None:
 
 
 def test_a_policy_of_a_mixture_names_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name, value in {"EPISODES": 4, "EVERY": ROLLOUT, "_MEASURED": 8}.items():
-        monkeypatch.setattr(train, name, value)
+    monkeypatch.setattr(keeper, "_MEASURED", 8)
     task = dataclasses.replace(TINY, scenarios=MIXTURE)
     train.train(task, ROLLOUT, tmp_path)
     card = load_policy(tmp_path / POLICY).card

@@ -10,19 +10,18 @@ import pytest
 from sideslip.agents.learned.files import load_policy
 
 pytest.importorskip("stable_baselines3")
-from sideslip.agents.training import train
+from sideslip.agents.training import keeper, train
 from sideslip.benchmarks import policies as enjoy
 from sideslip.benchmarks.cli import train as train_command
 from tests.benchmarks.conftest import Run
 
-TINY = ("--num-envs", 8, "--option", "scenario=sine-with-dwell")
+TINY = ("--num-envs", 8, "--option", "scenario=sine-with-dwell", "--n-eval-envs", 4)
 
 
 @pytest.fixture
 def run(run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
     """Call `sideslip train` in an empty folder; gives (exit status, stdout, stderr)."""
-    for name, value in {"EPISODES": 4, "EVERY": 256, "_MEASURED": 8}.items():
-        monkeypatch.setattr(train, name, value)
+    monkeypatch.setattr(keeper, "_MEASURED", 8)
     monkeypatch.setattr(train_command, "EPISODES", 4)
     monkeypatch.chdir(tmp_path)
     return partial(run, "train")
@@ -49,8 +48,8 @@ def test_it_goes_on_with_what_the_folder_holds(
     monkeypatch.setattr(enjoy, "evaluate", lambda *_: None)
     monkeypatch.setattr(enjoy, "evaluation", lambda _: {"cost": {}})
     folder = "train-YawVision-v0-ppo-sine-with-dwell-0"
-    assert run(*TINY, "--steps", 256)[0] == 0
-    status, _, err = run("--resume", "--out", folder, "--steps", 512)
+    assert run(*TINY, "--steps", 256, "--eval-freq", 256)[0] == 0
+    status, _, err = run("--resume", "--out", folder, "-n", 512, "-P")
     assert status == 0, err
     assert len((tmp_path / folder / train.CURVE).read_text().splitlines()) == 3
     status, _, err = run(*TINY, "--steps", 256)
@@ -69,7 +68,7 @@ def test_it_goes_on_with_what_the_folder_holds(
         (("--option", "scenario=moon"), "unknown scenario 'moon'"),
         (("--resume",), "holds no training to go on with"),
         (("--steps", "0"), "steps is at least 1, got 0"),
-        (("--num-envs", "0"), "num_envs is at least 1, got 0"),
+        (("--num-envs", "0"), "greater than or equal to 1"),
         (("--seed", "-1"), "seed is at least 0, got -1"),
         (("--scenarios", "moon"), "scenario 0 of the mixture: unknown scenario 'moon'"),
     ],
@@ -88,9 +87,11 @@ def test_without_the_extra_the_command_names_it(
     run: Run, missing: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in list(sys.modules):
-        if name.split(".")[0] in ("torch", "stable_baselines3") or name in (
+        if name.split(".")[0] == missing or name in (
             "sideslip.agents.training.train",
             "sideslip.agents.training.algorithms",
+            "sideslip.agents.training.keeper",
+            "sideslip.agents.training.task",
             "sideslip.agents.training.normalise",
             "sideslip.agents.training.checkpoint",
             "sideslip.agents.vec_env.env",

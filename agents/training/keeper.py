@@ -1,0 +1,221 @@
+"""What is done between rollouts: evaluations on other seeds, the best policy, a checkpoint."""
+
+import json
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ... import __version__
+from ...envs.backend.files import whole, write_whole
+from ..controllers.base import NoControl
+from ..learned.card import Card
+from ..learned.files import save_policy
+from ..rollout import costs_of
+from ..vec_env.env import make_vec_env
+from .algorithms import make_model, options_of, spread_of
+from .checkpoint import load_parameters, save_checkpoint
+from .export import network_from_sb3
+from .normalise import PerSecond, measured
+from .task import Task
+from .zips import give, start_of
+
+from stable_baselines3.common.base_class import BaseAlgorithm  # isort: skip  # after ours, which
+from stable_baselines3.common.callbacks import BaseCallback  # isort: skip  # name a missing extra
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm  # isort: skip
+
+CHECKPOINT, CURVE = "checkpoint.safetensors", "curve.jsonl"
+POLICY, BEST = "policy.safetensors", "best_model.zip"
+
+_MEASURED = 64  # environments whose observations make the scaling
+
+# No other seeds are as large: those of tests and of the calibration are below 2^63.
+_EVALUATION, _SCALING, _TRAINING = 2**64, 2**65, 2**66
+_ROOM = 2**40  # seeds of a training: it takes those from its steps on when it starts or goes on
+
+
+def evaluation_seeds(episodes: int) -> list[int]:
+    """Of the episodes of an evaluation."""
+    return [_EVALUATION + i for i in range(episodes)]
+
+
+class Evaluation(NamedTuple):
+    """Of the deterministic policy: mean cost, its share of the uncontrolled car's on these seeds.
+
+    cpu_seconds: of the training up to here, evaluations apart.
+    """
+
+    steps: int
+    cpu_seconds: float
+    cost: float
+    of_none: float
+
+
+class Progress(NamedTuple):
+    """Where a training stands: its newest episodes' mean cost with exploration (None: no episode
+    ended yet), and its evaluations."""
+
+    steps: int
+    cost: float | None
+    evaluations: tuple[Evaluation, ...]
+
+
+@dataclass(frozen=True)
+class Means:
+    """What may be another when a training goes on.
+
+    eval_freq: steps from one evaluation to the next. device: torch's name. tensorboard_log: a
+    folder for TensorBoard. report: called after every rollout. command: for the policy's card.
+
+    Raises ValueError for evaluations that are less than a step apart.
+    """
+
+    eval_freq: int = 250_000
+    device: str = "cpu"
+    tensorboard_log: str | None = None
+    report: Callable[[Progress], None] | None = None
+    command: str = ""
+
+    def __post_init__(self) -> None:
+        if self.eval_freq < 1:
+            raise ValueError(f"eval_freq is at least 1, got {self.eval_freq}")
+
+
+class Keeper(BaseCallback):
+    """Builds the model; evaluates it between rollouts and keeps what is needed to go on.
+
+    checkpoint: the state of one, None for a new training.
+    """
+
+    def __init__(
+        self, task: Task, folder: Path, checkpoint: Mapping[str, Any] | None, means: Means
+    ) -> None:
+        super().__init__()
+        self.task, self.folder, self.means = task, folder, means
+        self.seeds = evaluation_seeds(task.n_eval_envs)
+        self.tested = task.vector_env(task.n_eval_envs)
+        base: Any = self.tested.unwrapped
+        self.period: float = base.control_period * base.dt  # s
+        saved = {} if checkpoint is None else checkpoint
+        self.evaluations = [Evaluation(*each) for each in saved.get("evaluations", [])]
+        self.none: float = saved.get("none") or self._cost(NoControl(self.tested))
+        self.scaling: Any = saved.get("scaling")
+        self.spent = self.evaluations[-1].cpu_seconds if self.evaluations else 0.0
+        self.since = time.process_time()
+
+    def build(
+        self,
+        checkpoint: Mapping[str, Any] | None,
+        trained_agent: str | Path | None = None,
+        trust: bool = False,
+    ) -> BaseAlgorithm:
+        """The model, new, of the checkpoint or of a zip, with the environments it is trained on."""
+        task, means = self.task, self.means
+        start = None
+        if trained_agent is not None:
+            width = (self.tested.single_observation_space.shape or (0,))[0]
+            start = start_of(trained_agent, width, trust)
+            self.scaling = start.scaling
+        if self.scaling is None:
+            spread, seed = spread_of(task.settings), _SCALING + task.seed
+            self.scaling = measured(task.vector_env(_MEASURED), spread, seed)
+        env = make_vec_env(
+            task.env_id,
+            task.num_envs,
+            estimator=task.around,
+            env_kwargs=task.options(task.num_envs),
+        )
+        steps = 0 if checkpoint is None else int(checkpoint["steps"])
+        seed = (task.seed + steps) % 2**32
+        rated = PerSecond(env, self.period)
+        further = {"device": means.device, "tensorboard_log": means.tensorboard_log}
+        model = make_model(
+            task.algo, task.settings, rated, self.period, self.scaling, seed, **further
+        )
+        if checkpoint is not None:
+            load_parameters(self.folder / CHECKPOINT, model)
+            if isinstance(model, OffPolicyAlgorithm):
+                model.learning_starts += steps  # its buffer begins empty
+        if start is not None:
+            give(start, model)
+        model.num_timesteps = steps
+        env.seed(_TRAINING + task.seed * _ROOM + steps)
+        self.init_callback(model)
+        return model
+
+    def _cost(self, agent: Any) -> float:
+        """Mean over the evaluation's drives."""
+        return float(costs_of(self.tested, agent, self.seeds).mean())
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_start(self) -> None:
+        self.check()
+        last = self.evaluations[-1].steps if self.evaluations else -self.means.eval_freq
+        if self.model.num_timesteps - last >= self.means.eval_freq:
+            self.evaluate()
+
+    def _on_rollout_end(self) -> None:
+        if self.means.report is not None:
+            ended = self.model.ep_info_buffer
+            cost = -float(np.mean([each["r"] for each in ended])) if ended else None
+            progress = Progress(self.model.num_timesteps, cost, tuple(self.evaluations))
+            self.means.report(progress)
+
+    def check(self) -> None:
+        """FloatingPointError where the weights are not finite."""
+        if not all(bool(each.isfinite().all()) for each in self.model.policy.parameters()):
+            raise FloatingPointError(
+                f"the weights are not finite after step {self.model.num_timesteps}; "
+                f"{self.folder / CHECKPOINT} holds them as they were at the last evaluation"
+            )
+
+    def evaluate(self) -> None:
+        """Cost of the policy as it is; the best one so far and the checkpoint are written."""
+        self.check()
+        self.spent += time.process_time() - self.since
+        cost = self._cost(self.model)
+        now = Evaluation(self.model.num_timesteps, round(self.spent, 3), cost, cost / self.none)
+        if all(cost < each.cost for each in self.evaluations):
+            self._keep_best(now)
+        self.evaluations.append(now)
+        self.logger.record("eval/mean_reward", -cost)
+        self.logger.dump(self.model.num_timesteps)
+        checkpoint = {
+            "sideslip": __version__,
+            "task": asdict(self.task),
+            "steps": self.model.num_timesteps,
+            "none": self.none,
+            "scaling": self.scaling,
+            "evaluations": self.evaluations,
+        }
+        save_checkpoint(self.folder / CHECKPOINT, self.model, checkpoint)
+        lines = "".join(json.dumps(each._asdict()) + "\n" for each in self.evaluations)
+        write_whole(self.folder / CURVE, lines.encode())
+        self.since = time.process_time()
+
+    def _keep_best(self, now: Evaluation) -> None:
+        task = self.task
+        described = options_of(task.settings, self.period, task.num_envs)
+        described |= {"num_envs": task.num_envs, "policy": task.settings["policy"]}
+        mixture: dict[str, Any] = {"scenarios": task.scenarios} if task.scenarios else {}
+        first = {"scenario": task.scenarios[0]} if task.scenarios else {}
+        card = Card.of(
+            task.env_id,
+            task.env_options | first,
+            task.estimator,
+            task.estimator_options,
+            algorithm=task.algo,
+            algorithm_options=described | mixture,
+            command=self.means.command,
+            seeds={"training": task.seed, "from": _TRAINING + task.seed * _ROOM},
+            steps=now.steps,
+            cpu_seconds=now.cpu_seconds,
+        )
+        save_policy(self.folder / POLICY, network_from_sb3(self.model), card)
+        with whole(self.folder / BEST) as file:
+            self.model.save(file)

@@ -1,0 +1,181 @@
+"""Every algorithm trains, goes on, is exported and stops at NaN; settings are checked."""
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+pytest.importorskip("stable_baselines3")
+pytest.importorskip("sb3_contrib")
+import torch
+
+from sideslip.agents.learned.policy import Learned
+from sideslip.agents.training import keeper, train
+from sideslip.agents.training.algorithms import (
+    ALGORITHMS,
+    HYPERPARAMS,
+    algorithm_of,
+    check_settings,
+    settings_of,
+)
+from sideslip.agents.training.checkpoint import read_state
+from sideslip.agents.training.train import BEST, CHECKPOINT, POLICY, Means, Progress, Task
+
+SMALL: dict[str, Any] = {"n_steps": 16, "learning_starts": 64, "buffer_size": 4096}
+ROLLOUT, VISION = 128, "sideslip/YawVision-v0"
+EACH = Means(eval_freq=ROLLOUT)
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.setattr(keeper, "_MEASURED", 8)
+    threads = torch.get_num_threads()
+    yield
+    torch.set_num_threads(threads)
+
+
+def tiny(algo: str, **more: Any) -> Task:
+    """Eight environments, rollouts of 128 steps or fewer that divide them, small buffers."""
+    settings = settings_of(algo, VISION)
+    settings |= {name: value for name, value in SMALL.items() if name in settings}
+    settings |= {"train_freq": 16, "gradient_steps": 4} if "train_freq" in settings else {}
+    scenario = {"scenario": {"base": "sine-with-dwell", "duration": 0.5}}
+    return Task(VISION, algo, "", scenario, 3, 8, settings=settings | more, n_eval_envs=4)
+
+
+def tensors(model: Any) -> dict[str, Any]:
+    """Every tensor that the training goes on with."""
+    found = {name: getattr(model, name) for name in model._get_torch_save_params()[1]}
+    for part, state in model.get_parameters().items():
+        if "state" in state and "param_groups" in state:
+            for i, each in state["state"].items():
+                found |= {f"{part} {i} {key}": value for key, value in each.items()}
+        else:
+            found |= {f"{part} {name}": value for name, value in state.items()}
+    return found
+
+
+@pytest.fixture(scope="module", params=list(ALGORITHMS))
+def trained(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """(task, folder, model) of two rollouts."""
+    task, folder = tiny(request.param), tmp_path_factory.mktemp(request.param)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(keeper, "_MEASURED", 8)
+        model = train.train(task, 2 * ROLLOUT, folder, means=EACH).model
+    return task, folder, model
+
+
+def test_it_goes_on_where_the_checkpoint_is(trained: Any) -> None:
+    task, folder, model = trained
+    again = train.train(task, 2 * ROLLOUT, folder, resume=True)  # there is nothing to do
+    one, other = tensors(model), tensors(again.model)
+    assert one.keys() == other.keys() and len(one) > 30
+    assert all(torch.equal(one[name], other[name]) for name in one)
+    assert any("log_ent_coef" in name for name in one) == (task.algo in ("sac", "tqc"))
+    before = {name: value.clone() for name, value in other.items()}
+    more = train.train(task, 4 * ROLLOUT, folder, resume=True, means=EACH)
+    assert [each.steps // ROLLOUT for each in more.evaluations] == [0, 1, 2, 3, 4]
+    moved = tensors(more.model)
+    actor = [name for name in moved if "policy " in name and name.endswith(".weight")]
+    assert actor and all(not torch.equal(moved[name], before[name]) for name in actor)
+
+
+def test_numpys_policy_drives_as_torchs(trained: Any) -> None:
+    """Through an episode's end and with the memory of each, where there is one."""
+    _, folder, _ = trained
+    card = Learned(tiny("ppo").vector_env(2), folder / POLICY).policy.card
+    model: Any = algorithm_of(card.algorithm).load().load(folder / BEST, device="cpu")  # type: ignore[attr-defined]
+    env = Task(
+        VISION, env_options={"scenario": {"base": "step-steer", "duration": 0.5}}
+    ).vector_env(4)
+    ours = Learned(env, folder / POLICY)
+    obs, _ = env.reset(seed=0)
+    mine, theirs, start = None, None, np.ones(4, np.bool_)
+    acted = []
+    for _ in range(120):
+        a, mine = ours.predict(obs, mine, start)
+        b, theirs = model.predict(obs, theirs, start, deterministic=True)
+        assert np.abs(a - b).max() < 1e-6
+        acted.append(a)
+        obs, _, terminated, truncated, _ = env.step(a)
+        start = terminated | truncated
+    assert np.ptp(acted) > 1e-3
+
+
+def test_the_same_seed_trains_the_same(trained: Any, tmp_path: Path) -> None:
+    task, _, model = trained
+    here = train.train(task, 2 * ROLLOUT, tmp_path, means=EACH)
+    one, other = tensors(model), tensors(here.model)
+    assert all(torch.equal(one[name], other[name]) for name in one)
+
+
+@pytest.mark.parametrize("algo", ALGORITHMS)
+def test_weights_of_nan_stop_it(algo: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With the step; the checkpoint is that of the last evaluation."""
+    models, real = list[Any](), train.Keeper.build
+
+    def built(*arguments: Any) -> Any:
+        models.append(real(*arguments))
+        return models[0]
+
+    def spoil(now: Progress) -> None:
+        if now.steps == 2 * ROLLOUT:
+            with torch.no_grad():
+                next(models[0].policy.parameters()).fill_(float("nan"))
+
+    monkeypatch.setattr(train.Keeper, "build", built)
+    means = Means(eval_freq=ROLLOUT, report=spoil)
+    with pytest.raises(FloatingPointError, match=f"after step {2 * ROLLOUT}; .*{CHECKPOINT}"):
+        train.train(tiny(algo), 4 * ROLLOUT, tmp_path, means=means)
+    assert read_state(tmp_path / CHECKPOINT)["steps"] == ROLLOUT
+
+
+@pytest.mark.parametrize("algo", ["tqc", "recurrent-ppo"])
+def test_without_its_package_an_algorithm_names_the_extra(
+    algo: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "sb3_contrib", None)
+    with pytest.raises(ModuleNotFoundError, match=r"sb3_contrib: pip install 'sideslip\[train\]'"):
+        Task(algo=algo)
+
+
+def test_the_packages_settings_are_of_ids_there_are() -> None:
+    import yaml
+
+    for name, algorithm in ALGORITHMS.items():
+        entries = yaml.safe_load((HYPERPARAMS / f"{algorithm.zoo}.yml").read_text())
+        assert "default" in entries and set(entries) - {"default"} <= set(gym.registry)
+        for key in entries:
+            check_settings(name, entries[key])
+            assert settings_of(name, key) == entries[key]
+    assert len(list(HYPERPARAMS.iterdir())) == len(ALGORITHMS)
+
+
+MEANT = "default: {policy: MlpPolicy, n_timesteps: 9, n_envs: 1"
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (MEANT + ", n_stepz: 3}", "default: unknown option 'n_stepz' of ppo; known: .*n_steps"),
+        (MEANT + ", seed: 3}", "unknown option 'seed' of ppo"),
+        (MEANT + ', policy_kwargs: "dict(net_arch=[9])"}', "policy_kwargs is {name: value}"),
+        (MEANT + ", learning_rate: lin_x}", "learning_rate is a positive number or lin_NUMBER"),
+        (MEANT + ", learning_rate: -1.0}", "learning_rate is a positive number or lin_NUMBER"),
+        ("default: {n_envs: 1}", "default: no n_timesteps, policy"),
+        ("default: 3", "settings are {name: value}, got 3"),
+        ("other: {n_envs: 1}", f"has no settings of {VISION}, and no 'default'"),
+        ("[1]", "is no YAML of settings: {id"),
+        ("{", "is no YAML of settings: while parsing"),
+    ],
+)
+def test_a_fault_in_a_file_of_settings_is_named(text: str, said: str, tmp_path: Path) -> None:
+    path = tmp_path / "mine.yml"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=said) as caught:
+        settings_of("ppo", VISION, path)
+    assert str(caught.value).startswith(str(path))

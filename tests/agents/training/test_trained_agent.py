@@ -1,0 +1,104 @@
+"""A training begins with the weights of a zip: ours, or a foreign one with its VecNormalize."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("stable_baselines3")
+import torch
+from stable_baselines3 import PPO, SAC
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sideslip.agents.training import keeper, train
+from sideslip.agents.training.normalise import CLIP
+from sideslip.agents.training.train import BEST, Means, Task
+from sideslip.agents.vec_env.env import make_vec_env
+
+SHORT: dict[str, Any] = {"scenario": {"base": "sine-with-dwell", "duration": 0.3}}
+TASK = Task(num_envs=4, env_options=SHORT, n_eval_envs=4)
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(keeper, "_MEASURED", 8)
+
+
+def observations() -> Any:
+    env = TASK.vector_env(4)
+    obs, _ = env.reset(seed=1)
+    return np.concatenate([obs, env.step(np.full((4, 1), 0.5))[0]])
+
+
+def begun(tmp_path: Path, zipped: Path, trust: bool = False) -> Any:
+    """The model before its first step."""
+    place = tmp_path / "new"
+    place.mkdir()
+    return train.Keeper(TASK, place, None, Means()).build(None, zipped, trust)
+
+
+def foreign(path: Path, normalised: bool, **options: Any) -> Any:
+    """A zip as rl-baselines3-zoo leaves it, and what acts in it."""
+    env: Any = make_vec_env(TASK.env_id, 2, env_kwargs=SHORT)
+    if normalised:
+        env = VecNormalize(env)
+    model = PPO("MlpPolicy", env, device="cpu", seed=1, n_steps=32, batch_size=64, **options)
+    model.learn(64)
+    model.save(path)
+    if normalised:
+        env.save(path.with_name("vecnormalize.pkl"))
+    return lambda x: model.predict(env.normalize_obs(x) if normalised else x, deterministic=True)[0]
+
+
+def test_our_zip_goes_on_as_it_was(tmp_path: Path) -> None:
+    first = train.train(TASK, 128, tmp_path / "first").model
+    model = begun(tmp_path, tmp_path / "first" / BEST)
+    assert model.num_timesteps == 0
+    one, other = first.policy.state_dict(), model.policy.state_dict()
+    best = PPO.load(tmp_path / "first" / BEST, device="cpu").policy.state_dict()
+    assert one.keys() == other.keys()
+    assert all(torch.equal(best[name], other[name]) for name in best)
+    assert float(other["features_extractor.clip"]) == CLIP
+    done = train.train(TASK, 128, tmp_path / "on", trained_agent=tmp_path / "first" / BEST)
+    assert done.model.num_timesteps == 128
+    again = train.train(TASK, 256, tmp_path / "on", resume=True)  # the scaling is the zip's still
+    assert torch.equal(
+        again.model.policy.state_dict()["features_extractor.mean"], other["features_extractor.mean"]
+    )
+
+
+@pytest.mark.parametrize("normalised", [True, False])
+def test_a_zip_from_elsewhere_acts_as_it_did(normalised: bool, tmp_path: Path) -> None:
+    acts = foreign(tmp_path / "model.zip", normalised)
+    model = begun(tmp_path, tmp_path / "model.zip", trust=True)
+    x = observations()
+    assert np.ptp(acts(x)) > 1e-4
+    if normalised:  # what hardly varied in training is not read, as in an export
+        scale = model.policy.state_dict()["features_extractor.scale"].numpy()
+        x[:, scale == 0.0] = model.policy.state_dict()["features_extractor.mean"].numpy()[
+            scale == 0.0
+        ]
+    assert model.predict(x, deterministic=True)[0] == pytest.approx(acts(x), abs=1e-6)
+
+
+def test_what_no_training_can_begin_with_is_refused(tmp_path: Path) -> None:
+    foreign(tmp_path / "model.zip", True)
+    zipped = tmp_path / "model.zip"
+    for arguments, kind, said in (
+        ((zipped,), PermissionError, "vecnormalize.pkl is a pickle.*--trust"),
+        ((tmp_path / "none.zip",), FileNotFoundError, "none.zip: no such file"),
+        ((tmp_path / "vecnormalize.pkl",), ValueError, "is no zip, or is cut short"),
+    ):
+        with pytest.raises(kind, match=said):
+            train.train(TASK, 128, tmp_path / "new", trained_agent=arguments[0])
+    assert not (tmp_path / "new" / train.CHECKPOINT).exists()
+    with pytest.raises(ValueError, match="from its checkpoint or from a zip, not from both"):
+        train.train(TASK, 128, tmp_path / "new", resume=True, trained_agent=zipped)
+    (tmp_path / "vecnormalize.pkl").unlink()
+    foreign(zipped, False, policy_kwargs={"net_arch": [8]})
+    with pytest.raises(ValueError, match="holds other networks than this training's PPO"):
+        train.train(TASK, 128, tmp_path / "new", trained_agent=zipped)
+    SAC("MlpPolicy", make_vec_env(TASK.env_id, 1), buffer_size=10, device="cpu").save(zipped)
+    with pytest.raises(ValueError, match="holds other networks than this training's PPO"):
+        train.train(TASK, 128, tmp_path / "new", trained_agent=zipped)

@@ -1,0 +1,34 @@
+"""rl-baselines3-zoo trains with the package's settings, and its zip goes on here."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("rl_zoo3")
+from sideslip.agents.training.algorithms import ALGORITHMS, HYPERPARAMS
+from sideslip.agents.training.train import Task, train
+
+FEW = {"n_envs": 4, "n_steps": 16, "batch_size": 32, "learning_starts": 32, "buffer_size": 1000}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("algo", ALGORITHMS)
+def test_the_zoo_takes_our_settings_and_we_its_zip(algo: str, tmp_path: Path) -> None:
+    zoo = ALGORITHMS[algo].zoo
+    settings = Task(algo=algo).settings
+    few = [f"{name}:{value}" for name, value in FEW.items() if name in settings]
+    command = [
+        *(sys.executable, "-m", "rl_zoo3.train", "--algo", zoo, "--env", "sideslip/YawVision-v0"),
+        *("--gym-packages", "sideslip", "--conf-file", str(HYPERPARAMS / f"{zoo}.yml")),
+        *("-n", "256", "--seed", "0", "--eval-freq", "-1", "-f", str(tmp_path), "--device", "cpu"),
+        *("-params", *few),
+    ]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-2000:]
+    (zipped,) = (tmp_path / zoo / "sideslip-YawVision-v0_1").glob("sideslip*.zip")
+    task = Task(algo=algo, num_envs=4, n_eval_envs=4)
+    train(task, 64, tmp_path / "on", trained_agent=zipped, trust=True)

@@ -1,0 +1,54 @@
+"""Trainings over nominal's cost on the same seeds; what cannot be compared is refused."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+pytest.importorskip("stable_baselines3")
+from sideslip.agents.rollout import costs_of
+from sideslip.agents.rungs import make_rung
+from sideslip.agents.training import keeper
+from sideslip.agents.training.train import CURVE, Means, Task, train
+from sideslip.benchmarks.curves import table_of
+
+SHORT: dict[str, Any] = {"scenario": {"base": "random-steering", "duration": 0.5}}
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Of a training of two rollouts."""
+    monkeypatch.setattr(keeper, "_MEASURED", 8)
+    task = Task(env_options=SHORT, num_envs=8, n_eval_envs=8)
+    train(task, 512, tmp_path / "a", means=Means(eval_freq=256))
+    return tmp_path / "a"
+
+
+def test_a_training_stands_over_nominal_by_cpu_seconds(folder: Path) -> None:
+    lines = [json.loads(line) for line in (folder / CURVE).read_text().splitlines()]
+    env, agent = make_rung("nominal", "sideslip/YawVision-v0", 8, **SHORT)
+    nominal = costs_of(env, agent, [2**64 + i for i in range(8)]).mean()
+    table = table_of([folder])
+    spent, ratios = (list(column.cells) for column in table.columns)
+    assert len(spent) == 8 and spent[-1] == f"{lines[-1]['cpu_seconds']:.0f}"
+    assert ratios[-1] == f"{min(line['cost'] for line in lines) / nominal:.2f}"
+    assert ratios[0] in ("", f"{lines[0]['cost'] / nominal:.2f}")
+    console = Console(width=200)
+    with console.capture() as shown:
+        console.print(table)
+    assert str(folder) in shown.get()
+
+
+def test_what_cannot_be_compared_is_refused(folder: Path, tmp_path: Path) -> None:
+    other = tmp_path / "b"
+    train(Task(num_envs=8, n_eval_envs=4, env_options=SHORT), 256, other)
+    with pytest.raises(ValueError, match="evaluated on different tasks"):
+        table_of([folder, other])
+    mixture = Task(num_envs=8, n_eval_envs=4, scenarios=[SHORT["scenario"]])
+    train(mixture, 256, tmp_path / "c")
+    with pytest.raises(ValueError, match="designed for one scenario"):
+        table_of([tmp_path / "c"])
+    with pytest.raises(FileNotFoundError, match="holds no training"):
+        table_of([tmp_path])
