@@ -11,20 +11,19 @@ from gymnasium.error import ResetNeeded
 
 from .arguments import action_of
 from .backend.decorators import entry_of
-from .engine.arrays import Row
+from .engine.arrays import Packed
 from .engine.config import EnvConfig
-from .engine.layout import FLAGS, PARAMS_WIDTH, STATE_WIDTH, Z
+from .engine.layout import PARAMS_WIDTH, Z
 from .engine.reset import reset_vehicle
-from .engine.step import step_vehicle
+from .engine.step import step_packed
 from .engine.views import motion_in, record_in, slow_in, true_states_in, vehicle_in
-from .engine.window import window_of
-from .record import FAST_WIDTH, PACKET_WIDTH, Array, Record
+from .record import Array, Record
 from .rendering.drawn import DrawnOne, Numbers
 from .scenarios.manoeuvres import ScenarioSource, scenario_from
 from .scenarios.scenario import Scenario
 from .sensors.link import SlowSensor
 from .task.failures import REFUSED, RUNNING
-from .task.info import REPORT, info_of
+from .task.info import info_of
 from .task.observation import Entry
 from .ticks import TICK
 from .vehicle.dynamics import Motion
@@ -32,11 +31,12 @@ from .vehicle.vehicle import Vehicle
 from .vehicle.vehicles import VehicleSource, vehicle_from
 from .vision import Seeing
 
-_FLOAT32 = np.dtype(np.float32)
-_STEP: list[Any] = []  # `step_vehicle` for the types of an env's arrays, once one has stepped
+_STEP: list[Any] = []  # `step_packed` for the types of an env's arrays, once one has stepped
 
 
-class StabilityEnv(Seeing, DrawnOne, gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
+class StabilityEnv(
+    Packed, Seeing, DrawnOne, gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]
+):
     """Keep a car's sideslip angle where it should be, by two motors and, if asked, by steering.
 
     ## Action
@@ -95,6 +95,8 @@ class StabilityEnv(Seeing, DrawnOne, gym.Env[npt.NDArray[np.float32], npt.NDArra
     the action may steer too. vision, delay, appearance: as of `Seeing`. render_mode: of `Drawn`.
     """
 
+    config: EnvConfig
+
     def __init__(
         self,
         sensors: str = "vision",
@@ -125,19 +127,13 @@ class StabilityEnv(Seeing, DrawnOne, gym.Env[npt.NDArray[np.float32], npt.NDArra
         self._see_in(vision, delay, appearance)
 
         self.layout: tuple[Entry, ...] = self.config.layout
-        self._bounds = self.config.bounds
-        low, high = self._bounds.astype(np.float32)
+        low, high = self.config.bounds.astype(np.float32)
         self.observation_space = gym.spaces.Box(low, high, dtype=np.float32)
-        self._entries, self._width = len(self.layout), self.config.action_width
+        self._width = self.config.action_width
         self._fails = on_bad_action == "fail"
         self.action_space = gym.spaces.Box(-1.0, 1.0, (self._width,), np.float32)
-        self._params, self._state = np.zeros(PARAMS_WIDTH), np.zeros(STATE_WIDTH)
-        self._switches = np.zeros(len(FLAGS), np.int64)
-        self._window = window_of(self.control_period)
-        self.rows = np.zeros((self.control_period, FAST_WIDTH))
-        self.packets = np.zeros((self.config.most_packets, PACKET_WIDTH))
-        self._report = np.zeros(len(REPORT))
-        self.ticks_done = self.delivered = 0  # rows and packets of the newest record
+        self._make_room(PARAMS_WIDTH)
+        self.ticks_done = 0  # rows of the newest record
         # the record as it stood before the newest reset: a vector env resets within a step
         self.final_rows, self.final_packets = self.rows.copy(), self.packets.copy()
         self.final_ticks_done, self.final_delivered, self._over = 0, 0, True
@@ -150,21 +146,19 @@ class StabilityEnv(Seeing, DrawnOne, gym.Env[npt.NDArray[np.float32], npt.NDArra
         super().reset(seed=seed)  # refused options leave everything as it was
         self._now = config
         key = int(self.np_random.integers(0, 2**64, dtype=np.uint64))
-        obs = np.empty(len(self.layout), np.float32)
-        self.rows, self.final_rows = self.final_rows, self.rows
-        self.packets, self.final_packets = self.final_packets, self.packets
+        self.final_rows[:], self.final_packets[:] = self.rows, self.packets
         self.final_ticks_done, self.final_delivered = self.ticks_done, self.delivered
-        self._params = np.zeros(len(config.start.params))  # behind which a trace may be
-        reset_vehicle(config.start, key & 0xFFFFFFFF, key >> 32, self._bounds, self._row(obs))
+        self._make_room(len(config.start.params))
+        reset_vehicle(config.start, key & 0xFFFFFFFF, key >> 32, self._bounds, self._row)
         self._over = False
         self._begin()
         self.ticks_done, self.annotations = 1, {}
-        info, self.delivered = info_of(self._report)
+        info = info_of(self._told())
         if self.eye is not None:
             info |= self.eye.marks
         if self._traces:
             self._seen()
-        return obs, info
+        return self._observation(), info
 
     def step(
         self, action: npt.ArrayLike
@@ -173,41 +167,31 @@ class StabilityEnv(Seeing, DrawnOne, gym.Env[npt.NDArray[np.float32], npt.NDArra
         if self._over:
             raise ResetNeeded("the episode is over or was never started: call reset() first")
         force = action_of(action, self._width, self._fails)
-        obs = np.empty(self._entries, _FLOAT32)
         eye = self.eye
         before = None if eye is None else self._state.copy()
-        done = self._advance(force, obs)
+        done = self._advance(force)
         if done <= 0:
             if done == REFUSED:
                 raise ValueError(f"action {force.tolist()} is not finite; nothing was stepped")
-            obs = np.zeros_like(obs)
+            self._obs[:] = 0.0
         elif eye is not None:
-            eye.look(before, self._row(obs), done, self._bounds, self._window)
+            eye.look(before, self._row, done, self._bounds, self._window)
         self.ticks_done = done
-        info, self.delivered = info_of(self._report)
+        info = info_of(self._told())
         if eye is not None:
             info |= eye.marks
         terminated, truncated = info["failure"] != RUNNING, info["is_success"]
         self._over = terminated or truncated
         if self._traces:
             self._seen()
-        return obs, -info["cost"], terminated, truncated, info
+        return self._observation(), -info["cost"], terminated, truncated, info
 
-    def _advance(self, force: npt.NDArray[np.float32], obs: npt.NDArray[np.float32]) -> int:
+    def _advance(self, force: npt.NDArray[np.float32]) -> int:
         """One control period; what `step_vehicle` returns."""
-        arguments = (
-            self._params, self._state, self._switches, obs, self.rows, self.packets, self._report,
-            force, self.control_period, self._bounds, self._window,
-        )  # fmt: skip
         if not _STEP:
-            _STEP.append(entry_of(step_vehicle, *arguments))
-        done: int = _STEP[0](*arguments)
+            _STEP.append(entry_of(step_packed, self._work, force))
+        done: int = _STEP[0](self._work, force)
         return done
-
-    def _row(self, obs: npt.NDArray[np.float32]) -> Row:
-        """The arrays of this episode."""
-        record = self.rows, self.packets, self._report
-        return Row(self._params, self._state, self._switches, obs, *record)
 
     @property
     def record(self) -> Record:
@@ -275,7 +259,7 @@ class StabilityEnv(Seeing, DrawnOne, gym.Env[npt.NDArray[np.float32], npt.NDArra
             "rows": self.rows.copy(),
             "packets": self.packets.copy(),
             "report": self._report.copy(),
-            "progress": (self.ticks_done, self.delivered, self._over),
+            "progress": (self.ticks_done, self._over),
             "rng": copy.deepcopy(self.np_random),
         }
 
@@ -287,12 +271,13 @@ class StabilityEnv(Seeing, DrawnOne, gym.Env[npt.NDArray[np.float32], npt.NDArra
             )
         if snapshot["layout"] != self.layout:
             raise ValueError("the snapshot is of an env with other sensors or another observation")
-        self._params = np.array(snapshot["params"], np.float64)
+        self._make_room(len(snapshot["params"]))
+        self._params[:] = snapshot["params"]
         self._state[:] = snapshot["state"]
         self._switches[:] = snapshot["switches"]
         self._now = snapshot["config"]
         self.rows[:] = snapshot["rows"]
         self.packets[:] = snapshot["packets"]
         self._report[:] = snapshot["report"]
-        self.ticks_done, self.delivered, self._over = snapshot["progress"]
+        self.ticks_done, self._over = snapshot["progress"]
         self.np_random = copy.deepcopy(snapshot["rng"])

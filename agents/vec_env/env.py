@@ -122,7 +122,7 @@ class NativeVecEnv(VecEnv):
         """Remember the infos that the resets of these rows returned."""
         more = {key: each for key, each in infos.items() if "final_" not in key}
         for i, info in zip(rows, _rows_of(more, rows), strict=True):
-            self.reset_infos[i] = info_of(self._base.reports[i])[0] | info
+            self.reset_infos[i] = info_of(self._base.reports[i].tolist()) | info
 
     def get_images(self) -> Sequence[npt.NDArray[np.uint8] | None]:
         """A frame of each row, of render_mode="rgb_array"."""

@@ -90,7 +90,7 @@ class Row:
         more = {name: [value] * len(mask) for name, value in (options or {}).items()}
         obs, _ = self._env.reset(seed=seeds, options={**more, "reset_mask": mask})
         base: Any = self._env.unwrapped
-        return obs[self._i], info_of(base.reports[self._i])[0]
+        return obs[self._i], info_of(base.reports[self._i].tolist())
 
     def is_wrapped(self, wrapper_class: type) -> bool:
         """Whether one of the layers is of this class, or the twin of this single wrapper."""

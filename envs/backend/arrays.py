@@ -10,11 +10,12 @@ and stores.
 
 from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 
+import numpy as np
 from llvmlite import ir
 from numba.core import cgutils, types
 from numba.core.imputils import lower_builtin
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
-from numba.np.arrayobj import load_item, make_array, store_item
+from numba.np.arrayobj import load_item, make_array, populate_array, store_item
 
 from .simd import FLOATS, INTS, LANES, splat
 
@@ -72,6 +73,31 @@ def at(array: Any, *index: int) -> Any:
 def put(array: Any, value: Any, *index: int) -> None:
     """Write a number."""
     array[index] = value
+
+
+def matrix(array: Any, first: int, rows: int, columns: int) -> Any:
+    """The numbers of a vector from `first` on as a matrix, without a copy."""
+    return array[first : first + rows * columns].reshape(rows, columns)
+
+
+def integers(array: Any, first: int, count: int) -> Any:
+    """The place of so many numbers of a vector from `first` on as int64, without a copy."""
+    return array[first : first + count].view(np.int64)
+
+
+def singles(array: Any, first: int, count: int) -> Any:
+    """The same as float32, two to a number."""
+    return array[first : first - (-count // 2)].view(np.float32)[:count]
+
+
+def abreast(array: Any) -> int:
+    """How many columns of a matrix `along` reads at once; one where they are lanes already."""
+    return 1
+
+
+def along(array: Any, where: T, first: int) -> T:
+    """`read` of a matrix's columns from `first` on, in lanes."""
+    return read(array, where, first)
 
 
 def lane_count() -> int:
@@ -194,6 +220,62 @@ def _lower_write(context, builder, sig, args):
     for k, (i, value) in enumerate(zip(places, values, strict=True)):
         _write(context, builder, kind, args[0], [i, *args[3:]], value, of[k])
     return context.get_dummy_value()
+
+
+def _teach_view(primitive: Any, of: Any) -> None:
+    """Teach the compiler a view of a vector's numbers, of a kind and a shape."""
+    axes = primitive.__code__.co_argcount - 2
+    kind = types.Array(of, axes, "C")
+
+    @infer_global(primitive)
+    class _Typing(AbstractTemplate):
+        def generic(self, args, kws):
+            vector = types.Array(types.float64, 1, "C")
+            return signature(kind, vector, *whole(args[1:])) if args[0] == vector else None
+
+    def lower(context, builder, sig, args):
+        size = context.get_constant(types.intp, of.bitwidth // 8)
+        made = make_array(kind)(context, builder)
+        pointer = builder.bitcast(
+            place(context, builder, sig.args[0], args[0], [args[1]]), made.data.type
+        )
+        strides = [builder.mul(size, each) for each in args[3:]] + [size]
+        populate_array(made, pointer, args[2:], strides, size, None)
+        return made._getvalue()
+
+    lower_builtin(primitive, types.Array, *[types.Integer] * (axes + 1))(lower)
+
+
+_teach_view(matrix, types.float64)
+_teach_view(integers, types.int64)
+_teach_view(singles, types.float32)
+
+
+@infer_global(abreast)
+class _Abreast(AbstractTemplate):
+    def generic(self, args, kws):
+        return signature(types.intp, *args)
+
+
+@lower_builtin(abreast, types.Array)
+def _lower_abreast(context, builder, sig, args):
+    return context.get_constant(types.intp, LANES if sig.args[0].ndim == 2 else 1)
+
+
+@infer_global(along)
+class _Along(AbstractTemplate):
+    def generic(self, args, kws):
+        made = types.BaseTuple.from_types([FLOATS] * len(args[1]), args[1].instance_class)
+        return signature(made, *args[:2], types.intp)
+
+
+@lower_builtin(along, types.Array, types.BaseTuple, types.Integer)
+def _lower_along(context, builder, sig, args):
+    places = [[i, args[2]] for i in cgutils.unpack_tuple(builder, args[1])]
+    firsts = [place(context, builder, sig.args[0], args[0], index) for index in places]
+    lanes = [builder.bitcast(first, FLOATS.value.as_pointer()) for first in firsts]
+    entries = [builder.load(each, align=8) for each in lanes]
+    return context.make_tuple(builder, sig.return_type, entries)
 
 
 @infer_global(lane_count)

@@ -92,6 +92,8 @@ def _table(real: Any) -> dict[str, Callable[..., Any]]:
         "word": lambda a: int(a),
         "from_word": lambda a: real(a),
         "anywhere": lambda condition: condition,
+        "abreast": lambda array: 1,
+        "along": lambda array, where, first: read(array, where, first),
         "lane_count": lambda: 1,
         "ramp": lambda first: first,
     }

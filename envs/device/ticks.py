@@ -13,6 +13,7 @@ from ..backend.random import CHANNELS, normals
 from ..engine.layout import Drive, P
 from ..engine.step import fixed_of
 from ..engine.tick import Kind, Moving, advance, changed
+from ..engine.window import judge
 from ..record import FAST_WIDTH
 from ..scenarios.roads import Lead
 from ..scenarios.steering import steering_at
@@ -61,6 +62,7 @@ class Ticks:
         self._normals, self._steering_at = on_tensors(dtype, normals, steering_at)
         self._fixed, self._advance, self._changed = on_tensors(dtype, fixed_of, advance, changed)
         self._failure_of, self._select = on_tensors(dtype, failure_of, select)
+        (self._judge,) = on_tensors(dtype, judge)
         self._dtype = dtype
         self.tick: Any = compiled(self._tick) if compile else self._tick
         self.foresee: Any = compiled(self._foresee) if compile else self._foresee
@@ -102,9 +104,10 @@ class Ticks:
         )
         alive, fit = now.alive, now.alive & ~seen.lost
         tick = now.tick + alive
-        failure = self._failure_of(seen)
+        found = self._judge(after.motion, seen.past, task, fixed.path, self.kind)
+        failure = self._failure_of(seen.lost, found.spun, found.off)
         refs = [pick(seen.lost, 0.0, each) for each in seen.refs]
-        shown = (pick(seen.lost, 0.0, seen.beta), *refs, seen.steer, seen.moment)
+        shown = (pick(seen.lost, 0.0, found.beta), *refs, seen.steer, seen.moment)
 
         def chosen(where: Tensor, new: Any, old: Any) -> Numbers:
             return tuple(pick(where, a, b) for a, b in zip(new, old, strict=True))
@@ -118,7 +121,7 @@ class Ticks:
             chosen(alive, after.lead, now.lead),
             tick,
             pick(alive, failure, now.failure),
-            now.cost + pick(alive, seen.cost * TICK, 0.0),
+            now.cost + pick(alive, found.cost * TICK, 0.0),
             chosen(alive, shown, now.shown),
             chosen(alive, seen.row, now.row),
             chosen(alive, after.motion, now.track),

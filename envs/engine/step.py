@@ -20,14 +20,13 @@ from ..scenarios.steering import DRIVER
 from ..task.cost import rest_of_cost
 from ..task.failures import BAD_ACTION, REFUSED, RUNNING, failure_of
 from ..task.info import REPORT
-from ..ticks import TICK
 from ..vehicle.tyres import shifts
-from .arrays import Row
+from .arrays import Row, parts_of
 from .layout import FLAGS, P, Z
 from .observe import observe_fast, observe_slow, write_report
 from .packets import next_due, sense_slow
 from .tick import Fixed, Kind, Moving, Seen, advance, changed, standing_load
-from .window import WINDOW, chance_at, foresee
+from .window import VERDICT, WINDOW, chance_at, foresee, judged
 
 
 @jit
@@ -91,33 +90,38 @@ def drive_on(
     fails or ends before the others, 0 is returned and z and report are as they were.
     """
     fixed = fixed_of(p)
-    motion, drive, tick = read(z, Z.motion), read(z, Z.drive), at(z, Z.clock.tick)
-    car = changed(fixed.car, fixed.change, tick > fixed.change.tick)
-    load, refs, lead = standing_load(drive, car, kind), read(z, Z.refs), read(z, Z.lead)
-    now = Moving(motion, drive, load, at(z, Z.driver), car, refs, lead)
     task = fixed.task
     N_z, added = share * task.yaw_scale, turn * task.authority
-    cost = 0.0 * N_z
-    for j in range(n):
-        before = now.motion
-        chance, ahead = chance_at(window, j), at(window, WINDOW.ahead, j)
-        now, seen = advance(fixed, N_z, added, now, tick, chance, ahead, kind)
-        tick = tick + 1.0
-        cost = cost + seen.cost * TICK
-        write(rows[j], seen.row, FAST)
-        write(window, now.motion, WINDOW.track, j)
-        failed = anywhere(seen.lost | seen.spun | seen.off)
-        ended = failed | anywhere(tick >= task.duration)
-        if ended or j + 1 == n:
-            if not alone and (failed or j + 1 < n):
-                return 0
-            motion, beta, refs = now.motion, seen.beta, seen.refs
-            if anywhere(seen.lost):  # the last that is fit for `info`
-                motion, beta, refs = before, 0.0 * cost, (0.0 * cost, 0.0 * cost)
-            write(z, motion, Z.motion)
-            write_end(z, report, now, seen, beta, refs, tick, cost, task.duration)
-            return j + 1
-    return 0
+    last = n
+    while True:
+        motion, drive, tick = read(z, Z.motion), read(z, Z.drive), at(z, Z.clock.tick)
+        car = changed(fixed.car, fixed.change, tick > fixed.change.tick)
+        load, refs, lead = standing_load(drive, car, kind), read(z, Z.refs), read(z, Z.lead)
+        now = Moving(motion, drive, load, at(z, Z.driver), car, refs, lead)
+        for j in range(last):
+            before = now.motion
+            chance, ahead = chance_at(window, j), at(window, WINDOW.ahead, j)
+            now, seen = advance(fixed, N_z, added, now, tick, chance, ahead, kind)
+            tick = tick + 1.0
+            write(rows[j], seen.row, FAST)
+            write(window, now.motion, WINDOW.track, j)
+            write(window, seen.past, WINDOW.past, j)
+            lost = anywhere(seen.lost)
+            if lost or anywhere(tick >= task.duration) or j + 1 == last:
+                cost, done, failed = judged(window, j + 1, 0.0 * N_z, fixed, kind)
+                if not alone and (lost or failed or done < n):
+                    return 0
+                last = done
+                if done <= j:  # the car was no longer running: once more, and only so far
+                    break
+                verdict = read(window, VERDICT, j)
+                motion, beta, refs = now.motion, verdict.beta, seen.refs
+                if lost:  # the last that is fit for `info`
+                    motion, beta, refs = before, 0.0 * cost, (0.0 * cost, 0.0 * cost)
+                write(z, motion, Z.motion)
+                failure = failure_of(seen.lost, verdict.spun != 0.0, verdict.off != 0.0)
+                write_end(z, report, now, seen, failure, beta, refs, tick, cost, task.duration)
+                return j + 1
 
 
 @inlined
@@ -126,6 +130,7 @@ def write_end(
     report: Any,
     now: Moving,
     seen: Seen,
+    failure: Any,
     beta: Any,
     refs: Any,
     tick: Any,
@@ -138,7 +143,6 @@ def write_end(
     write(z, refs, Z.refs)
     write(z, now.lead, Z.lead)
     put(z, tick, Z.clock.tick)
-    failure = failure_of(seen)
     put(z, failure, Z.clock.failure)
     rest = rest_of_cost(duration, tick)
     put(report, cost + select(failure != RUNNING, rest, 0.0), REPORT.cost)
@@ -261,3 +265,16 @@ def step_vehicle(
     done = drive_on(p, z, kind, share, turn, n, rows, report, window, True)
     conclude(row, n, done, bounds, window)
     return int(done)
+
+
+@jit
+def step_packed(work: Any, action: Any) -> int:
+    """`step_vehicle` of the episode whose arrays lie in a workspace."""
+    row, bounds, window = parts_of(work)
+    n = len(row.rows)
+    return int(
+        step_vehicle(
+            row.p, row.z, row.switches, row.obs, row.rows, row.packets, row.report, action, n,
+            bounds, window,
+        )
+    )  # fmt: skip

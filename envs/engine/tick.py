@@ -6,23 +6,22 @@ our plant; `command` and `sense`, before and after the motion, serve a plant of 
 
 from typing import Any, NamedTuple
 
-from ..backend.decorators import inlined, jit
-from ..backend.primitives import absolute, anywhere, select
+from ..backend.decorators import inlined
+from ..backend.primitives import anywhere, select
 from ..record import FAST
 from ..scenarios.driver import steered
 from ..scenarios.roads import NOMINAL_PATH, Lead, laid_by
 from ..scenarios.speed import acceleration_command, wanted_motion
-from ..scenarios.tracks import path_offset
 from ..scenarios.wind import wind_at
 from ..sensors.inertial import Chance, fast_row, specific_force
-from ..task.cost import cost_rate
 from ..task.reference import followed, reference
 from ..ticks import TICK
 from ..vehicle.actuators import distribute, lagged, slewed, torque_limit, within_stop, yaw_moment
-from ..vehicle.dynamics import Car, Push, Road, curvature_beside, sideslip_angle
+from ..vehicle.dynamics import Car, Push, Road, curvature_beside
 from ..vehicle.integration import kutta3
 from ..vehicle.tyres import Inputs, load_of
 from .layout import Drive
+from .window import Past
 
 NO_LAG, ONE_LAGS = range(2)  # 2: both lag
 
@@ -97,17 +96,14 @@ class Control(NamedTuple):
 
 
 class Seen(NamedTuple):
-    """Sensors, cost and failures at the end of a tick."""
+    """Sensors at the end of a tick."""
 
     row: Any  # the fast sensors, columns as in `Fast`
-    cost: Any  # per second
-    beta: Any
     refs: Any
     steer: Any  # rad, N m: of `Acted`
     moment: Any
-    lost: Any  # whether the numbers are no longer finite,
-    spun: Any  # the car spins,
-    off: Any  # or has left the road
+    lost: Any  # whether the numbers are no longer finite
+    past: Past
 
 
 @inlined
@@ -119,21 +115,21 @@ def changed(car: Any, change: Any, now: Any) -> Any:
     return Car(*(car[:4] + changed_tyres + car[6:]))
 
 
-@jit
+@inlined
 def standing_load(drive: Any, car: Any, kind: Kind) -> Any:
     """The Load of the actuators as they are now."""
     inputs = Inputs(drive.delta_f, drive.T_l, drive.T_r)
     return load_of(inputs, car, kind.small_angle, kind.shifting)
 
 
-@jit
+@inlined
 def load_at(steer: Any, T_l: Any, T_r: Any, drive: Any, rest: Any, car: Any, kind: Kind) -> Any:
     """The Load at a front angle, `rest` of the motors' deviation from T_l and T_r being left."""
     inputs = Inputs(steer, lagged(T_l, drive.T_l, rest), lagged(T_r, drive.T_r, rest))
     return load_of(inputs, car, kind.small_angle, kind.shifting)
 
 
-@jit
+@inlined
 def torques(
     N_z: Any, tick: Any, v_x: Any, integral: Any, pace: Any, car: Any, yaw_first: Any
 ) -> Any:
@@ -241,30 +237,22 @@ def sense(
     task = fixed.task
     row = fast_row(motion, accel, acted, fixed.car.d_f, fixed.noise, chance)
     v = 0.5 * (row[FAST.wheel_left] + row[FAST.wheel_right])
-    beta = sideslip_angle(motion.v_x, motion.v_y, kind.small_angle)
+    driver = ahead
     if kind.follows:
         driver = steered(
             acted.driver, motion, fixed.path, fixed.road, fixed.target, fixed.person, task.stop
         )
-        aside = motion.y - path_offset(fixed.path, motion.s)
-    else:
-        driver = ahead
-        aside = motion.y - 0.0
     steady = reference(driver, v, fixed.target, kind.reference)
     refs = followed(before, steady, fixed.target, kind.reference)
-    e_beta, e_gamma = beta - refs[0], motion.gamma - refs[1]
     size = motion.v_x * motion.v_x + motion.v_y * motion.v_y + motion.gamma * motion.gamma
     finite = size + motion.psi + motion.Y + motion.phi  # squares: the references take them too
     seen = Seen(
         row,
-        cost_rate(e_beta, e_gamma, acted.effort, acted.added, kind.reference),
-        beta,
         refs,
         acted.steer,
         acted.moment,
         finite - finite != 0.0,
-        (absolute(beta) > task.spin) & (motion.v_x > 0.0),  # backing up is no spin
-        absolute(aside) > task.half_width,
+        Past(refs[0], refs[1], acted.effort, acted.added),
     )
     return driver, seen
 

@@ -8,34 +8,65 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
-from ..backend.arrays import at, lane_count, offsets, put, ramp, read, write
-from ..backend.decorators import jit
-from ..backend.primitives import anywhere, to_float, whole, word
+from ..backend.arrays import abreast, along, at, lane_count, offsets, put, ramp, read, write
+from ..backend.decorators import inlined, jit
+from ..backend.primitives import absolute, anywhere, select, to_float, whole, word
 from ..backend.random import CHANNELS, normals
 from ..backend.simd import LANES
 from ..record import Array
 from ..scenarios.steering import WANDER_AT, steering_at, trace_at
+from ..scenarios.tracks import path_offset
 from ..sensors.inertial import Chance
-from ..vehicle.dynamics import Motion
+from ..task.cost import cost_rate
+from ..ticks import TICK
+from ..vehicle.dynamics import Motion, sideslip_angle
 from .layout import PARAMS_WIDTH, P, Z
 
 
+class Past(NamedTuple):
+    """What is judged of a tick besides the motion that it led to."""
+
+    beta_ref: Any
+    gamma_ref: Any
+    effort: Any  # of `Acted`
+    added: Any
+
+
+class Verdict(NamedTuple):
+    """Cost and failures of a tick."""
+
+    cost: Any  # per second
+    beta: Any
+    spun: Any  # whether the car spins
+    off: Any  # or has left the road
+
+
 class Window(NamedTuple):
-    """Rows of the array: normal numbers, the programme's angle in rad, Motion at the tick's end."""
+    """Rows of the array: normal numbers, the programme's angle in rad, Motion at the tick's end and
+    what is to be judged of it."""
 
     inertial: Annotated[tuple[Any, ...], 4]
     wheels: Annotated[tuple[Any, ...], 4]
     ahead: Any
     track: Motion
+    past: Past
 
 
-WINDOW, _HEIGHT = offsets(Window)
+WINDOW, HEIGHT = offsets(Window)
+VERDICT = Verdict(*WINDOW.past)
+"""The rows in which a tick's Verdict stands once there is one, flags as 0 and 1."""
 _KEEP, _FRESH, _HOLD = P.programme[WANDER_AT : WANDER_AT + 3]
 
 
+@jit
+def columns_of(n: int) -> int:
+    """The columns for n ticks a step: whole lanes."""
+    return -(-n // LANES) * LANES
+
+
 def window_of(n: int, *lanes: int) -> Array:
-    """The array for n ticks a step, whose columns are whole lanes."""
-    return np.zeros((_HEIGHT, -(-n // LANES) * LANES, *lanes))
+    """The array for n ticks a step."""
+    return np.zeros((HEIGHT, columns_of(n), *lanes))
 
 
 @jit
@@ -110,3 +141,40 @@ def foresee_lanes(p: Any, z: Any, n: int, follows: int, window: Any) -> None:
 def chance_at(window: Any, j: int) -> Chance:
     """The random numbers of a tick of the step."""
     return Chance(read(window, WINDOW.inertial, j), read(window, WINDOW.wheels, j))
+
+
+@inlined
+def judge(motion: Any, past: Past, task: Any, path: Any, kind: Any) -> Verdict:
+    """The Verdict on a tick that led to a motion.
+
+    No tick of the plant waits for it: that of all of a step's follows at once.
+    """
+    beta = sideslip_angle(motion.v_x, motion.v_y, kind.small_angle)
+    e_beta, e_gamma = beta - past.beta_ref, motion.gamma - past.gamma_ref
+    aside = motion.y - (path_offset(path, motion.s) if kind.follows else 0.0)
+    return Verdict(
+        cost_rate(e_beta, e_gamma, past.effort, past.added, kind.reference),
+        beta,
+        (absolute(beta) > task.spin) & (motion.v_x > 0.0),  # backing up is no spin
+        absolute(aside) > task.half_width,
+    )
+
+
+@jit
+def judged(window: Any, n: int, cost: Any, fixed: Any, kind: Any) -> tuple[Any, int, bool]:
+    """(cost, ticks, whether the last of them is a failure) of a step's n ticks, up to one at which
+    a car spins or has left the road. cost: 0, of one car or of those of a block.
+
+    Verdicts take the place of what they are on.
+    """
+    for j in range(0, n, abreast(window)):
+        motion, past = along(window, WINDOW.track, j), along(window, WINDOW.past, j)
+        found = judge(motion, past, fixed.task, fixed.path, kind)
+        spun, off = select(found.spun, 1.0, 0.0), select(found.off, 1.0, 0.0)
+        write(window, (found.cost, found.beta, spun, off), WINDOW.past, j)
+    for j in range(n):
+        found = read(window, VERDICT, j)
+        cost = cost + found.cost * TICK
+        if anywhere(found.spun + found.off != 0.0):
+            return cost, j + 1, True
+    return cost, n, False

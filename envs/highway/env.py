@@ -117,7 +117,7 @@ class HighwayEnv(StabilityEnv):
             p[list(P.path)] = self._around.path
         super()._begin()
 
-    def _advance(self, force: npt.NDArray[np.float32], obs: npt.NDArray[np.float32]) -> int:
+    def _advance(self, force: npt.NDArray[np.float32]) -> int:
         """One control period of our car on the lane as it is here, then the road's steps in it."""
         around, p, z = self._around, self._params, self._state
         assert around is not None
@@ -125,7 +125,7 @@ class HighwayEnv(StabilityEnv):
         z[Z.motion.y], z[Z.motion.theta] = here.y, here.theta
         p[P.road.curvature] = here.curvature
         first = int(z[Z.clock.tick])
-        done = super()._advance(force, obs)
+        done = super()._advance(force)
         running = done > 0 and self._report[REPORT.failure] == RUNNING
         for tick in range(first + 1, first + done + 1) if running else ():
             if tick % PERIOD == 0:

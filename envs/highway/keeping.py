@@ -182,13 +182,13 @@ class KeepingEnv(PlantEnv):
     def _begin(self) -> None:
         self.plant.start(int(self._state[Z.clock.key_low]))
 
-    def _advance(self, force: npt.NDArray[np.float32], obs: npt.NDArray[np.float32]) -> int:
+    def _advance(self, force: npt.NDArray[np.float32]) -> int:
         """A control period on the lane as it is here, which camera and record then see."""
         plant, z = self.plant, self._state
         plant.project()
         self._params[P.road.curvature] = plant.curvature
         z[Z.motion.y], z[Z.motion.theta] = plant.y, plant.theta
-        return super()._advance(force, obs)
+        return super()._advance(force)
 
     @property
     def truth(self) -> tuple[float, ...]:

@@ -12,16 +12,18 @@ from ..backend.decorators import plain
 from ..engine.layout import P, Z
 from ..engine.step import conclude, fixed_of, kind_of, shares_of, write_end
 from ..engine.tick import Fixed, Kind, Moving, command, sense
-from ..engine.window import WINDOW, chance_at, foresee
+from ..engine.window import WINDOW, chance_at, foresee, judge
 from ..record import FAST
 from ..scenarios.manoeuvres import ScenarioSource, scenario_from
 from ..stability import StabilityEnv
+from ..task.failures import RUNNING, failure_of
 from ..ticks import TICK
 from .checks import check_options, check_scenario
 from .plants import OUTSIDE_PLANTS, Acting, OutsidePlant, Plant, outside_vehicle
 
 _fixed_of, _kind_of, _write_end = plain(fixed_of), plain(kind_of), plain(write_end)
-_command, _sense = plain(command), plain(sense)
+_command, _sense, _judge = plain(command), plain(sense), plain(judge)
+_failure_of = plain(failure_of)
 
 
 class PlantEnv(StabilityEnv):
@@ -31,16 +33,16 @@ class PlantEnv(StabilityEnv):
     _our_tyres = False
     plant: Plant
 
-    def _advance(self, force: npt.NDArray[np.float32], obs: npt.NDArray[np.float32]) -> int:
+    def _advance(self, force: npt.NDArray[np.float32]) -> int:
         """One control period of the outside plant: `step_vehicle` with another motion."""
         share, turn = shares_of(force)
         if share != share:
-            return super()._advance(force, obs)  # refuses or fails before it moves anything
+            return super()._advance(force)  # refuses or fails before it moves anything
         p, z, n = self._params, self._state, self.control_period
         kind = _kind_of(p, self._switches)
         foresee(p, z, n, kind.follows, self._window)
         done = self._drive_on(_fixed_of(p), kind, share, turn)
-        conclude(self._row(obs), n, done, self._bounds, self._window)
+        conclude(self._row, n, done, self._bounds, self._window)
         return done
 
     def _drive_on(self, fixed: Fixed, kind: Kind, share: float, turn: float) -> int:
@@ -49,7 +51,7 @@ class PlantEnv(StabilityEnv):
         motion, drive, refs = read(z, Z.motion), read(z, Z.drive), read(z, Z.refs)
         lead = read(z, Z.lead)
         now = Moving(motion, drive, None, float(z[Z.driver]), fixed.car, refs, lead)
-        tick, cost, done, over = float(z[Z.clock.tick]), 0.0, 0, False
+        tick, cost, done, over, failure = float(z[Z.clock.tick]), 0.0, 0, False, 0.0
         N_z, added = share * task.yaw_scale, turn * task.authority
         while not over:
             chance = chance_at(self._window, done)
@@ -67,11 +69,14 @@ class PlantEnv(StabilityEnv):
             now = Moving(motion, control.drive, None, driver, now.car, seen.refs, lead)
             write(self.rows[done], seen.row, FAST)
             write(self._window, motion, WINDOW.track, done)
-            tick, cost, done = tick + 1.0, cost + seen.cost * TICK, done + 1
-            failed = seen.lost or seen.spun or seen.off
-            over = failed or tick >= task.duration or done == self.control_period
+            found = _judge(motion, seen.past, task, fixed.path, kind)
+            tick, cost, done = tick + 1.0, cost + found.cost * TICK, done + 1
+            failure = _failure_of(seen.lost, found.spun, found.off)
+            over = failure != RUNNING or tick >= task.duration or done == self.control_period
         write(z, now.motion, Z.motion)
-        _write_end(z, self._report, now, seen, seen.beta, seen.refs, tick, cost, task.duration)
+        _write_end(
+            z, self._report, now, seen, failure, found.beta, seen.refs, tick, cost, task.duration
+        )
         return done
 
 

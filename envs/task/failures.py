@@ -11,7 +11,8 @@ REFUSED = -1
 
 
 @jit
-def failure_of(seen: Any) -> Any:
-    """The failure's code, as a float, from what is `lost`, `spun` or `off` (`engine.tick.Seen`)."""
-    failure = select(seen.spun, SPIN * 1.0, select(seen.off, OFF_ROAD * 1.0, RUNNING * 1.0))
-    return select(seen.lost, NOT_FINITE * 1.0, failure)
+def failure_of(lost: Any, spun: Any, off: Any) -> Any:
+    """The failure's code, as a float: whether the numbers are no longer finite, the car spins or
+    has left the road."""
+    failure = select(spun, SPIN * 1.0, select(off, OFF_ROAD * 1.0, RUNNING * 1.0))
+    return select(lost, NOT_FINITE * 1.0, failure)

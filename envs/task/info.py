@@ -31,29 +31,22 @@ REPORT = Report()
 
 _NUMBERS = REPORT._fields[: REPORT.failure]  # of `info`; `failure` and `is_success` follow
 _KEYS = (*_NUMBERS, "failure", "is_success")
+_RUNNING: dict[str, Any] = dict.fromkeys(_NUMBERS, 0.0) | {"failure": RUNNING, "is_success": False}
 _MASKS = tuple(f"_{key}" for key in _KEYS)
 
 
-def info_of(report: Array) -> tuple[dict[str, Any], int]:
-    """`info` of a step or a reset from a report (len(Report),), and how many packets came."""
+def info_of(report: list[float]) -> dict[str, Any]:
+    """`info` of a step or a reset from a report, a number for each column."""
+    info = _RUNNING.copy()  # a copy's keys need no sorting in
     (
-        t, beta, gamma, psi, beta_ref, gamma_ref, steer, yaw_moment, cost,
-        code, delivered, _, ended,
-    ) = report.tolist()  # fmt: skip
-    failure = int(code)
-    return {
-        "t": t,
-        "beta": beta,
-        "gamma": gamma,
-        "psi": psi,
-        "beta_ref": beta_ref,
-        "gamma_ref": gamma_ref,
-        "steer": steer,
-        "yaw_moment": yaw_moment,
-        "cost": cost,
-        "failure": failure,
-        "is_success": ended == 1.0 and failure == RUNNING,
-    }, int(delivered)
+        info["t"], info["beta"], info["gamma"], info["psi"], info["beta_ref"], info["gamma_ref"],
+        info["steer"], info["yaw_moment"], info["cost"], code, _, _, ended,
+    ) = report  # fmt: skip
+    if code != RUNNING:
+        info["failure"] = int(code)
+    elif ended == 1.0:
+        info["is_success"] = True
+    return info
 
 
 def infos_of(reports: Array, rows: npt.NDArray[np.bool_]) -> dict[str, Any]:

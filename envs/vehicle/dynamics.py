@@ -210,7 +210,7 @@ def derivative(
     )  # fmt: skip
 
 
-@jit
+@inlined
 def sideslip_angle(v_x: Any, v_y: Any, small_angle: int) -> Any:
     """beta in rad: atan2(v_y, v_x) above 0.5 m/s, else 0 (the ratio on the small-angle plant)."""
     if small_angle:

@@ -50,7 +50,7 @@ class Load(NamedTuple):
     F_r: Any
 
 
-@jit
+@inlined
 def _squared_capacity(limit: Any, drive: Any) -> Any:
     """The square of the lateral capacity in N of a tyre that also drives: the friction circle, but
     the capacity is never below 5 %."""
@@ -64,7 +64,7 @@ def shifts(small_angle: int, law: int, roll: int) -> int:
     return int(small_angle == 0 and law != LINEAR and roll == 1)
 
 
-@jit
+@inlined
 def _axle_shift(F_l: Any, F_r: Any, rear_l: Any, rear_r: Any, weight: Any, car: Any) -> Any:
     """N by which each rear wheel's load grows, and each front one's falls: F_x h / 2 l.
 
@@ -76,7 +76,7 @@ def _axle_shift(F_l: Any, F_r: Any, rear_l: Any, rear_r: Any, weight: Any, car: 
     return minimum(maximum(shift, -0.9 * weight * car.l_f), 0.9 * weight * car.l_r)
 
 
-@jit
+@inlined
 def load_of(inputs: Any, car: Any, small_angle: int, shifting: int = 0) -> Any:
     """The Load of the Inputs of one instant.
 

@@ -140,5 +140,5 @@ def test_whole_steps(name: str, arguments: dict[str, Any], monkeypatch: pytest.M
 
     compiled = episode()
     monkeypatch.setattr(stability, "reset_vehicle", plain(restart.reset_vehicle))
-    monkeypatch.setattr(stability, "step_vehicle", plain(kernel.step_vehicle))
+    monkeypatch.setattr(stability, "step_packed", plain(kernel.step_packed))
     assert episode() == compiled

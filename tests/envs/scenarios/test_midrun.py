@@ -61,7 +61,7 @@ def test_whole_steps_have_the_same_bits_without_the_compiler(
 
     compiled = episode()
     monkeypatch.setattr(stability, "reset_vehicle", plain(restart.reset_vehicle))
-    monkeypatch.setattr(stability, "step_vehicle", plain(kernel.step_vehicle))
+    monkeypatch.setattr(stability, "step_packed", plain(kernel.step_packed))
     assert episode() == compiled
 
 
