@@ -66,6 +66,11 @@ class Plant:
         """The place of the driver's angle in x."""
         return self.model.purpose.states.index("driver")
 
+    @property
+    def keep(self) -> float:
+        """The share of the driver's angle that is left a period later, on average."""
+        return float(self.model.G[self.driver, self.driver])
+
 
 @dataclass(frozen=True)
 class Optimum:
@@ -94,6 +99,17 @@ class Optimum:
                 closed = model.G - model.H @ L[j : j + 1]
                 X = closed @ known @ closed.T + model.G @ P @ model.G.T + W
         return self.cost + total / len(self.errors)
+
+    def excess(self, read: Array, actions: Array) -> Array:
+        """What actions (N, steps) cost more than the best ones would have, by episode (N,).
+
+        Whoever acts: in expectation his cost less the optimum, and much less scattered. read: what
+        `Lqg` reads in his cars, (N, steps, 5). Actions are those that the motors deliver.
+        """
+        answers = _answers(self.plant, self.gains)
+        answers[0, -1] /= self.plant.keep  # the first angle is seen before it acts
+        wrong = actions + np.einsum("nji,ji->nj", read, answers)
+        return np.asarray(wrong**2 @ self.weights)
 
 
 def plant_of(env: AnyEnv) -> Plant:
@@ -214,6 +230,14 @@ def _errors(env: gym.Env[Any, Any], plant: Plant, seed: int) -> Array:
     return found
 
 
+def _answers(plant: Plant, gains: Array) -> Array:
+    """Gains (..., n) of the state as those (..., 5) of what `Lqg` reads."""
+    names = plant.model.purpose.states
+    found = gains[..., [names.index(name) for name in (*OUTPUTS, "driver")]]
+    found[..., -1] *= plant.keep
+    return found
+
+
 class Lqg(Controller):
     """The best policy of a linear scenario that goes on for ever, on `estimated` of its env.
 
@@ -227,9 +251,7 @@ class Lqg(Controller):
         super().__init__(env)
         plant = plant_of(env)
         self.gains = _regulator(plant)[0][0] if gains is None else gains
-        names = plant.model.purpose.states
-        self._answer = self.gains[[names.index(name) for name in (*OUTPUTS, "driver")]]
-        self._answer[-1] *= plant.model.G[plant.driver, plant.driver]
+        self._answer = _answers(plant, self.gains)
 
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
         action[:, 0] = -inputs @ self._answer

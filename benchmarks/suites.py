@@ -73,6 +73,10 @@ SUITES: dict[str, tuple[str, _Run]] = {
     "unknown": (".unknown.suite", _seeds),
     "control": (".control.suite", _control),
     "learned": (".learned", _learned),
+    "memory": (
+        ".memory.suite",
+        lambda suite, r: suite.run(r.quick, r.episodes, r.jobs, r.console, r.keep),
+    ),
     "papers": (".papers.suite", _seeds),
     "following": (".following", _following),
     "highway": (".highway", _highway),

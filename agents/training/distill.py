@@ -51,20 +51,21 @@ class Round(NamedTuple):
 
 def drive(
     lesson: Lesson,
-    policy: Policy | None,
+    policy: Any,
     seeds: Sequence[int],
     noise: float,
     usual: float = np.inf,
 ) -> Drives:
     """Each seed's first episode, driven by a policy, or by the teacher, shaken, without one.
 
-    usual: the cost by which errors are judged where an episode costs more: one that fails, or is
-    lost, is what there is most to learn from.
+    policy: a `Policy`, anything with stable-baselines3's `predict`, or None. usual: the cost by
+    which errors are judged where an episode costs more: one that fails, or is lost, is what there
+    is most to learn from.
 
     Raises ValueError where the teacher's cars are not those of the student.
     """
     cars, twins, teacher = lesson
-    student = None if policy is None else Learned(cars, policy)
+    student = Learned(cars, policy) if isinstance(policy, Policy) else policy
     rng = np.random.default_rng(seeds[0])
     spread = noise * rng.random((len(seeds), 1))
     obs, _ = cars.reset(seed=list(seeds))

@@ -92,6 +92,7 @@ class Student(nn.Module):
         self.cell = nn.GRU(inputs, course.cells, batch_first=True) if course.cells else None
         sizes = [course.cells or inputs, *course.hidden, width]
         self.dense = nn.ModuleList(nn.Linear(a, b) for a, b in itertools.pairwise(sizes))
+        self.recurrent = bool(course.cells)
 
     def forward(self, z: Any, state: Any = None) -> tuple[Any, Any]:
         """(actions (B, T, m), the next state) of inputs (B, T, k)."""
@@ -132,7 +133,8 @@ def scaling_of(
     return mean, np.where(there & (spread > 1e-9), 1.0 / np.maximum(spread, 1e-9), 0.0)
 
 
-def _normalised(obs: Single, mean: Array, scale: Array) -> Single:
+def normalised(obs: Single, mean: Array, scale: Array) -> Single:
+    """Observations (..., k) as a student reads them."""
     return np.clip((obs - mean.astype(np.float32)) * scale.astype(np.float32), -CLIP, CLIP)
 
 
@@ -162,7 +164,7 @@ class _Episodes:
                 x[row, :length], y[row, :length] = self.drives[i].obs[j], self.drives[i].labels[j]
                 w[row, :length] = self.drives[i].weights[j]
             S = torch.from_numpy(np.stack([self.drives[i].curvature for i, _ in rows]))
-            arrays = (_normalised(x, *self.scaling), y, w)
+            arrays = (normalised(x, *self.scaling), y, w)
             for at in range(0, longest, WINDOW):
                 z, labels, weights = (torch.from_numpy(a[:, at : at + WINDOW]) for a in arrays)
                 yield z, labels, weights, S, at == 0
@@ -176,7 +178,7 @@ class _Steps:
         self.lesson = torch.cat([torch.full((int(t.sum()),), i) for i, t in enumerate(there)])
         self.curvatures = torch.from_numpy(np.stack([each.curvature for each in drives]))
         pairs = list(zip(drives, there, strict=True))
-        self.x = _joined([_normalised(each.obs[t], mean, scale) for each, t in pairs])
+        self.x = _joined([normalised(each.obs[t], mean, scale) for each, t in pairs])
         self.y = _joined([each.labels[t] for each, t in pairs])
         self.w = _joined([each.weights[t] for each, t in pairs])
         self.most = -(-len(self.w) // SAMPLES)
@@ -188,12 +190,20 @@ class _Steps:
 
 
 def fitted(
-    model: Student, drives: Sequence[Drives], mean: Array, scale: Array, course: Course, epochs: int
+    model: nn.Module,
+    drives: Sequence[Drives],
+    mean: Array,
+    scale: Array,
+    course: Course,
+    epochs: int,
 ) -> float:
     """Train a model on drives; the loss of the last epoch. Raises FloatingPointError where it
-    diverges."""
+    diverges.
+
+    model: gives actions and state as a `Student`; `recurrent` says whether steps belong together.
+    """
     optimiser = torch.optim.Adam(model.parameters(), course.learning_rate)
-    batches = (_Episodes if course.cells else _Steps)(drives, mean, scale)
+    batches = (_Episodes if model.recurrent else _Steps)(drives, mean, scale)
     falling = torch.optim.lr_scheduler.LinearLR(optimiser, 1.0, 0.02, epochs * batches.most)
     count = sum(len(each.costs) for each in drives)
     length = sum(int((each.weights > 0.0).sum()) for each in drives) / count

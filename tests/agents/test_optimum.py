@@ -143,3 +143,30 @@ def test_late_rare_and_lost_pictures_cost_more() -> None:
 def test_what_has_no_known_optimum_is_refused(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         plant_of(gym.make(IDS[0], scenario=LINEAR | changes))
+
+
+@pytest.mark.parametrize("env_id", IDS)
+@pytest.mark.parametrize(("share", "noise"), [(0.0, 0.0), (0.5, 0.0), (1.0, 0.2)])
+def test_a_policy_costs_the_weighed_squares_of_its_errors_more(
+    env_id: str, share: float, noise: float
+) -> None:
+    """The performance difference of an LQG problem, against the costs of the same seeds and against
+    what `cost_of` says of a gain; the squares scatter less."""
+    found, env, rng = best(env_id), estimated(gym.make_vec(env_id, 64)), np.random.default_rng(2)
+    names = [entry.name for entry in env.layout]
+    agent, columns = Lqg(env, share * found.gains[0]), [names.index(each) for each in Lqg.needs]
+    obs, _ = env.reset(seed=0)
+    costs, read, actions = np.zeros(64), [], []
+    for _ in range(found.plant.steps):
+        action = agent.predict(obs)[0] + noise * rng.standard_normal((64, 1)).astype(np.float32)
+        read.append(obs[:, columns].astype(float))
+        actions.append(action[:, 0].astype(float))
+        obs, rewards, *_ = env.step(action)
+        costs -= rewards
+    optimal, *_ = drive(env, Lqg(env))
+    excess = found.excess(np.stack(read, 1), np.stack(actions, 1))
+    assert agree(costs - optimal - excess, 0.0)
+    assert excess.mean() > 5.0 * np.std(costs - optimal - excess) / 8.0  # so that it is tested
+    assert excess.std() < 0.8 * (costs - optimal).std() or share == 0.0
+    if not noise:
+        assert agree(excess, found.cost_of(share * found.gains[0]) - found.cost)

@@ -1,0 +1,73 @@
+"""What networks with memory read of a linear env: its observation without what says nothing, and
+with the camera's offset as a rate."""
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from gymnasium.vector import VectorEnv, VectorWrapper
+from gymnasium.vector.utils import batch_space
+
+from ...envs.task.observation import AGE_CAP, Entry, space_of
+
+Single = npt.NDArray[np.float32]
+
+SILENT = ("accel_", "wheel_", "roll_rate", "gps_X", "gps_Y", "gps_speed", "gps_satellites")
+"""Entries of sensors that the linear scenarios drown in noise, or that stand still there."""
+OFFSET, RATE, AGE = "camera_y_l", "camera_y_l_rate", "camera_age"
+LATEST = 1.0  # s, from which on an age is no older
+
+
+class Prepared(VectorWrapper[Any, Any, Any, Any, Any]):
+    """A vector env whose observations networks learn from more easily.
+
+    The lateral offset wanders over metres and is measured to a millimetre, so it becomes its mean
+    rate between the last two pictures, zero until there are two: with the pictures' ages the same
+    information, but for the first one's. Ages end at `LATEST`; entries that begin as in `SILENT`
+    and the references are left out.
+    """
+
+    def __init__(self, env: VectorEnv[Any, Any, Any]) -> None:
+        super().__init__(env)
+        base: Any = env.unwrapped
+        inner = base.layout
+        self._period: float = base.control_period * base.dt
+        left_out = (*SILENT, "beta_ref", "gamma_ref")
+        chosen = [i for i, entry in enumerate(inner) if not entry.name.startswith(left_out)]
+        names = [inner[i].name for i in chosen]
+        self._columns = np.array(chosen)
+        self._ages = [i for i, name in enumerate(names) if name.endswith("_age")]
+        self._offset = names.index(OFFSET) if OFFSET in names else None
+        self._at = names.index(AGE) if AGE in names else None
+        rate = Entry(RATE, "m/s", -100.0, 100.0)
+        self.layout = tuple(rate if inner[i].name == OFFSET else inner[i] for i in chosen)
+        self.single_observation_space = space_of(self.layout)
+        self.observation_space = batch_space(self.single_observation_space, env.num_envs)
+        self._last = np.full((3, env.num_envs), AGE_CAP)  # offset, its rate, age of the picture
+
+    def reset(self, **arguments: Any) -> tuple[Single, dict[str, Any]]:
+        """The inner env's."""
+        obs, infos = self.env.reset(**arguments)
+        return self._read(obs), infos
+
+    def step(self, actions: Any) -> tuple[Single, Any, Any, Any, dict[str, Any]]:
+        """The inner env's."""
+        obs, *rest = self.env.step(actions)
+        return self._read(obs), *rest
+
+    def _read(self, obs: Single) -> Single:
+        x = obs[:, self._columns]
+        if self._offset is not None and self._at is not None:
+            x[:, self._offset] = self._rate(x[:, self._offset], x[:, self._at])
+        x[:, self._ages] = np.minimum(x[:, self._ages], LATEST)
+        return x
+
+    def _rate(self, offset: Single, age: Single) -> Any:
+        before, rate, aged = self._last
+        between = aged + self._period - age  # from the last picture to this one
+        new = between > 0.5 * self._period
+        known = new & (aged < AGE_CAP)
+        rate = np.where(known, (offset - before) / np.where(known, between, 1.0), rate)
+        rate = np.where(age < AGE_CAP, np.where(new & ~known, 0.0, rate), 0.0)
+        self._last = np.stack([offset, rate, age])
+        return rate

@@ -1,0 +1,94 @@
+"""Who is trained and judged in which condition, and what a training may use."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any
+
+import gymnasium as gym
+
+from ...agents.optimum import Optimum, optimum
+
+ID = "sideslip/LinearYawVision-v0"
+PERIOD, STEP = 0.04, 0.01  # s, of pictures and of control
+CONDITIONS: Mapping[str, Mapping[str, Any]] = {
+    "100 ms": {"delays": [0.1]},
+    "300 ms": {"delays": [0.3]},
+    "0 ms": {"delays": [0.0]},
+    "100 ms, half lost": {"delays": [0.1], "loss": 0.5},
+    "300 ms, half lost": {"delays": [0.3], "loss": 0.5},
+}
+"""How late pictures are, and which share never comes."""
+REPEATED, SEEDS = "100 ms", 3
+"""The condition in which everybody trains on so many seeds; elsewhere on one."""
+SCHEDULES = 8  # whose arrivals the optimum is averaged over, where pictures are lost
+FILTER, PPO, ALONE = "lqg", "ppo", 8
+"""The optimum's own policy, as a check, on so many times the episodes; learning from rewards."""
+EPISODES, QUICK_EPISODES = 64, 16
+
+
+@dataclass(frozen=True)
+class Budget:
+    """What a training may use.
+
+    cars: side by side. rounds: of driving and learning. epochs: passes over all drives in a round.
+    ppo: steps of PPO, 0 for none. duration: s, of an episode.
+    """
+
+    cars: int = 64
+    rounds: int = 3
+    epochs: int = 1
+    ppo: int = 500_000
+    duration: float = 10.0
+
+
+QUICK = Budget(cars=32, rounds=2, epochs=1, ppo=0, duration=3.0)
+
+
+@dataclass(frozen=True)
+class Case:
+    """Who, in which condition, trained with which seed and budget; so many episodes judge it."""
+
+    who: str
+    condition: str
+    seed: int
+    budget: Budget
+    episodes: int
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Of the env."""
+        spec = gym.spec(ID).kwargs
+        camera = {"period": PERIOD} | dict(CONDITIONS[self.condition])
+        return {"camera": camera, "scenario": spec["scenario"] | {"duration": self.budget.duration}}
+
+    @property
+    def late(self) -> int:
+        """Steps that a picture is old when it arrives."""
+        return round(float(CONDITIONS[self.condition]["delays"][0]) / STEP)
+
+    @property
+    def best(self) -> Optimum:
+        """The optimum."""
+        return _best(self.condition, self.budget)
+
+
+@cache
+def _best(condition: str, budget: Budget) -> Optimum:
+    options = Case("", condition, 0, budget, 1).options
+    return optimum(gym.make(ID, **options), SCHEDULES if "loss" in options["camera"] else 1)
+
+
+def cases_of(quick: bool, episodes: int | None = None) -> list[Case]:
+    """What a run trains, the repeated seeds last."""
+    from ...agents.training.memories import MEMORIES
+
+    budget, conditions = (QUICK, (REPEATED,)) if quick else (Budget(), tuple(CONDITIONS))
+    count = episodes or (QUICK_EPISODES if quick else EPISODES)
+    who = (FILTER, *MEMORIES)
+    cases = [Case(name, where, 0, budget, count) for where in conditions for name in who]
+    if not quick:
+        cases.append(Case(PPO, REPEATED, 0, budget, count))
+        again = [each for each in cases if each.condition == REPEATED and each.who in MEMORIES]
+        cases += [replace(each, seed=seed) for seed in range(1, SEEDS) for each in again]
+    return cases
