@@ -18,7 +18,7 @@ from ...envs.engine.layout import P, Z
 from ...envs.ticks import TICK
 from ...envs.vehicle.actuators import lagged
 from ...envs.vehicle.dynamics import Car, Motion, Push, Road
-from ...envs.vehicle.integration import kutta3
+from ...envs.vehicle.integration import kutta3, rk4
 from ...envs.vehicle.tyres import FIALA, Inputs, load_of, shifts
 from ..harness.results import Suite
 from .c_plant import c_plant
@@ -95,8 +95,10 @@ def tick(
     car: Any,
     road: Any,
     left: Any,
+    stages: int,
 ) -> Any:
-    """(last, motion, acting) after a tick; first and last: the Load at its start and end."""
+    """(last, motion, acting) after a tick by the rule of so many stages; first and last: the Load
+    at its start and end."""
     between = Inputs(
         lagged(command.delta_f, acting.delta_f, left[0]),
         lagged(command.T_l, acting.T_l, left[2]),
@@ -109,7 +111,10 @@ def tick(
     )
     shifting = shifts(0, FIALA, 1)
     middle, last = load_of(between, car, 0, shifting), load_of(acting, car, 0, shifting)
-    return last, kutta3(motion, (first, middle, last), push, car, road, TICK, 0, FIALA, 1), acting
+    loads = (first, middle, last)
+    if stages == 4:
+        return last, rk4(motion, loads, push, car, road, TICK, 0, FIALA, 1), acting
+    return last, kutta3(motion, loads, push, car, road, TICK, 0, FIALA, 1), acting
 
 
 @jit
@@ -122,6 +127,7 @@ def advance(
     motions: Any,
     acting: Any,
     ticks: int,
+    stages: int,
 ) -> None:
     """Ticks of every car, a block at a time; the arrays of `Cars`."""
     for b in range(len(cars)):
@@ -130,14 +136,14 @@ def advance(
         motion, now = read(motions[b], _MOTION), read(acting[b], _INPUTS)
         load = load_of(now, car, 0, shifts(0, FIALA, 1))
         for _ in range(ticks):
-            load, motion, now = tick(load, motion, now, command, push, car, road, left)
+            load, motion, now = tick(load, motion, now, command, push, car, road, left, stages)
         write(motions[b], motion, _MOTION)
         write(acting[b], now, _INPUTS)
 
 
 def ours(cars: Cars, ticks: int) -> None:
     """The plant as the batch engine moves it, in lanes."""
-    advance(*cars, ticks)
+    advance(*cars, ticks, 3)
 
 
 def in_c() -> Advance:
