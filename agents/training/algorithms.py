@@ -1,6 +1,19 @@
 """The algorithms of `sideslip train`: stable-baselines3's, with settings that learn here.
 
-The settings are those of `hyperparams/`, in rl-baselines3-zoo's format.
+The settings stand in `hyperparams/`, in rl-baselines3-zoo's format, and were chosen on YawVision-v0
+with seed 0. PPO on its sensors alone (600,000 steps, about 20 CPU-s; mean cost over none's on 256
+drives): with a step size of 1e-3, rewards as they come and a horizon of 0.5 s 0.22, times ten 0.18,
+with 0.2 s 0.16, rewards per second (times a hundred) 0.13; a step size of 2e-3 0.125. Worse were a
+horizon of 0.1 s and 16 steps a rollout; running normalisation was no better.
+
+PPO behind `exact-kf` with accelerometer and disturbances (40 CPU-s; mean cost over nominal's on 64
+drives): a first deviation of 0.14 2.28, 0.37 1.10, 0.61 1.01, 1.0 1.09; with 0.37 a step size of
+4e-3 1.11; with 0.61 eight epochs instead of four 1.06.
+
+On sensors alone, over nominal's: PPO 5.8 after 40 CPU-s; SAC 7.3 after 40 where entropy's first
+weight is 1, 33 after 25 with a step size of 3e-4, and with a first weight of 0.1 it saturates, the
+cars spin, the buffer holds nothing else and it stays so; recurrent PPO, 32 cells, 7.3 after 60.
+TQC has SAC's settings.
 """
 
 import inspect

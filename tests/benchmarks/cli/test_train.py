@@ -13,6 +13,7 @@ pytest.importorskip("stable_baselines3")
 from sideslip.agents.training import keeper, train
 from sideslip.benchmarks import policies as enjoy
 from sideslip.benchmarks.cli import train as train_command
+from sideslip.benchmarks.cli.output import options_of
 from tests.benchmarks.conftest import Run
 
 TINY = ("--num-envs", 8, "--option", "scenario=sine-with-dwell", "--n-eval-envs", 4)
@@ -100,6 +101,16 @@ def test_without_the_extra_the_command_names_it(
     monkeypatch.setitem(sys.modules, missing, None)
     status, _, err = run()
     assert status == 2 and "pip install 'sideslip[train]'" in err
+
+
+def test_the_command_of_a_card_says_what_the_filter_was(run: Run) -> None:
+    told = {"outputs": ["beta", "F_d"], "options": {"fast": ["gyro", "accel_y"]}}
+    task = train.Task(estimator="exact-kf", estimator_options=told)
+    words = train_command._words(task, 10)
+    found = [words[i + 1] for i, word in enumerate(words) if word == "--estimator-option"]
+    assert options_of(found) == told
+    status, _, err = run("--estimator-option", found[0])
+    assert status == 2 and "options of an estimator need an estimator" in err
 
 
 def test_the_folder_is_named_by_what_is_trained() -> None:
