@@ -1,8 +1,10 @@
 """Cars and controllers under test, as drives."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
+from ...agents.learned.files import load_policy
 from ...envs.outside.plants import outside_vehicle
 from ...envs.vehicle.vehicle import COMS, PASSENGER_CAR
 from .drive import Drive, TestCar, of_env
@@ -25,21 +27,48 @@ def outside_car() -> TestCar:
 
 @dataclass(frozen=True)
 class Contestant:
-    """A controller with the estimator it reads ("" where it reads none)."""
+    """A controller with the estimator it reads ("" where it reads none).
+
+    estimate: options of the estimator's wrapper. slow: whether it plans, and is left out of a quick
+    run. policies: by car, where the controller is learned; each has
+    the estimator of its training.
+    """
 
     agent: str
     estimator: str = ""
+    estimate: Mapping[str, Any] = field(default_factory=dict)
+    slow: bool = False
+    policies: Mapping[str, str] = field(default_factory=dict)
+
+    def on(self, car: str) -> tuple[str, str, Mapping[str, Any]]:
+        """(agent, estimator, its options) on one of `CARS`; another car has the passenger car's."""
+        if not self.policies:
+            return self.agent, self.estimator, self.estimate
+        name = self.policies.get(car, self.policies["passenger-car"])
+        card = load_policy(name).card
+        return name, card.estimator, card.estimator_options
 
     def drive(self, car: str, seed: int = 0) -> Drive:
         """Drives of one of `CARS`; references stay within what friction can hold."""
         options: dict[str, Any] = {"vehicle": CARS[car].vehicle.to_dict(), "reference": "limited"}
-        return of_env(ENV_ID, self.agent, self.estimator, seed, **options)
+        agent, estimator, estimate = self.on(car)
+        return of_env(ENV_ID, agent, estimator, seed, estimate, **options)
 
 
+_TYRES = {"outputs": ["beta", "gamma", "F_d", "N_d", "front_tyres", "rear_tyres"]}
+_FRICTION = {
+    "outputs": [*_TYRES["outputs"], "inverse_friction"],
+    "options": {"inverse_friction_sd": 0.3},
+}
 CONTESTANTS = (
     Contestant("none"),
     Contestant("feedforward"),
     Contestant("two-dof", "exact-kf"),
     Contestant("lqr", "exact-kf"),
     Contestant("esc"),
+    Contestant("adaptive-lqr", "joint", _TYRES),
+    Contestant("adaptive-nmpc", "joint", _FRICTION, slow=True),
+    Contestant(
+        "distilled", policies={"coms": "distill-coms-yaw", "passenger-car": "distill-car-yaw"}
+    ),
 )

@@ -85,16 +85,18 @@ def of_env(
     agent: str = "none",
     estimator: str = "",
     seed: int = 0,
+    estimate: Fields | None = None,
     agent_options: Fields | None = None,
     **options: Any,
 ) -> Drive:
     """Drives of an environment of ours with a controller and, if named, its estimator.
 
-    options: of the environment (vehicle, nominal, control_period, model of an outside plant).
+    estimate: options of the estimator's wrapper. options: of the environment (vehicle, nominal,
+    control_period, model of an outside plant).
     """
 
     def drive(fields: Fields) -> Series:
-        env = make_env(env_id, estimator, scenario=CALM | dict(fields), **options)
+        env = make_env(env_id, estimator, estimate, scenario=CALM | dict(fields), **options)
         return _episode(env, make_agent(agent, env, **(agent_options or {})), seed)
 
     return drive

@@ -83,7 +83,8 @@ class Episode:
 def episodes(model: str, contestant: Contestant, seeds: Sequence[int]) -> list[Episode]:
     """A contestant on an outside plant."""
     options: dict[str, Any] = {"model": model, "scenario": SCENARIO, "reference": "limited"}
-    env = make_env(OUTSIDE_ID, contestant.estimator, **options)
-    agent = make_agent(contestant.agent, env)
+    who, estimator, estimate = contestant.on(model)
+    env = make_env(OUTSIDE_ID, estimator, estimate, **options)
+    agent = make_agent(who, env)
     driven = [rollout(env, agent, seed) for seed in seeds]
     return [Episode(d.cost, d.failed, float(abs(d["beta"]).max())) for d in driven]

@@ -6,11 +6,15 @@ import numpy as np
 
 from ... import __version__
 from ...envs.vehicle.vehicle import GRAVITY
+from ..control.scores import FLOOR
 from ..harness.results import Row, Suite, Table
-from ..harness.stats import interval
+from ..harness.stats import geometric_mean, interval
 from . import fmvss126, iso3888, iso4138, iso7401, outside
 from .cases import NAME, Case, Done, Sine, Transient, of
 from .contestants import CONTESTANTS
+
+RIVAL = "lqr"
+"""Against whom costs on outside plants are paired."""
 
 
 def add(suite: Suite, done: Done) -> None:
@@ -28,7 +32,8 @@ def add(suite: Suite, done: Done) -> None:
 def _row(case: Case, metric: str, value: float, of: str = "", **more: Any) -> Row:
     """of: what is measured, if a case has several."""
     who = CONTESTANTS[case.contestant]
-    columns = {"estimator": who.estimator, "controller": who.agent, "env_version": __version__}
+    columns = {"estimator": who.on(case.car)[1], "controller": who.agent}
+    columns["env_version"] = __version__
     where = f"{case.procedure} {case.car}" + (f", {of}" if of else "")
     return Row(NAME, where, metric, value, **columns | more)
 
@@ -109,17 +114,25 @@ def _step(suite: Suite, done: dict[Case, Transient]) -> None:
 def _episodes(suite: Suite, done: dict[Case, list[outside.Episode]]) -> None:
     """Outside plants: cost and spins of each contestant."""
     cells = []
+    costs = {case: np.array([each.cost for each in found]) for case, found in done.items()}
+    rivals = {case.car: costs[case] for case in done if _who(case)[0] == RIVAL}
     for case, found in done.items():
-        cost = interval(np.array([each.cost for each in found]))
+        cost, paired = interval(costs[case]), ""
+        if case.car in rivals and _who(case)[0] != RIVAL:
+            logs = np.log((costs[case] + FLOOR) / (rivals[case.car] + FLOOR))
+            paired = "{:.0f} [{:.0f}, {:.0f}]".format(*(100.0 * x for x in geometric_mean(logs)))
         spins = float(np.mean([each.failed for each in found]))
         more: dict[str, Any] = {"n": len(found), "salt": "fixed"}
         suite.rows.append(_row(case, "cost", cost.value, low=cost.low, high=cost.high, **more))
         suite.rows.append(_row(case, "share", spins, **more))
         peak = 1e3 * float(np.median([each.peak for each in found]))
         text = "{:.3g} [{:.3g}, {:.3g}]".format(*cost)
-        cells.append([*_who(case), text, f"{100 * spins:.0f}", f"{peak:.0f}"])
-    header = ("controller", "model", "cost", "failed / %", "median peak slip / mrad")
-    note = "Lane changes at 60 to 90 km/h; speed, steering, tyres and friction are drawn by seed."
+        cells.append([*_who(case), text, paired, f"{100 * spins:.0f}", f"{peak:.0f}"])
+    header = ("controller", "model", "cost", f"of {RIVAL}'s / %", "failed / %", "peak slip / mrad")
+    note = (
+        f"{len(found)} lane changes at 60 to 90 km/h; speed, steering, tyres and friction are "
+        f"drawn by seed. of {RIVAL}'s: geometric mean, paired. peak slip: median."
+    )
     suite.tables.append(Table("CommonRoad's models of a BMW 320i", header, cells, note))
 
 

@@ -3,9 +3,11 @@
 import pytest
 
 pytest.importorskip("vehiclemodels")
+from sideslip.agents import make_agent
+from sideslip.benchmarks.harness.drives import make_env
 from sideslip.benchmarks.procedures import outside, suite
 from sideslip.benchmarks.procedures.cases import Case
-from sideslip.benchmarks.procedures.contestants import CARS, CONTESTANTS
+from sideslip.benchmarks.procedures.contestants import CARS, CONTESTANTS, ENV_ID
 from sideslip.benchmarks.suites import SUITES
 from sideslip.envs.outside.plants import OUTSIDE_PLANTS
 
@@ -20,6 +22,24 @@ def test_every_contestant_drives_every_procedure_that_has_a_verdict() -> None:
     driven = {case.car: case.seeds for case in cases if case.procedure == "outside"}
     assert set(driven) == set(OUTSIDE_PLANTS)
     assert {len(seeds) for seeds in driven.values()} == {20}
+
+
+@pytest.mark.parametrize("car", [*CARS, "drift"])
+def test_each_contestant_has_what_it_reads(car: str) -> None:
+    """Policies drive the car that they learned on, outside cars as the passenger car."""
+    names = [each.on(car)[0] for each in CONTESTANTS]
+    assert names[-1] == ("distill-coms-yaw" if car == "coms" else "distill-car-yaw")
+    for each in CONTESTANTS:
+        agent, estimator, estimate = each.on(car)
+        options = {"vehicle": "coms"} if car == "coms" else {"vehicle": "passenger-car"}
+        env = make_env(ENV_ID, estimator, estimate, **options)
+        make_agent(agent, env)
+
+
+def test_who_plans_is_left_out_of_a_quick_run() -> None:
+    driven = {CONTESTANTS[case.contestant].agent for case in suite.cases_of(quick=True)}
+    assert "adaptive-nmpc" not in driven
+    assert {"adaptive-lqr", "distilled"} <= driven
 
 
 def test_without_the_extra_outside_plants_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
