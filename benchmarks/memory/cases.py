@@ -1,6 +1,6 @@
 """Who is trained and judged in which condition, and what a training may use."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
@@ -8,6 +8,7 @@ from typing import Any
 import gymnasium as gym
 
 from ...agents.optimum import Optimum, optimum
+from ...envs.arguments import check_choice
 
 ID = "sideslip/LinearYawVision-v0"
 PERIOD, STEP = 0.04, 0.01  # s, of pictures and of control
@@ -79,16 +80,24 @@ def _best(condition: str, budget: Budget) -> Optimum:
     return optimum(gym.make(ID, **options), SCHEDULES if "loss" in options["camera"] else 1)
 
 
-def cases_of(quick: bool, episodes: int | None = None) -> list[Case]:
-    """What a run trains, the repeated seeds last."""
+def cases_of(
+    quick: bool,
+    episodes: int | None = None,
+    conditions: Sequence[str] = (),
+    seeds: int = SEEDS,
+) -> list[Case]:
+    """What a run trains, the repeated seeds last; arguments as of the suite's `run`."""
     from ...agents.training.memories import MEMORIES
 
-    budget, conditions = (QUICK, (REPEATED,)) if quick else (Budget(), tuple(CONDITIONS))
+    for each in conditions:
+        check_choice("condition", each, CONDITIONS)
+    budget, usual = (QUICK, (REPEATED,)) if quick else (Budget(), tuple(CONDITIONS))
+    conditions = list(dict.fromkeys((REPEATED, *conditions))) if conditions else usual
     count = episodes or (QUICK_EPISODES if quick else EPISODES)
     who = (FILTER, *MEMORIES)
     cases = [Case(name, where, 0, budget, count) for where in conditions for name in who]
     if not quick:
         cases.append(Case(PPO, REPEATED, 0, budget, count))
         again = [each for each in cases if each.condition == REPEATED and each.who in MEMORIES]
-        cases += [replace(each, seed=seed) for seed in range(1, SEEDS) for each in again]
+        cases += [replace(each, seed=seed) for seed in range(1, seeds) for each in again]
     return cases

@@ -17,7 +17,7 @@ from ..harness.parallel import run_cases
 from ..harness.results import Row, Suite, Table
 from ..harness.stats import Estimate, interval
 from ..harness.verdict import percent, verdict
-from .cases import ALONE, CONDITIONS, FILTER, ID, PPO, REPEATED, cases_of
+from .cases import ALONE, CONDITIONS, FILTER, ID, PPO, REPEATED, SEEDS, cases_of
 from .measure import Found, Kept
 
 NAME = "memory"
@@ -40,16 +40,20 @@ def run(
     jobs: int | None = None,
     console: Console | None = None,
     keep: Path | None = None,
+    conditions: Sequence[str] = (),
+    seeds: int = SEEDS,
 ) -> Suite:
     """Everybody in every condition; quick: in one, with little training and without PPO.
 
-    episodes: that judge a policy. keep: a folder in which finished cases stay.
+    episodes: that judge a policy. keep: a folder in which finished cases stay. conditions: of
+    `CONDITIONS`, none for all. seeds: trainings of each memory in `REPEATED`, which is always
+    there.
     """
     suite = Suite(NAME, "Memory where the optimum is known", _TEXT)
     if find_spec("torch") is None:
         suite.verdict = 'Not trained: it needs torch, pip install "sideslip[train]".'
         return suite
-    cases = cases_of(quick, episodes)
+    cases = cases_of(quick, episodes, conditions, seeds)
     found = run_cases(Kept(keep and keep.absolute()), cases, NAME, jobs, console)
     results: dict[str, dict[str, list[Found]]] = {}
     for case, each in zip(cases, found, strict=True):

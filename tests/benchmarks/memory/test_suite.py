@@ -62,6 +62,15 @@ def test_a_full_run_is_everybody_everywhere_and_some_seeds() -> None:
     assert [Case("", where, 0, TINY, 1).late for where in CONDITIONS] == [10, 30, 0, 10, 30]
 
 
+def test_a_part_of_a_run_is_some_of_its_cases() -> None:
+    part = cases.cases_of(False, conditions=["300 ms"], seeds=1)
+    assert set(part) < set(cases.cases_of(False))
+    assert {each.condition for each in part} == {REPEATED, "300 ms"}
+    assert {each.seed for each in part} == {0}
+    with pytest.raises(ValueError, match="unknown condition '30 ms'; known: 100 ms, 300 ms"):
+        cases.cases_of(False, conditions=["30 ms"])
+
+
 def made(gaps: Mapping[str, float]) -> dict[str, dict[str, list[Found]]]:
     """Results whose gaps are known."""
     rng, results = np.random.default_rng(0), dict[str, dict[str, list[Found]]]()
