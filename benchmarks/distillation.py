@@ -39,18 +39,22 @@ def contests_of(kind: str) -> list[Contest]:
     return [each for each in contests() if each.kind == kind]
 
 
-def card_of(kind: str, estimator: str = "", **rest: Any) -> Card:
+def card_of(kind: str, estimator: str = "", teacher: str = RIVAL, **rest: Any) -> Card:
     """The card of a policy for a class of contests, in the first one's env; rest: other fields."""
     check_choice("estimator", estimator, FILTERS)
     first = contests_of(kind)[0]
-    options = _options(first) if estimator else {}
+    options = _options(first, teacher) if estimator else {}
     return Card.of(first.env_id, first.env_options, estimator, options, **rest)
 
 
-def _options(contest: Contest) -> JsonMap:
-    """The rival's filter, which is the same in all contests of a class, and more of its states."""
-    own = estimate_options(Cell(contest, JOINT, RIVAL))["options"]
-    return {"outputs": list(OUTPUTS), "std": True, "options": own}
+def _options(contest: Contest, teacher: str) -> JsonMap:
+    """The filter of a teacher that reads `joint`, else of the rival, which is the same in all
+    contests of a class, and more of its states."""
+    filters = {who: name for name, who in ADAPTIVE.items()}
+    who = teacher if teacher in filters else RIVAL
+    own = estimate_options(Cell(contest, filters[who], who))["options"]
+    known = [each for each in OUTPUTS if each != "inverse_friction" or f"{each}_sd" in own]
+    return {"outputs": known, "std": True, "options": own}
 
 
 def lessons_of(kind: str, teacher: str, estimator: str, cars: int) -> "list[Lesson]":
@@ -68,7 +72,7 @@ def lessons_of(kind: str, teacher: str, estimator: str, cars: int) -> "list[Less
         twins, agent = make_cars(cell, cars)
         env: Any = gym.make_vec(contest.env_id, num_envs=cars, **contest.env_options)
         if estimator:
-            env = EstimateObservation(env, estimator, **_options(contest))
+            env = EstimateObservation(env, estimator, **_options(contest, teacher))
         found.append(Lesson(env, twins, agent))
     return found
 

@@ -19,7 +19,7 @@ from ..controllers.lqr import Lqr
 from ..learned.card import Card
 from ..learned.files import Policy, save_policy
 from ..learned.policy import Learned
-from .student import LONGER, Course, Drives, Single, Student, fitted, scaling_of
+from .student import LONGER, Course, Drives, Scaling, Single, Student, fitted, scaling_of
 
 import torch  # isort: skip  # after ours, which say which extra is missing
 
@@ -135,7 +135,8 @@ def distill(
     cars = lessons[0].cars
     seeds = itertools.count(DISTILLING + course.seed * _SEEDS, cars.num_envs)
     model = Student(len(cars.layout), cars.single_action_space.shape[0], course)
-    policy, mean, scale = None, np.zeros(0), np.zeros(0)
+    policy: Policy | None = None
+    scaling: Scaling | None = None
     drives: list[Drives] = []
     rounds: list[Round] = []
     usual = [np.inf] * len(lessons)
@@ -147,15 +148,15 @@ def distill(
             fresh.append(drive(lesson, policy, numbers, course.noise, most))
         drives += fresh
         steps += sum(int((each.weights > 0.0).sum()) for each in fresh)
-        if policy is None:
-            mean, scale = scaling_of(fresh, cars.layout, lessons[0].teacher.needs)
+        if scaling is None:
+            scaling = scaling_of(fresh, cars.layout, lessons[0].teacher.needs)
             usual = [float(np.median(each.costs)) for each in fresh]
         epochs = course.epochs * (LONGER if i == course.rounds - 1 else 1)
-        loss = fitted(model, drives, mean, scale, course, epochs)
+        loss = fitted(model, drives, scaling, course, epochs)
         rounds.append(Round(steps, float(np.mean([each.costs.mean() for each in fresh])), loss))
         spent = round(time.process_time() - begun, 1)
         card = replace(card, steps=steps, cpu_seconds=spent)
-        policy = Policy(target.stem, model.network(mean, scale), card)
+        policy = Policy(target.stem, model.network(scaling), card)
         save_policy(target, policy.network, card)
         report(rounds[-1])
     assert policy is not None

@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ...envs.arguments import check_choice
-from .student import Array, Drives, normalised
+from .student import Array, Drives, normalised, whitening
 
 import torch  # isort: skip  # after ours, which say which extra is missing
 from torch import nn  # isort: skip
@@ -53,9 +53,7 @@ class Memory(nn.Module):
     def whiten(self, drives: Sequence[Drives], mean: Array, scale: Array) -> None:
         """Mix the inputs so that their covariance on drives is one."""
         seen = np.concatenate([normalised(each.obs, mean, scale) for each in drives])
-        values, vectors = np.linalg.eigh(np.cov(seen.reshape(-1, self.inputs).T))
-        mixed = vectors / np.sqrt(np.maximum(values, _LEAST**2)) @ vectors.T
-        self.mix.copy_(torch.from_numpy(mixed))
+        self.mix.copy_(torch.from_numpy(whitening(seen.reshape(-1, self.inputs), _LEAST**2)))
 
     def forward(self, z: Any, state: Any = None) -> tuple[Any, Any]:
         """(actions (B, T, 1), the next state) of normalised observations (B, T, k)."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from .distill import DISTILLING, Lesson, Round, drive
 from .memories import Memory, make_memory
-from .student import LONGER, Array, Course, Drives, Single, fitted, normalised, scaling_of
+from .student import LONGER, Array, Course, Drives, Scaling, Single, fitted, normalised, scaling_of
 
 import torch  # isort: skip  # after ours, which say which extra is missing
 
@@ -73,18 +73,19 @@ def imitated(
     seeds = itertools.count(DISTILLING + course.seed * _SEEDS, cars.num_envs)
     drives: list[Drives] = []
     agent, steps = None, 0
-    mean, scale = np.zeros(0), np.zeros(0)
+    scaling: Scaling | None = None
     for i in range(course.rounds):
         first = next(seeds)
         seen = drive(lesson, agent, range(first, first + cars.num_envs), course.noise)
         drives.append(seen._replace(curvature=np.full((1, 1), weight, np.float32)))
         steps += int((seen.weights > 0.0).sum())
-        if agent is None:
-            mean, scale = scaling_of(drives, cars.layout, lesson.teacher.needs)
+        if scaling is None:
+            mean, scale, _ = scaling_of(drives, cars.layout, lesson.teacher.needs)
+            scaling = Scaling(mean, scale, np.eye(len(mean)))  # memories mix by themselves
             model.whiten(drives, mean, scale)
         last = i == course.rounds - 1
-        loss = fitted(model, drives, mean, scale, course, course.epochs * (LONGER if last else 1))
-        agent = Remembering(model, mean, scale)
+        loss = fitted(model, drives, scaling, course, course.epochs * (LONGER if last else 1))
+        agent = Remembering(model, scaling.mean, scaling.scale)
         report(Round(steps, float(seen.costs.mean()), loss))
     assert agent is not None
     return agent

@@ -31,10 +31,10 @@ SAMPLES = 512  # steps of a batch without memory
 LONGER = 3  # times as many epochs in the last round
 UNREAD = ("gps_X", "gps_Y", "gps_satellites")
 """Where the car is says nothing of how to hold it."""
-
+_LEAST = 1e-3  # variance, of what varies by 1, that a mixture of inputs has at least
 
 Batch = tuple[Any, Any, Any, Any, bool]
-"""Normalised observations (B, T, k), labels (B, T, m), weights (B, T), curvatures (B, m, m), and
+"""Mixed observations (B, T, k), labels (B, T, m), weights (B, T), curvatures (B, m, m), and
 whether it begins the episodes."""
 
 
@@ -48,6 +48,23 @@ class Drives(NamedTuple):
     weights: Single
     curvature: Single
     costs: Array
+
+
+class Scaling(NamedTuple):
+    """What a student makes of an observation: clip((x - mean) scale) mixing.
+
+    mean, scale: (k,), scale zero of what is not read. mixing: (k, k), symmetric; what varies
+    little while its parts vary much, as course less heading, then varies as much as they do.
+    """
+
+    mean: Array
+    scale: Array
+    mixing: Array
+
+    def mixed(self, obs: Single) -> Single:
+        """Inputs of a `Student`, of observations (..., k)."""
+        mixing = self.mixing.astype(np.float32)
+        return normalised(obs, self.mean, self.scale) @ mixing
 
 
 @dataclass(frozen=True)
@@ -85,7 +102,7 @@ class Course:
 
 
 class Student(nn.Module):
-    """A GRU, if there is one, and dense layers behind it, on normalised observations."""
+    """A GRU, if there is one, and dense layers behind it, on mixed observations."""
 
     def __init__(self, inputs: int, width: int, course: Course) -> None:
         super().__init__()
@@ -102,14 +119,16 @@ class Student(nn.Module):
             z = nn.functional.silu(layer(z))
         return self.dense[-1](z), state
 
-    def network(self, mean: Array, scale: Array) -> Network:
+    def network(self, scaling: Scaling) -> Network:
         """The same function of plain observations, by NumPy."""
         numbers = {name: value.detach().numpy().copy() for name, value in self.named_parameters()}
-        dense = range(len(self.dense))
         names = ("weight_ih_l0", "weight_hh_l0", "bias_ih_l0", "bias_hh_l0")
+        first = "cell.weight_ih_l0" if self.cell else "dense.0.weight"
+        numbers[first] = numbers[first] @ scaling.mixing
+        dense = range(len(self.dense))
         return Network(
-            mean,
-            scale,
+            scaling.mean,
+            scaling.scale,
             [numbers[f"dense.{i}.weight"] for i in dense],
             [numbers[f"dense.{i}.bias"] for i in dense],
             "silu",
@@ -118,19 +137,24 @@ class Student(nn.Module):
         )
 
 
-def scaling_of(
-    drives: Sequence[Drives], layout: Sequence[Entry], needs: Sequence[str]
-) -> tuple[Array, Array]:
-    """Mean and scale of each entry, zero of what is not read.
+def scaling_of(drives: Sequence[Drives], layout: Sequence[Entry], needs: Sequence[str]) -> Scaling:
+    """How a student sees what these drives see.
 
     needs: what the teacher reads. A student that has all of it reads nothing else, of which it
     would only learn noise; one that has less reads whatever varies, but for `UNREAD`.
     """
     seen = np.concatenate([each.obs[each.weights > 0.0] for each in drives])
-    mean, spread = seen.mean(0, np.float64), seen.std(0, dtype=np.float64)
     names = [entry.name for entry in layout]
     there = np.isin(names, needs) if set(needs) <= set(names) else ~np.isin(names, UNREAD)
-    return mean, np.where(there & (spread > 1e-9), 1.0 / np.maximum(spread, 1e-9), 0.0)
+    mean, spread = seen.mean(0, np.float64), seen.std(0, dtype=np.float64)
+    scale = np.where(there & (spread > 1e-9), 1.0 / np.maximum(spread, 1e-9), 0.0)
+    return Scaling(mean, scale, whitening(normalised(seen, mean, scale), _LEAST))
+
+
+def whitening(z: Array, least: float) -> Array:
+    """(k, k) what makes the covariance of z (n, k) one; a smaller eigenvalue counts as `least`."""
+    sizes, axes = np.linalg.eigh(np.cov(z, rowvar=False))
+    return np.asarray(axes / np.sqrt(np.maximum(sizes, least)) @ axes.T)
 
 
 def normalised(obs: Single, mean: Array, scale: Array) -> Single:
@@ -145,8 +169,8 @@ def _joined(parts: Sequence[Single]) -> Any:
 class _Episodes:
     """`BATCH` episodes of a few lessons at once, cut into windows that the state goes through."""
 
-    def __init__(self, drives: Sequence[Drives], mean: Array, scale: Array) -> None:
-        self.drives, self.scaling = drives, (mean, scale)
+    def __init__(self, drives: Sequence[Drives], scaling: Scaling) -> None:
+        self.drives, self.scaling = drives, scaling
         self.everyone = [(i, j) for i, each in enumerate(drives) for j in range(len(each.costs))]
         longest = max(each.weights.shape[1] for each in drives)
         self.most = -(-len(self.everyone) // BATCH) * -(-longest // WINDOW)
@@ -164,7 +188,7 @@ class _Episodes:
                 x[row, :length], y[row, :length] = self.drives[i].obs[j], self.drives[i].labels[j]
                 w[row, :length] = self.drives[i].weights[j]
             S = torch.from_numpy(np.stack([self.drives[i].curvature for i, _ in rows]))
-            arrays = (normalised(x, *self.scaling), y, w)
+            arrays = (self.scaling.mixed(x), y, w)
             for at in range(0, longest, WINDOW):
                 z, labels, weights = (torch.from_numpy(a[:, at : at + WINDOW]) for a in arrays)
                 yield z, labels, weights, S, at == 0
@@ -173,12 +197,12 @@ class _Episodes:
 class _Steps:
     """`SAMPLES` single steps of all drives at once, as if each were an episode."""
 
-    def __init__(self, drives: Sequence[Drives], mean: Array, scale: Array) -> None:
+    def __init__(self, drives: Sequence[Drives], scaling: Scaling) -> None:
         there = [each.weights > 0.0 for each in drives]
         self.lesson = torch.cat([torch.full((int(t.sum()),), i) for i, t in enumerate(there)])
         self.curvatures = torch.from_numpy(np.stack([each.curvature for each in drives]))
         pairs = list(zip(drives, there, strict=True))
-        self.x = _joined([normalised(each.obs[t], mean, scale) for each, t in pairs])
+        self.x = _joined([scaling.mixed(each.obs[t]) for each, t in pairs])
         self.y = _joined([each.labels[t] for each, t in pairs])
         self.w = _joined([each.weights[t] for each, t in pairs])
         self.most = -(-len(self.w) // SAMPLES)
@@ -190,12 +214,7 @@ class _Steps:
 
 
 def fitted(
-    model: nn.Module,
-    drives: Sequence[Drives],
-    mean: Array,
-    scale: Array,
-    course: Course,
-    epochs: int,
+    model: nn.Module, drives: Sequence[Drives], scaling: Scaling, course: Course, epochs: int
 ) -> float:
     """Train a model on drives; the loss of the last epoch. Raises FloatingPointError where it
     diverges.
@@ -203,7 +222,7 @@ def fitted(
     model: gives actions and state as a `Student`; `recurrent` says whether steps belong together.
     """
     optimiser = torch.optim.Adam(model.parameters(), course.learning_rate)
-    batches = (_Episodes if model.recurrent else _Steps)(drives, mean, scale)
+    batches = (_Episodes if model.recurrent else _Steps)(drives, scaling)
     falling = torch.optim.lr_scheduler.LinearLR(optimiser, 1.0, 0.02, epochs * batches.most)
     count = sum(len(each.costs) for each in drives)
     length = sum(int((each.weights > 0.0).sum()) for each in drives) / count

@@ -201,7 +201,7 @@ def distill_command(
     course = Course(rounds, epochs, cells, tuple(hidden or (64, 64)), seed=seed)
     about = {"class": kind, "teacher": teacher, "cars": cars, **course.described()}
     options = {"algorithm": "distill", "algorithm_options": about, "seeds": {"training": seed}}
-    card = card_of(kind, estimator, command=command_line(), **options)
+    card = card_of(kind, estimator, teacher, command=command_line(), **options)
 
     lessons = lessons_of(kind, teacher, estimator, cars)
 

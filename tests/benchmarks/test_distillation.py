@@ -2,9 +2,11 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 pytest.importorskip("torch")
+from sideslip.benchmarks.control.cells import ADAPTIVE
 from sideslip.benchmarks.control.contests import contests
 from sideslip.benchmarks.distillation import FILTERS, card_of, contests_of, lessons_of
 from tests.benchmarks.conftest import Run
@@ -19,6 +21,20 @@ def test_a_class_is_lessons_with_one_observation_and_the_cards() -> None:
         for each in lessons:
             assert tuple((e.name, e.unit) for e in each.cars.layout) == card.observation
             assert each.teacher.width == 1
+
+
+@pytest.mark.parametrize("teacher", ADAPTIVE.values())
+def test_a_student_on_joint_reads_what_its_teacher_reads(teacher: str) -> None:
+    """To the bit, or it would learn to guess what its teacher's filter says."""
+    cars, twins, agent = lessons_of("coms-zero-slip", teacher, "joint", 2)[0]
+    seen = [env.reset(seed=[3, 4])[0] for env in (cars, twins)]
+    for _ in range(60):
+        seen = [env.step(np.full((2, 1), 0.2, np.float32))[0] for env in (cars, twins)]
+    read = [
+        obs[:, [[entry.name for entry in env.layout].index(name) for name in agent.needs]]
+        for obs, env in zip(seen, (cars, twins), strict=True)
+    ]
+    assert np.array_equal(*read) and np.ptp(read[0]) > 0.0
 
 
 def test_every_contest_is_in_one_class() -> None:

@@ -16,12 +16,19 @@ from sideslip.agents.learned.files import load_policy
 from sideslip.agents.rungs import make_rung
 from sideslip.agents.training import distill as training
 from sideslip.agents.training.distill import FLOOR, Lesson, distill, drive
-from sideslip.agents.training.student import CLIP, UNREAD, Course, Student, fitted, scaling_of
+from sideslip.agents.training.student import (
+    UNREAD,
+    Course,
+    Scaling,
+    Student,
+    fitted,
+    scaling_of,
+)
 
 ID, CARS = "sideslip/YawFusion-v0", 16
 SHORT = {"base": "coms-step", "duration": 1.2, "onset": 0.1}
 OPTIONS: dict[str, Any] = {"scenario": SHORT, "reference": "zero-slip"}
-COURSE = Course(rounds=2, epochs=25, cells=8, hidden=(8,), learning_rate=1e-2)
+COURSE = Course(rounds=3, epochs=25, cells=8, hidden=(8,), learning_rate=1e-2)
 
 
 def lesson(**options: Any) -> Lesson:
@@ -59,7 +66,7 @@ def test_the_file_is_the_last_rounds_and_its_card_has_the_numbers(learned: Any) 
     found, path = learned
     there = load_policy(path)
     assert there.salt == found.policy.salt
-    assert there.card.steps == found.rounds[-1].steps == 2 * CARS * 120
+    assert there.card.steps == found.rounds[-1].steps == COURSE.rounds * CARS * 120
     assert there.card.cpu_seconds > 0.0
 
 
@@ -67,11 +74,11 @@ def test_the_file_is_the_last_rounds_and_its_card_has_the_numbers(learned: Any) 
 def test_the_network_is_torchs(cells: int) -> None:
     torch.manual_seed(0)
     student, rng = Student(5, 2, Course(cells=cells, hidden=(9, 4))), np.random.default_rng(1)
-    mean, scale = rng.normal(size=5), rng.uniform(0.5, 2.0, 5)
+    mixing = np.eye(5) + 0.3 * np.ones((5, 5))
+    scaling = Scaling(rng.normal(size=5), rng.uniform(0.5, 2.0, 5), mixing)
     x = rng.normal(size=(3, 150, 5)).astype(np.float32)
-    z = ((x - mean) * scale).clip(-CLIP, CLIP).astype(np.float32)
-    theirs = student(torch.from_numpy(z))[0].detach().numpy()
-    ours = np.stack(rolled(student.network(mean, scale), x), axis=1)
+    theirs = student(torch.from_numpy(scaling.mixed(x)))[0].detach().numpy()
+    ours = np.stack(rolled(student.network(scaling), x), axis=1)
     assert np.abs(ours - theirs).max() < 1e-6 < np.abs(np.diff(ours, axis=1)).max()
 
 
@@ -99,8 +106,8 @@ def test_a_student_that_sees_what_its_teacher_reads_reads_nothing_else() -> None
     seen = [drive(lesson(), None, range(CARS), 0.1)]
     names = [entry.name for entry in cars.layout]
     for needs, there in ((("steer", "beta_ref"), {"steer"}), (("beta_hat",), None)):
-        _, scale = scaling_of(seen, cars.layout, needs)
-        reads = {name for name, each in zip(names, scale, strict=True) if each > 0.0}
+        scaling = scaling_of(seen, cars.layout, needs)
+        reads = {name for name, each in zip(names, scaling.scale, strict=True) if each > 0.0}
         assert reads == there if there else "gyro" in reads and not reads & set(UNREAD)
 
 
@@ -111,8 +118,8 @@ def test_a_training_that_diverges_stops_with_the_step_and_leaves_the_last_good_f
     drives = [drive(lesson(), None, range(CARS), 0.0)]
     names, model = len(drives[0].obs[0, 0]), Student(len(drives[0].obs[0, 0]), 1, COURSE)
     with pytest.raises(FloatingPointError, match=r"the loss is nan at step \d+"):
-        mean = np.full(names, np.nan)
-        real(model, drives, mean, np.ones(names), COURSE, 1)
+        scaling = Scaling(np.full(names, np.nan), np.ones(names), np.eye(names))
+        real(model, drives, scaling, COURSE, 1)
     calls: list[Any] = []
 
     def second(*arguments: Any) -> float:
@@ -146,3 +153,18 @@ def test_a_course_out_of_range_is_refused(wrong: dict[str, Any], message: str) -
 def test_nothing_to_learn_from_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="no lessons"):
         distill(Card.of(ID, OPTIONS), [], COURSE, tmp_path / "student.safetensors")
+
+
+def test_mixed_inputs_show_what_two_of_them_differ_by() -> None:
+    """As course less heading, whose difference is a tenth of either: it varies like the rest."""
+    cars = lesson().cars
+    seen = drive(lesson(), None, range(CARS), 0.1)
+    names, rng = [entry.name for entry in cars.layout], np.random.default_rng(0)
+    a, b = (names.index(name) for name in ("gps_course", "camera_psi"))
+    seen.obs[..., a] = rng.normal(size=seen.obs.shape[:2])
+    apart = 0.1 * rng.normal(size=seen.obs.shape[:2])
+    seen.obs[..., b] = seen.obs[..., a] + apart
+    z = scaling_of([seen], cars.layout, ("beta_hat",)).mixed(seen.obs)
+    shown = z[..., b] - z[..., a]
+    assert 1.2 < shown.std() < 1.6  # of two that vary by 1, the square root of 2
+    assert np.corrcoef(shown.ravel(), apart.ravel())[0, 1] > 0.99
