@@ -67,7 +67,7 @@ def test_a_part_of_a_run_is_some_of_its_cases() -> None:
     assert set(part) < set(cases.cases_of(False))
     assert {each.condition for each in part} == {REPEATED, "300 ms"}
     assert {each.seed for each in part} == {0}
-    with pytest.raises(ValueError, match="unknown condition '30 ms'; known: 100 ms, 300 ms"):
+    with pytest.raises(ValueError, match="unknown condition '30 ms'"):
         cases.cases_of(False, conditions=["30 ms"])
 
 
