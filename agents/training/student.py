@@ -151,7 +151,7 @@ def scaling_of(drives: Sequence[Drives], layout: Sequence[Entry], needs: Sequenc
     return Scaling(mean, scale, whitening(normalised(seen, mean, scale), _LEAST))
 
 
-def whitening(z: Array, least: float) -> Array:
+def whitening(z: Array | Single, least: float) -> Array:
     """(k, k) what makes the covariance of z (n, k) one; a smaller eigenvalue counts as `least`."""
     sizes, axes = np.linalg.eigh(np.cov(z, rowvar=False))
     return np.asarray(axes / np.sqrt(np.maximum(sizes, least)) @ axes.T)
