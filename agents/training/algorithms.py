@@ -11,9 +11,9 @@ drives): a first deviation of 0.14 2.28, 0.37 1.10, 0.61 1.01, 1.0 1.09; with 0.
 4e-3 1.11; with 0.61 eight epochs instead of four 1.06.
 
 On sensors alone, over nominal's: PPO 5.8 after 40 CPU-s; SAC 7.3 after 40 where entropy's first
-weight is 1, 33 after 25 with a step size of 3e-4; with a first weight of 0.1 three trainings diverged,
-for what reason was not looked into; recurrent PPO, 32 cells, 7.3 after 60. TQC has SAC's settings, not
-measured. One training each, on a machine that others used: a first look.
+weight is 1, 33 after 25 with a step size of 3e-4; three other settings diverged, for what reason
+was not looked into; recurrent PPO, 32 cells, 7.3 after 60. TQC has SAC's settings, not measured.
+One training each, beside other work on the machine: a first look.
 """
 
 import inspect
