@@ -26,7 +26,7 @@ from sideslip.benchmarks.control.contests import (
 from sideslip.benchmarks.control.episodes import NUMBERS, Driven
 from sideslip.benchmarks.control.run import Results, measure
 from sideslip.benchmarks.control.scores import Yardstick
-from sideslip.benchmarks.control.seeds import salt_of, salted_seeds
+from sideslip.benchmarks.control.seeds import salted_seeds
 from sideslip.benchmarks.harness.stats import average
 from sideslip.envs import FAILURES, SCENARIOS
 
@@ -146,8 +146,10 @@ def test_the_ladder_falls_in_every_scored_contest(contest: Contest) -> None:
 
 
 def falls(contest: Contest, episodes: int) -> None:
+    """On seeds the contests were not chosen on, the same in every version: with the salt's, one
+    version in a hundred failed by chance."""
     cells = [Cell(contest, "", rung) for rung in RUNGS]
-    there = measure(cells, salted_seeds(salt_of(), episodes), jobs=1)
+    there = measure(cells, salted_seeds("0", episodes), jobs=1)
     assert not any(each.error for each in there.found.values())
     yard = Yardstick(there.of(contest, NOMINAL), there.of(contest, STATE))
     gap = average(yard.paired(yard.oracle)[1])
