@@ -194,7 +194,7 @@ def bench(
     ] = None,
     jobs: Jobs = None,
     episodes: Annotated[
-        int | None, typer.Option(min=4, help="A cell of control (1000), or seeds of other suites.")
+        int | None, typer.Option(min=4, help="A cell of control (256), or seeds of other suites.")
     ] = None,
     keep: Annotated[
         Path | None, typer.Option(help="A folder for finished cases: a stopped run goes on.")
