@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 
 from ..agents.learned.card import Card, JsonMap
-from ..agents.learned.files import load_policy, save_policy
+from ..agents.learned.files import is_policy, load_policy, save_policy
 from ..envs.arguments import check_choice
 from ..estimators.vector.estimate import EstimateObservation
 from .control.build import estimate_options, make_cars
@@ -60,12 +60,15 @@ def _options(contest: Contest, teacher: str) -> JsonMap:
 def lessons_of(kind: str, teacher: str, estimator: str, cars: int) -> "list[Lesson]":
     """A lesson for each contest of a class.
 
-    teacher: a rung, or a controller of the matrix, which reads its filter there. Raises ValueError
-    for another name, or where that observation lacks what the teacher needs.
+    teacher: a rung, a controller of the matrix, which reads its filter there, or a policy, which
+    reads the one of its card. Raises ValueError for another name, or where that observation lacks
+    what the teacher needs.
     """
     from ..agents.training.distill import Lesson
 
     reads = {who: name for name, who in ADAPTIVE.items()} | dict.fromkeys(_ALONE, "")
+    if is_policy(teacher):
+        reads[teacher] = load_policy(teacher).card.estimator
     found = []
     for contest in contests_of(kind):
         cell = Cell(contest, reads.get(teacher, REFERENCE_FILTER), teacher)

@@ -29,8 +29,9 @@ from .harness.verdict import verdict
 
 NAME, TRAINED = "learned", "as trained"
 EPISODES, QUICK_EPISODES = 32, 4
+PAPERS = ("two-dof", "model-following")
 RIVALS = tuple(ADAPTIVE.values())
-"""Against whom episodes are counted."""
+"""Against whom episodes are counted, beside nominal and the papers'."""
 _LEVELS = np.geomspace(0.1, 10.0, 41)
 _TEXT = (
     "The shipped policies beside controllers on the same late sensors, on salted seeds and in "
@@ -71,7 +72,7 @@ def scenario_in(contest: Contest, condition: str) -> dict[str, Any]:
 
 def contestants(contest: Contest) -> list[tuple[str, str]]:
     """(estimator, controller) of everybody who drives a contest: rungs, classics, policies."""
-    classics = [who for who in ("two-dof", "model-following") if who in CONTROLLERS[contest.env_id]]
+    classics = [who for who in PAPERS if who in CONTROLLERS[contest.env_id]]
     return [
         ("", NOMINAL),
         ("", PARAMETERS),
@@ -185,6 +186,7 @@ def answer(found: Sequence[Found]) -> str:
 def _tabled(suite: Suite, found: Found) -> None:
     names = [who for _, who in contestants(chosen(found.kind)[0])]
     episodes = len(found.costs(NOMINAL))
+    rivals = [who for who in (NOMINAL, *PAPERS, *RIVALS) if who in names]
     shares, all_in_all = [], []
     for who in names:
         mine = {condition: found.shared(who, condition) for condition in CONDITIONS}
@@ -193,7 +195,7 @@ def _tabled(suite: Suite, found: Found) -> None:
         ratio = worst((costs + FLOOR) / (found.costs(NOMINAL) + FLOOR)).value
         beaten = [
             "" if who == rival else f"{100.0 * won(costs, found.costs(rival)).value:.0f} %"
-            for rival in (NOMINAL, *RIVALS)
+            for rival in rivals
         ]
         fails = share(found.failed(who)).value
         all_in_all.append([who, *beaten, f"{100.0 * fails:.1f} %", f"{ratio:.2f}"])
@@ -208,7 +210,7 @@ def _tabled(suite: Suite, found: Found) -> None:
         Table(f"{found.kind}: share of the gap", ("controller", *CONDITIONS), shares, note),
         Table(
             f"{found.kind}: all conditions together",
-            ("controller", *(f"beats {each}" for each in (NOMINAL, *RIVALS)), "fails", "worst 5 %"),
+            ("controller", *(f"beats {each}" for each in rivals), "fails", "worst 5 %"),
             all_in_all,
             f"Of {episodes} episodes. worst 5 %: mean of the largest ratios to nominal's cost.",
         ),

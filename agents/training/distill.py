@@ -19,7 +19,17 @@ from ..controllers.lqr import Lqr
 from ..learned.card import Card
 from ..learned.files import Policy, save_policy
 from ..learned.policy import Learned
-from .student import LONGER, Course, Drives, Scaling, Single, Student, fitted, scaling_of
+from .student import (
+    LONGER,
+    Course,
+    Drives,
+    Scaling,
+    Single,
+    Student,
+    fitted,
+    normalised,
+    scaling_of,
+)
 
 import torch  # isort: skip  # after ours, which say which extra is missing
 
@@ -73,6 +83,7 @@ def drive(
     running = start = np.ones(len(seeds), np.bool_)
     shaken, own, memory = np.zeros((len(seeds), teacher.width)), None, None
     costs, steps = np.zeros(len(seeds)), []
+    unseen = _unseen(lesson)
     while running.any():
         label, memory = teacher.predict(seen, memory, start)
         if student is None:
@@ -81,7 +92,7 @@ def drive(
         else:
             action, own = student.predict(obs, own, start)
         taught = running & np.isfinite(label).all(axis=1)
-        steps.append((obs, np.nan_to_num(label), taught))
+        steps.append((obs, np.nan_to_num(label), seen[:, unseen], taught))
         teacher.acted(memory, action)
         obs, rewards, terminated, truncated, _ = cars.step(action)
         seen, theirs, *_ = twins.step(action)
@@ -90,9 +101,15 @@ def drive(
         costs -= np.where(running, rewards, 0.0)
         start = np.logical_or(terminated, truncated)
         running = running & ~start
-    x, y, w = (np.stack(each, axis=1) for each in zip(*steps, strict=True))
+    x, y, told, w = (np.stack(each, axis=1) for each in zip(*steps, strict=True))
     weights = w / (np.minimum(costs, usual)[:, None] + FLOOR)
-    return Drives(x, y, weights.astype(np.float32), _curvature(cars, teacher, x), costs)
+    return Drives(x, y, told, weights.astype(np.float32), _curvature(cars, teacher, x), costs)
+
+
+def _unseen(lesson: Lesson) -> list[int]:
+    """Columns of what the teacher reads that is not in the student's observation."""
+    names, known = ([e.name for e in env.layout] for env in (lesson.teachers, lesson.cars))
+    return [names.index(name) for name in lesson.teacher.needs if name not in known]
 
 
 def _curvature(cars: Any, teacher: Any, obs: Single) -> Single:
@@ -134,7 +151,8 @@ def distill(
     begun, target, steps = time.process_time(), Path(path), 0
     cars = lessons[0].cars
     seeds = itertools.count(DISTILLING + course.seed * _SEEDS, cars.num_envs)
-    model = Student(len(cars.layout), cars.single_action_space.shape[0], course)
+    width, unseen = cars.single_action_space.shape[0], len(_unseen(lessons[0]))
+    model = Student(len(cars.layout), width, course, unseen)
     policy: Policy | None = None
     scaling: Scaling | None = None
     drives: list[Drives] = []
@@ -146,11 +164,13 @@ def distill(
             first = next(seeds)
             numbers = range(first, first + lesson.cars.num_envs)
             fresh.append(drive(lesson, policy, numbers, course.noise, most))
-        drives += fresh
         steps += sum(int((each.weights > 0.0).sum()) for each in fresh)
         if scaling is None:
             scaling = scaling_of(fresh, cars.layout, lessons[0].teacher.needs)
             usual = [float(np.median(each.costs)) for each in fresh]
+            told = np.concatenate([each.told[each.weights > 0.0] for each in fresh])
+            middle, scale = told.mean(0), 1.0 / np.maximum(told.std(0), 1e-9)
+        drives += [each._replace(told=normalised(each.told, middle, scale)) for each in fresh]
         epochs = course.epochs * (LONGER if i == course.rounds - 1 else 1)
         loss = fitted(model, drives, scaling, course, epochs)
         rounds.append(Round(steps, float(np.mean([each.costs.mean() for each in fresh])), loss))

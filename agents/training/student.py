@@ -26,28 +26,34 @@ Single = npt.NDArray[np.float32]
 
 CLIP = 8.0  # standard deviations of an input
 WINDOW = 50  # steps through which the gradient goes back in time
-BATCH = 16  # episodes
 SAMPLES = 512  # steps of a batch without memory
 LONGER = 3  # times as many epochs in the last round
 UNREAD = ("gps_X", "gps_Y", "gps_satellites")
 """Where the car is says nothing of how to hold it."""
 _LEAST = 1e-3  # variance, of what varies by 1, that a mixture of inputs has at least
 
-Batch = tuple[Any, Any, Any, Any, bool]
-"""Mixed observations (B, T, k), labels (B, T, m), weights (B, T), curvatures (B, m, m), and
-whether it begins the episodes."""
+Batch = tuple[Any, Any, Any, Any, Any, bool]
+"""Mixed observations (B, T, k), labels (B, T, m), what is told (B, T, q), weights (B, T),
+curvatures (B, m, m), and whether it begins the episodes."""
 
 
 class Drives(NamedTuple):
     """Episodes of a lesson, oldest step first: observations (N, T, k), the teacher's actions
-    (N, T, m), and the weights of their errors (N, T), zero where an episode was over. curvature:
-    (m, m), of a lesson. costs: (N,)."""
+    (N, T, m), what it reads that is not in them (N, T, q), and the weights of the actions' errors
+    (N, T), zero where an episode was over. curvature: (m, m), of a lesson. costs: (N,)."""
 
     obs: Single
     labels: Single
+    told: Single
     weights: Single
     curvature: Single
     costs: Array
+
+    @property
+    def missed_by_zero(self) -> float:
+        """The loss of a student that does nothing, all episodes together."""
+        each = np.einsum("nti,ij,ntj->nt", self.labels, self.curvature, self.labels)
+        return float((each * self.weights).sum())
 
 
 class Scaling(NamedTuple):
@@ -75,9 +81,11 @@ class Course:
     over all drives in a round, `LONGER` times as many in the last one. cells: of a GRU, 0 for a
     student without memory. hidden: sizes of the dense layers. learning_rate: of Adam, falling to a
     fiftieth in each round. noise: largest standard deviation of what shakes the teacher's actions.
-    seed: of weights and episodes.
+    seed: of weights and episodes. batch: episodes, for a student with memory. told: how much the
+    squared errors count of what its cells have to say, all that the teacher reads and the student
+    does not see, in standard deviations, where the errors of doing nothing count 1.
 
-    Raises ValueError for a number out of range.
+    Raises ValueError for a number out of range, or something to tell without cells.
     """
 
     rounds: int = 7
@@ -87,12 +95,17 @@ class Course:
     learning_rate: float = 3e-3
     noise: float = 0.02
     seed: int = 0
+    batch: int = 16
+    told: float = 0.0
 
     def __post_init__(self) -> None:
-        if min(self.rounds, self.epochs, *self.hidden) < 1 or min(self.cells, self.seed) < 0:
+        sizes = self.rounds, self.epochs, self.batch, *self.hidden
+        if min(sizes) < 1 or min(self.cells, self.seed) < 0:
             raise ValueError(f"rounds, epochs and sizes are 1 at least, cells and seed 0: {self}")
-        if not (self.learning_rate > 0.0 and self.noise >= 0.0):
-            raise ValueError(f"learning_rate is above zero, noise not below: {self}")
+        if not (self.learning_rate > 0.0 and self.noise >= 0.0 and self.told >= 0.0):
+            raise ValueError(f"learning_rate is above zero, noise and told not below: {self}")
+        if self.told and not self.cells:
+            raise ValueError("a student without cells has nothing to say: told is for those with")
 
     def described(self) -> dict[str, Any]:
         """All numbers but the seed, in JSON types."""
@@ -102,22 +115,27 @@ class Course:
 
 
 class Student(nn.Module):
-    """A GRU, if there is one, and dense layers behind it, on mixed observations."""
+    """A GRU, if there is one, and dense layers behind it, on mixed observations.
 
-    def __init__(self, inputs: int, width: int, course: Course) -> None:
+    told: so many more numbers, linear in what the cells hold, are of use in training alone.
+    """
+
+    def __init__(self, inputs: int, width: int, course: Course, told: int = 0) -> None:
         super().__init__()
         self.cell = nn.GRU(inputs, course.cells, batch_first=True) if course.cells else None
         sizes = [course.cells or inputs, *course.hidden, width]
         self.dense = nn.ModuleList(nn.Linear(a, b) for a, b in itertools.pairwise(sizes))
+        self.tell = nn.Linear(course.cells, told) if course.told else None
         self.recurrent = bool(course.cells)
 
     def forward(self, z: Any, state: Any = None) -> tuple[Any, Any]:
-        """(actions (B, T, m), the next state) of inputs (B, T, k)."""
+        """(actions and what is told (B, T, m + q), the next state) of inputs (B, T, k)."""
         if self.cell is not None:
             z, state = self.cell(z, state)
+        more = [] if self.tell is None else [self.tell(z)]
         for layer in self.dense[:-1]:
             z = nn.functional.silu(layer(z))
-        return self.dense[-1](z), state
+        return torch.cat([self.dense[-1](z), *more], dim=-1), state
 
     def network(self, scaling: Scaling) -> Network:
         """The same function of plain observations, by NumPy."""
@@ -167,50 +185,52 @@ def _joined(parts: Sequence[Single]) -> Any:
 
 
 class _Episodes:
-    """`BATCH` episodes of a few lessons at once, cut into windows that the state goes through."""
+    """Some episodes of a few lessons at once, cut into windows that the state goes through."""
 
-    def __init__(self, drives: Sequence[Drives], scaling: Scaling) -> None:
-        self.drives, self.scaling = drives, scaling
+    def __init__(self, drives: Sequence[Drives], scaling: Scaling, course: Course) -> None:
+        self.drives, self.scaling, self.batch = drives, scaling, course.batch
         self.everyone = [(i, j) for i, each in enumerate(drives) for j in range(len(each.costs))]
         longest = max(each.weights.shape[1] for each in drives)
-        self.most = -(-len(self.everyone) // BATCH) * -(-longest // WINDOW)
+        self.most = -(-len(self.everyone) // self.batch) * -(-longest // WINDOW)
 
     def __iter__(self) -> Iterator[Batch]:
-        for chosen in torch.split(torch.randperm(len(self.everyone)), BATCH):
+        names = ("obs", "labels", "told", "weights")
+        for chosen in torch.split(torch.randperm(len(self.everyone)), self.batch):
             rows = [self.everyone[int(i)] for i in chosen]
             longest = max(self.drives[i].weights.shape[1] for i, _ in rows)
-            x, y, w = (
+            arrays = [
                 np.zeros((len(rows), longest, *getattr(self.drives[0], name).shape[2:]), np.float32)
-                for name in ("obs", "labels", "weights")
-            )
+                for name in names
+            ]
             for row, (i, j) in enumerate(rows):
                 length = self.drives[i].weights.shape[1]
-                x[row, :length], y[row, :length] = self.drives[i].obs[j], self.drives[i].labels[j]
-                w[row, :length] = self.drives[i].weights[j]
+                for array, name in zip(arrays, names, strict=True):
+                    array[row, :length] = getattr(self.drives[i], name)[j]
             S = torch.from_numpy(np.stack([self.drives[i].curvature for i, _ in rows]))
-            arrays = (self.scaling.mixed(x), y, w)
+            arrays[0] = self.scaling.mixed(arrays[0])
             for at in range(0, longest, WINDOW):
-                z, labels, weights = (torch.from_numpy(a[:, at : at + WINDOW]) for a in arrays)
-                yield z, labels, weights, S, at == 0
+                z, y, q, w = (torch.from_numpy(a[:, at : at + WINDOW]) for a in arrays)
+                yield z, y, q, w, S, at == 0
 
 
 class _Steps:
     """`SAMPLES` single steps of all drives at once, as if each were an episode."""
 
-    def __init__(self, drives: Sequence[Drives], scaling: Scaling) -> None:
+    def __init__(self, drives: Sequence[Drives], scaling: Scaling, _: Course) -> None:
         there = [each.weights > 0.0 for each in drives]
         self.lesson = torch.cat([torch.full((int(t.sum()),), i) for i, t in enumerate(there)])
         self.curvatures = torch.from_numpy(np.stack([each.curvature for each in drives]))
         pairs = list(zip(drives, there, strict=True))
         self.x = _joined([scaling.mixed(each.obs[t]) for each, t in pairs])
         self.y = _joined([each.labels[t] for each, t in pairs])
+        self.q = _joined([each.told[t] for each, t in pairs])
         self.w = _joined([each.weights[t] for each, t in pairs])
         self.most = -(-len(self.w) // SAMPLES)
 
     def __iter__(self) -> Iterator[Batch]:
         for i in torch.split(torch.randperm(len(self.w)), SAMPLES):
             S = self.curvatures[self.lesson[i]]
-            yield self.x[i, None], self.y[i, None], self.w[i, None], S, True
+            yield *(each[i, None] for each in (self.x, self.y, self.q, self.w)), S, True
 
 
 def fitted(
@@ -222,19 +242,24 @@ def fitted(
     model: gives actions and state as a `Student`; `recurrent` says whether steps belong together.
     """
     optimiser = torch.optim.Adam(model.parameters(), course.learning_rate)
-    batches = (_Episodes if model.recurrent else _Steps)(drives, scaling)
+    batches = (_Episodes if model.recurrent else _Steps)(drives, scaling, course)
     falling = torch.optim.lr_scheduler.LinearLR(optimiser, 1.0, 0.02, epochs * batches.most)
     count = sum(len(each.costs) for each in drives)
     length = sum(int((each.weights > 0.0).sum()) for each in drives) / count
+    idle = sum(each.missed_by_zero for each in drives) / count
     step, total, state = 0, 0.0, None
     for _ in range(epochs):
         total = 0.0
-        for z, y, w, S, begins in batches:
-            actions, state = model(z, None if begins else state)
+        for z, y, q, w, S, begins in batches:
+            out, state = model(z, None if begins else state)
             state = None if state is None else state.detach()
-            error = actions - y
+            there = w > 0.0
+            error = out[..., : y.shape[-1]] - y
             added = torch.einsum("bti,bij,btj->bt", error, S, error) * w
-            loss = length * added.sum() / (w > 0.0).sum().clamp(min=1)  # of an episode
+            loss = length * added.sum() / there.sum().clamp(min=1)  # of an episode
+            if course.told:
+                missed = (out[..., y.shape[-1] :] - q)[there].square().mean()
+                loss = loss / idle + course.told * missed
             optimiser.zero_grad()
             loss.backward()
             norm = nn.utils.clip_grad_norm_(model.parameters(), 1.0)

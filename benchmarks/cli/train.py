@@ -175,7 +175,7 @@ def distill_command(
     name: Annotated[str, typer.Argument(help="Of the file NAME.safetensors.")],
     kind: Annotated[str, typer.Option("--class", help="Of contests, as coms-model.")],
     teacher: Annotated[
-        str, typer.Option(help="A rung, or a controller of the matrix.")
+        str, typer.Option(help="A rung, a controller of the matrix, or a policy.")
     ] = "adaptive-nmpc",
     estimator: Annotated[
         str, typer.Option(help="What the policy reads: joint, or nothing but the sensors.")
@@ -187,6 +187,11 @@ def distill_command(
     hidden: Annotated[
         list[int] | None, typer.Option(help="Size of a dense layer (64, 64).")
     ] = None,
+    batch: Annotated[int, typer.Option(help="Episodes, with a GRU.")] = 16,
+    noise: Annotated[float, typer.Option(help="That shakes the teacher, at most.")] = 0.02,
+    told: Annotated[
+        float, typer.Option(help="Weight of what the teacher reads, as its GRU estimates it.")
+    ] = 0.0,
     seed: Annotated[int, typer.Option(help="Of weights and episodes.")] = 0,
     episodes: Annotated[int, typer.Option(help="Of each contest's test.", min=2)] = 32,
     out: Annotated[Path | None, typer.Option(help="The file; default: NAME here.")] = None,
@@ -198,7 +203,8 @@ def distill_command(
 
     target, console = out or Path(f"{name}.safetensors"), Console()
     check_files(policy=target)
-    course = Course(rounds, epochs, cells, tuple(hidden or (64, 64)), seed=seed)
+    sizes = tuple(hidden or (64, 64))
+    course = Course(rounds, epochs, cells, sizes, noise=noise, seed=seed, batch=batch, told=told)
     about = {"class": kind, "teacher": teacher, "cars": cars, **course.described()}
     options = {"algorithm": "distill", "algorithm_options": about, "seeds": {"training": seed}}
     card = card_of(kind, estimator, teacher, command=command_line(), **options)

@@ -37,6 +37,13 @@ def test_a_student_on_joint_reads_what_its_teacher_reads(teacher: str) -> None:
     assert np.array_equal(*read) and np.ptp(read[0]) > 0.0
 
 
+def test_a_policy_teaches_on_the_filter_of_its_card() -> None:
+    """So that one without a filter learns from one that has it, which costs little to ask."""
+    cars, twins, agent = lessons_of("coms-zero-slip", "distill-coms-yaw", "", 2)[0]
+    there = [{entry.name for entry in env.layout} for env in (cars, twins)]
+    assert set(agent.needs) <= there[1] and "beta_hat" in there[1] - there[0]
+
+
 def test_every_contest_is_in_one_class() -> None:
     kinds = dict.fromkeys(each.kind for each in contests())
     assert sum(len(contests_of(kind)) for kind in kinds) == len(contests())

@@ -87,8 +87,7 @@ def solved_by_ipopt(agent: Nmpc, found: Any, monkeypatch: pytest.MonkeyPatch) ->
     [
         (0, YAW),
         (1, AFS),
-        (2, YAW),
-        (3, AFS),
+        *(pytest.param(*each, marks=pytest.mark.long) for each in ((2, YAW), (3, AFS))),
         *(pytest.param(i, (AFS, YAW)[i % 2], marks=pytest.mark.long) for i in range(len(SLIDES))),
     ],
 )

@@ -22,6 +22,7 @@ from sideslip.agents.training.student import (
     Scaling,
     Student,
     fitted,
+    normalised,
     scaling_of,
 )
 
@@ -80,6 +81,31 @@ def test_the_network_is_torchs(cells: int) -> None:
     theirs = student(torch.from_numpy(scaling.mixed(x)))[0].detach().numpy()
     ours = np.stack(rolled(student.network(scaling), x), axis=1)
     assert np.abs(ours - theirs).max() < 1e-6 < np.abs(np.diff(ours, axis=1)).max()
+
+
+def test_what_is_told_is_what_the_teacher_reads_and_the_student_does_not_see() -> None:
+    """On seeds that it has not seen, the cells know the yaw rate, which so short a training shows
+    them; the policy's file has nothing of it."""
+    seen, other = (drive(lesson(), None, range(at, at + CARS), 0.1) for at in (0, 900))
+    cars, _, teacher = lesson()
+    names = [entry.name for entry in cars.layout]
+    told = [name for name in teacher.needs if name not in names]
+    assert {"beta_hat", "gamma_hat"} <= set(told) and len(told) == seen.told.shape[2]
+    rates = seen.told[..., told.index("gamma_hat")], seen.obs[..., names.index("gyro")]
+    assert np.corrcoef(*(each.ravel() for each in rates))[0, 1] > 0.9
+    mean, scale = seen.told.mean((0, 1)), 1.0 / np.maximum(seen.told.std((0, 1)), 1e-9)
+    seen, other = (x._replace(told=normalised(x.told, mean, scale)) for x in (seen, other))
+    course = replace(COURSE, told=1.0)
+    torch.manual_seed(0)
+    model = Student(len(names), 1, course, len(told))
+    scaling = scaling_of([seen], cars.layout, ("beta_hat",))
+    fitted(model, [seen], scaling, course, 60)
+    out = model(torch.from_numpy(scaling.mixed(other.obs)))[0].detach().numpy()
+    missed, varies = (x.mean((0, 1)) for x in ((out[..., 1:] - other.told) ** 2, other.told**2))
+    rate = told.index("gamma_hat")
+    assert missed[rate] < 0.3 * varies[rate]
+    assert model.network(scaling).width == 1
+    assert Student(5, 1, COURSE, 2).tell is None
 
 
 def test_a_teacher_of_other_cars_is_refused() -> None:
@@ -143,6 +169,9 @@ def test_a_training_that_diverges_stops_with_the_step_and_leaves_the_last_good_f
         ({"seed": -1}, "1 at least"),
         ({"learning_rate": float("nan")}, "learning_rate"),
         ({"noise": -0.1}, "learning_rate is above zero, noise"),
+        ({"told": -1.0}, "noise and told not below"),
+        ({"batch": 0}, "1 at least"),
+        ({"told": 1.0, "cells": 0}, "nothing to say"),
     ],
 )
 def test_a_course_out_of_range_is_refused(wrong: dict[str, Any], message: str) -> None:

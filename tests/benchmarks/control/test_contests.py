@@ -130,12 +130,13 @@ def test_every_tier_has_its_contests_and_they_can_be_built() -> None:
 
 
 SCORED = contests() if module.FILE.is_file() else ()
-FIRST = {contest.tier: contest for contest in SCORED[::-1]}
+ENDS = {contest.tier: contest for contest in SCORED[::-1] if contest.tier in ("1", "2c")}
 
 
-@pytest.mark.parametrize("contest", FIRST.values(), ids=FIRST)
+@pytest.mark.parametrize("contest", ENDS.values(), ids=ENDS)
 def test_the_ladder_falls_in_a_sample(contest: Contest) -> None:
-    """Nominal costs more than oracle-state, paired, in the first scored contest of each tier."""
+    """Nominal costs more than oracle-state, paired, in a contest of the mildest and one of the
+    hardest tier."""
     falls(contest, 24)
 
 
