@@ -92,7 +92,7 @@ def test_what_is_told_is_what_the_teacher_reads_and_the_student_does_not_see() -
     told = [name for name in teacher.needs if name not in names]
     assert {"beta_hat", "gamma_hat"} <= set(told) and len(told) == seen.told.shape[2]
     rates = seen.told[..., told.index("gamma_hat")], seen.obs[..., names.index("gyro")]
-    assert np.corrcoef(*(each.ravel() for each in rates))[0, 1] > 0.9
+    assert np.corrcoef(rates[0].ravel(), rates[1].ravel())[0, 1] > 0.9
     mean, scale = seen.told.mean((0, 1)), 1.0 / np.maximum(seen.told.std((0, 1)), 1e-9)
     seen, other = (x._replace(told=normalised(x.told, mean, scale)) for x in (seen, other))
     course = replace(COURSE, told=1.0)
