@@ -47,8 +47,8 @@ CONTROLLERS: dict[str, tuple[str, ...]] = {
 RUNGS = (NOMINAL, PARAMETERS, STATE)
 _CANDIDATES = tuple(name for those in ORACLES.values() for name in those)
 LEARNED: dict[str, tuple[tuple[str, str], ...]] = {
-    "car-steering": (("joint", "distill-car-steering"),),
-    "car-yaw": (("joint", "distill-car-yaw"),),
+    "car-steering": (("joint", "distill-car-steering"), ("", "raw-car-steering")),
+    "car-yaw": (("joint", "distill-car-yaw"), ("", "raw-car-yaw")),
     "coms-model": (("joint", "distill-coms-steering"),),
     "coms-zero-slip": (("joint", "distill-coms-yaw"),),
 }
