@@ -15,7 +15,7 @@ INSTALL := PIP_CONSTRAINT=constraints.txt PIP_BUILD_CONSTRAINT=constraints.txt \
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
-.PHONY: help bench bench-full test test-all test-stock coverage lint types docs wheel clean
+.PHONY: help bench bench-full test test-plain test-all test-stock coverage lint types docs wheel clean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1\t\2/p' Makefile | expand -t 18
@@ -26,11 +26,13 @@ bench: .venv/ready-bench ## compare estimators and controllers on few seeds; wri
 bench-full: .venv/ready-bench ## the same on all seeds, hours on two cores; goes on where it was stopped
 	$(BIN)/sideslip bench --html report.html --json results.json --keep .bench $(if $(LOG),--log "$(LOG)")
 
-test: .venv/ready-all ## the tests, the examples in docstrings, and the marked tests without compilation
+test: .venv/ready-all ## the tests and the examples in docstrings
 	$(PYTEST) $(TOGETHER) -m "not long" $(DOCTESTS)
+
+test-plain: .venv/ready-all ## the marked tests without compilation
 	NUMBA_DISABLE_JIT=1 $(PYTEST) $(TOGETHER) -m "plain and not compiled and not long"
 
-test-all: .venv/ready-all ## the same with the long tests
+test-all: .venv/ready-all ## both with the long tests
 	$(PYTEST) $(TOGETHER) $(DOCTESTS)
 	NUMBA_DISABLE_JIT=1 $(PYTEST) $(TOGETHER) -m "plain and not compiled"
 
