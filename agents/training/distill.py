@@ -169,7 +169,8 @@ def distill(
             scaling = scaling_of(fresh, cars.layout, lessons[0].teacher.needs)
             usual = [float(np.median(each.costs)) for each in fresh]
             told = np.concatenate([each.told[each.weights > 0.0] for each in fresh])
-            middle, scale = told.mean(0), 1.0 / np.maximum(told.std(0), 1e-9)
+            middle, spread = told.mean(0), told.std(0)
+            scale = np.where(spread > 1e-9, 1.0 / np.maximum(spread, 1e-9), 0.0)
         drives += [each._replace(told=normalised(each.told, middle, scale)) for each in fresh]
         epochs = course.epochs * (LONGER if i == course.rounds - 1 else 1)
         loss = fitted(model, drives, scaling, course, epochs)
