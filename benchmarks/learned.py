@@ -32,6 +32,7 @@ EPISODES, QUICK_EPISODES = 32, 4
 PAPERS = ("two-dof", "model-following")
 RIVALS = tuple(ADAPTIVE.values())
 """Against whom episodes are counted, beside nominal and the papers'."""
+LEAST = 0.1  # mean log ratio between nominal and oracle-parameters, of which there are shares
 _LEVELS = np.geomspace(0.1, 10.0, 41)
 _TEXT = (
     "The shipped policies beside controllers on the same late sensors, on salted seeds and in "
@@ -97,12 +98,12 @@ class Found:
     driven: dict[str, list[dict[str, Driven]]] = field(default_factory=dict)
 
     def shared(self, name: str, condition: str) -> Estimate:
-        """A contestant's share of the gap in a condition."""
-        found = [
-            Yardstick(each[NOMINAL], each[PARAMETERS]).paired(each[name])
-            for each in self.driven[condition]
-        ]
-        return score(found)
+        """A contestant's share of the gap in a condition; NaN of one below `LEAST`."""
+        there = self.driven[condition]
+        yards = [Yardstick(each[NOMINAL], each[PARAMETERS]) for each in there]
+        if not np.mean([yard.gap for yard in yards]) > LEAST:
+            return Estimate(np.nan)
+        return score([yard.paired(each[name]) for yard, each in zip(yards, there, strict=True)])
 
     def ratios(self, name: str) -> Array:
         """Cost over nominal's, of each episode in all conditions and contests; infinite where it
@@ -174,7 +175,7 @@ def answer(found: Sequence[Found]) -> str:
     for each in found:
         _, policy = LEARNED[each.kind][0]
         shares = {name: each.shared(policy, name).value for name in CONDITIONS}
-        worst_name = min(shares, key=lambda name: shares[name])
+        worst_name = min(shares, key=lambda name: np.nan_to_num(shares[name], nan=np.inf))
         better = won(each.costs(policy), each.costs(RIVALS[0])).value
         lines.append(
             f"{policy} closes {shares[TRAINED]:.2f} of the gap, {shares[worst_name]:.2f} with "
@@ -190,7 +191,7 @@ def _tabled(suite: Suite, found: Found) -> None:
     shares, all_in_all = [], []
     for who in names:
         mine = {condition: found.shared(who, condition) for condition in CONDITIONS}
-        shares.append([who, *(f"{e.value:.2f} [{e.low:.2f}, {e.high:.2f}]" for e in mine.values())])
+        shares.append([who, *map(_shown, mine.values())])
         costs = found.costs(who)
         ratio = worst((costs + FLOOR) / (found.costs(NOMINAL) + FLOOR)).value
         beaten = [
@@ -206,6 +207,8 @@ def _tabled(suite: Suite, found: Found) -> None:
             suite.rows.append(Row.of("score", each, **where, **who_and_how, **version))
     driven = ", ".join(each.scenario for each in chosen(found.kind))
     note = f"{driven}; {episodes // len(CONDITIONS)} episodes a condition, the same for everybody."
+    if any("-" in row for row in shares):
+        note += f" -: nominal's mean log ratio to {PARAMETERS} is below {LEAST}."
     suite.tables += [
         Table(f"{found.kind}: share of the gap", ("controller", *CONDITIONS), shares, note),
         Table(
@@ -215,6 +218,12 @@ def _tabled(suite: Suite, found: Found) -> None:
             f"Of {episodes} episodes. worst 5 %: mean of the largest ratios to nominal's cost.",
         ),
     ]
+
+
+def _shown(share: Estimate) -> str:
+    """A share, or "-" where there is no gap."""
+    value, low, high = share
+    return f"{value:.2f} [{low:.2f}, {high:.2f}]" if np.isfinite(value) else "-"
 
 
 def _illustrated(suite: Suite, found: Sequence[Found]) -> None:

@@ -57,8 +57,8 @@ CONTROLLERS = {
     "distill-coms-yaw": "#2E8B9E",
     "distill-car-steering": "#B0603A",
     "distill-car-yaw": "#5E8F2E",
-    "raw-car-steering": "#C0705A",
-    "raw-car-yaw": "#4F9E6F",
+    "raw-car-steering": "#1F93C6",
+    "raw-car-yaw": "#2A8DBD",
 }
 RUNGS = {
     "nominal": "#CF00B4",

@@ -52,11 +52,14 @@ def test_the_share_is_of_the_gap_between_nominal_and_the_car_that_is_known() -> 
     cases = {NOMINAL: 1.0, PARAMETERS: 0.25, "half": 0.5, "dearer": 2.0}
     mine = {name: driven(factor * nominal) for name, factor in cases.items()}
     mine["fails"] = driven(0.25 * nominal, rng.random(400) < 0.1)
-    found = Found("car-yaw", {TRAINED: [mine]})
+    small = mine | {PARAMETERS: driven(0.95 * nominal)}
+    found = Found("car-yaw", {TRAINED: [mine], "a quarter heavier": [small]})
+    assert np.isnan(found.shared("half", "a quarter heavier").value)
     expected = {NOMINAL: 0.0, PARAMETERS: 1.0, "half": 0.5, "dearer": -0.5}
     for name, share in expected.items():
         assert found.shared(name, TRAINED).value == pytest.approx(share, abs=2e-3)
     assert found.shared("fails", TRAINED).high < 0.9
+    found.driven.pop("a quarter heavier")
     assert found.failed("fails").mean() == pytest.approx(0.1, abs=0.05)
     ratios = found.ratios("fails")
     assert np.isinf(ratios).mean() == found.failed("fails").mean()
