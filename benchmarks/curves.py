@@ -2,8 +2,8 @@
 
     sideslip train ... --out run-0; python -m sideslip.benchmarks.curves run-0 run-1 ...
 
-Reads the evaluations of finished or running trainings and has `nominal` drive their seeds. What the
-evaluations cost is not counted.
+Reads the evaluations of finished or running trainings and has `nominal` drive their seeds; then
+both drive seeds on which nothing was chosen. What the evaluations cost is not counted.
 """
 
 import json
@@ -11,24 +11,57 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from ..agents.learned.files import load_policy
+from ..agents.learned.policy import Learned
 from ..agents.rollout import costs_of
 from ..agents.rungs import NOMINAL, make_rung
-from ..agents.training.keeper import CURVE, evaluation_seeds
+from ..agents.training.keeper import CURVE, POLICY, evaluation_seeds
 from ..agents.training.train import Task, task_in
+from ..envs.record import Array
+from .control.scores import FLOOR
+from .harness.stats import geometric_mean, interval, ratio_of_means, won
+
+EPISODES = 1024
+FURTHER = 7_000_000
+"""First of the seeds on which no policy was chosen."""
 
 
-def nominal_cost(task: Task) -> float:
-    """Mean cost of `nominal` on the seeds of a training's evaluations.
+def nominal_costs(task: Task, seeds: Sequence[int]) -> Array:
+    """Cost of `nominal` on each seed of a training's task.
 
     Raises ValueError for a mixture, of whose scenarios a rung is built for one only.
     """
     if task.scenarios:
         raise ValueError("nominal is designed for one scenario, and this training is of a mixture")
-    env, agent = make_rung(NOMINAL, task.env_id, task.n_eval_envs, **task.env_options)
-    return float(costs_of(env, agent, evaluation_seeds(task.n_eval_envs)).mean())
+    env, agent = make_rung(NOMINAL, task.env_id, len(seeds), **task.env_options)
+    return costs_of(env, agent, seeds)
+
+
+def further(folders: Sequence[str | Path], episodes: int = EPISODES) -> Table:
+    """The best policy of each training beside `nominal` on seeds that chose nothing, and which of
+    them are level: the ratio's interval reaches 1 or lies below. Raises as `table_of`."""
+    task = _task_of(folders)
+    seeds = range(FURTHER, FURTHER + episodes)
+    nominal = nominal_costs(task, seeds)
+    table = Table("training", "CPU-s", "mean", "geometric mean", "better", "level")
+    level = 0
+    for folder in map(Path, folders):
+        env = task.vector_env(episodes)
+        costs = costs_of(env, Learned(env, load_policy(folder / POLICY)), seeds)
+        ratio = interval(costs, ratio_of_means, nominal)
+        logs = geometric_mean(np.log((costs + FLOOR) / (nominal + FLOOR)))
+        reached, better = ratio.low <= 1.0, won(costs, nominal).value
+        level += reached
+        spent = json.loads((folder / CURVE).read_text().splitlines()[-1])["cpu_seconds"]
+        shown = (f"{each.value:.3f} [{each.low:.3f}, {each.high:.3f}]" for each in (ratio, logs))
+        percent = f"{100.0 * better:.0f} %"
+        table.add_row(str(folder), f"{spent:.0f}", *shown, percent, "yes" if reached else "no")
+    table.title = f"over nominal on {episodes} further seeds; {level} of {len(folders)} level"
+    return table
 
 
 def table_of(folders: Sequence[str | Path]) -> Table:
@@ -37,11 +70,8 @@ def table_of(folders: Sequence[str | Path]) -> Table:
     Raises ValueError for trainings that were evaluated on different tasks, and what `task_in`
     raises.
     """
-    tasks = [task_in(folder) for folder in folders]
-    judged = [(each.env_id, each.env_options, each.n_eval_envs) for each in tasks]
-    if any(each != judged[0] for each in judged):
-        raise ValueError("these trainings were evaluated on different tasks")
-    nominal = nominal_cost(tasks[0])
+    task = _task_of(folders)
+    nominal = float(nominal_costs(task, evaluation_seeds(task.n_eval_envs)).mean())
     curves = [_curve(Path(folder), nominal) for folder in folders]
     table = Table("CPU-s", *map(str, folders), title=f"mean cost / nominal's {nominal:.4g}")
     last = max(curve[-1][0] for curve in curves)
@@ -53,6 +83,15 @@ def table_of(folders: Sequence[str | Path]) -> Table:
     return table
 
 
+def _task_of(folders: Sequence[str | Path]) -> Task:
+    """The task that all of these trainings were evaluated on; ValueError where there is none."""
+    tasks = [task_in(folder) for folder in folders]
+    judged = [(each.env_id, each.env_options, each.n_eval_envs, each.around) for each in tasks]
+    if any(each != judged[0] for each in judged):
+        raise ValueError("these trainings were evaluated on different tasks")
+    return tasks[0]
+
+
 def _curve(folder: Path, nominal: float) -> list[tuple[float, float]]:
     """(CPU-seconds, cost over nominal's) of each evaluation."""
     lines = map(json.loads, (folder / CURVE).read_text().splitlines())
@@ -60,4 +99,6 @@ def _curve(folder: Path, nominal: float) -> list[tuple[float, float]]:
 
 
 if __name__ == "__main__":
-    Console().print(table_of(sys.argv[1:]))
+    console = Console()
+    console.print(table_of(sys.argv[1:]))
+    console.print(further(sys.argv[1:]))

@@ -2,12 +2,13 @@
 of it in each of them."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
+import numpy as np
 
 from ..agents.learned.card import Card, JsonMap
 from ..agents.learned.files import is_policy, load_policy, save_policy
@@ -15,7 +16,7 @@ from ..envs.arguments import check_choice
 from ..estimators.vector.estimate import EstimateObservation
 from .control.build import estimate_options, make_cars
 from .control.cells import ADAPTIVE, REFERENCE_FILTER, RUNGS, Cell
-from .control.contests import NOMINAL, ORACLES, PARAMETERS, Contest, contests
+from .control.contests import NOMINAL, ORACLES, PARAMETERS, Contest, changed, contests
 from .control.episodes import Chunk, drive
 from .control.scores import gains
 from .control.seeds import salted_seeds
@@ -29,6 +30,9 @@ JOINT, RIVAL = "joint, friction", "adaptive-nmpc"
 OUTPUTS = ("beta", "gamma", "phi", "phi_rate", "F_d", "N_d", "bias", "front_tyres", "rear_tyres",
            "inverse_friction")  # fmt: skip
 """What a student on `joint` reads of it, with standard deviations."""
+VARIED = {"tyres": (0.4, 2.0), "mass": (0.8, 1.3), "camera": (0.01, 0.12), "gps": (2.0, 6.0)}
+"""Of lessons that are varied: factors on each axle's tyres, in every episode, and, of a lesson, on
+the true car's mass; how late its camera is, and how long its GPS is out, in s."""
 _ALONE = (*RUNGS, *(name for names in ORACLES.values() for name in names))
 FILTERS = ("", "joint")
 
@@ -57,26 +61,48 @@ def _options(contest: Contest, teacher: str) -> JsonMap:
     return {"outputs": known, "std": True, "options": own}
 
 
-def lessons_of(kind: str, teacher: str, estimator: str, cars: int) -> "list[Lesson]":
-    """A lesson for each contest of a class.
+def _changes(varied: int, rng: np.random.Generator) -> Iterator[JsonMap]:
+    """What lessons change of their contest's scenario: nothing, then `VARIED` so many times."""
+    yield {}
+    for _ in range(varied):
+        begins, lasts = rng.uniform(0.0, 4.0), rng.uniform(*VARIED["gps"])
+        yield {
+            "front_stiffness": VARIED["tyres"],
+            "rear_stiffness": VARIED["tyres"],
+            "camera_delays": [round(rng.uniform(*VARIED["camera"]), 3)],  # whole ticks
+            "gps_outage": (begins, begins + lasts),
+            "mass": float(rng.uniform(*VARIED["mass"])),
+        }
+
+
+def lessons_of(
+    kind: str, teacher: str, estimator: str, cars: int, varied: int = 0, seed: int = 0
+) -> "list[Lesson]":
+    """A lesson for each contest of a class, and more of each where what the contest keeps varies.
 
     teacher: a rung, a controller of the matrix, which reads its filter there, or a policy, which
-    reads the one of its card. Raises ValueError for another name, or where that observation lacks
-    what the teacher needs.
+    reads the one of its card. cars: of each lesson. varied: lessons of each contest that are
+    varied, as `VARIED` says; no filter and no teacher learns of it. seed: of what is drawn for
+    them. Raises ValueError for another name, or where that observation lacks what the teacher
+    needs.
     """
     from ..agents.training.distill import Lesson
+
+    rng = np.random.default_rng(seed)
 
     reads = {who: name for name, who in ADAPTIVE.items()} | dict.fromkeys(_ALONE, "")
     if is_policy(teacher):
         reads[teacher] = load_policy(teacher).card.estimator
     found = []
     for contest in contests_of(kind):
-        cell = Cell(contest, reads.get(teacher, REFERENCE_FILTER), teacher)
-        twins, agent = make_cars(cell, cars)
-        env: Any = gym.make_vec(contest.env_id, num_envs=cars, **contest.env_options)
-        if estimator:
-            env = EstimateObservation(env, estimator, **_options(contest, teacher))
-        found.append(Lesson(env, twins, agent))
+        for change in _changes(varied, rng):
+            own = {"scenario": changed(contest, change)} if change else {}
+            cell = Cell(contest, reads.get(teacher, REFERENCE_FILTER), teacher, own)
+            twins, agent = make_cars(cell, cars)
+            env: Any = gym.make_vec(contest.env_id, num_envs=cars, **contest.env_options | own)
+            if estimator:
+                env = EstimateObservation(env, estimator, **_options(contest, teacher))
+            found.append(Lesson(env, twins, agent))
     return found
 
 

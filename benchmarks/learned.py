@@ -15,10 +15,8 @@ from rich.console import Console
 
 from .. import __version__
 from ..envs.record import Array
-from ..envs.scenarios.manoeuvres import scenario_from
-from ..envs.vehicle.vehicles import VEHICLES
 from .control.cells import ADAPTIVE, CONTROLLERS, LEARNED, REFERENCE_FILTER, Cell
-from .control.contests import NOMINAL, PARAMETERS, Contest, contests
+from .control.contests import NOMINAL, PARAMETERS, Contest, changed, contests
 from .control.episodes import Driven
 from .control.run import Results, measure
 from .control.scores import FAILED, FLOOR, Yardstick, score
@@ -56,19 +54,12 @@ CONDITIONS: Mapping[str, Mapping[str, Any]] = {
     "gyro 0.5 deg/s off": {"noise": {"gyro_bias": float(np.radians(0.5))}},
     "a quarter heavier": {"mass": 1.25},
 }
-"""What each one changes of a contest's scenario; noise comes to the scenario's own, the mass is a
-factor of the true car's."""
+"""What each one changes of a contest's scenario, as `contests.changed` takes it."""
 
 
 def scenario_in(contest: Contest, condition: str) -> dict[str, Any]:
     """A contest's scenario in a condition, over its name."""
-    change, base = dict(CONDITIONS[condition]), scenario_from(contest.scenario)
-    if "noise" in change:
-        change["noise"] = dict(base.noise) | change["noise"]
-    if "mass" in change:
-        mass = change.pop("mass") * VEHICLES[contest.vehicle].mass
-        change["vehicle"] = dict(base.vehicle) | {"mass": mass}
-    return {"base": contest.scenario} | change
+    return changed(contest, CONDITIONS[condition])
 
 
 def contestants(contest: Contest) -> list[tuple[str, str]]:

@@ -180,7 +180,13 @@ def distill_command(
     estimator: Annotated[
         str, typer.Option(help="What the policy reads: joint, or nothing but the sensors.")
     ] = "joint",
-    cars: Annotated[int, typer.Option(help="Of each contest and round.", min=1)] = 6,
+    cars: Annotated[int, typer.Option(help="Of each lesson and round.", min=1)] = 6,
+    varied: Annotated[
+        int,
+        typer.Option(
+            min=0, help="Lessons of each contest with another car, camera delay and GPS outage."
+        ),
+    ] = 0,
     rounds: Annotated[int, typer.Option(help="Of driving and learning.")] = 7,
     epochs: Annotated[int, typer.Option(help="Passes over all drives in a round.")] = 12,
     cells: Annotated[int, typer.Option(help="Of its GRU; 0: no memory.")] = 0,
@@ -205,11 +211,12 @@ def distill_command(
     check_files(policy=target)
     sizes = tuple(hidden or (64, 64))
     course = Course(rounds, epochs, cells, sizes, noise=noise, seed=seed, batch=batch, told=told)
-    about = {"class": kind, "teacher": teacher, "cars": cars, **course.described()}
+    about = {"class": kind, "teacher": teacher, "cars": cars, "varied": varied}
+    about |= course.described()
     options = {"algorithm": "distill", "algorithm_options": about, "seeds": {"training": seed}}
     card = card_of(kind, estimator, teacher, command=command_line(), **options)
 
-    lessons = lessons_of(kind, teacher, estimator, cars)
+    lessons = lessons_of(kind, teacher, estimator, cars, varied, seed)
 
     def show(now: Round) -> None:
         text = f"{now.steps:,} steps, mean cost {now.cost:.4g}, loss {now.loss:.3g}"

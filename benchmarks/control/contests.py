@@ -5,7 +5,7 @@ Those of a tier are chosen once, on tuning seeds, by what is to be won there (`c
 """
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
@@ -14,7 +14,8 @@ from typing import Any
 from ... import __version__
 from ...agents import rungs
 from ...envs.arguments import check_choice
-from ...envs.scenarios.manoeuvres import SCENARIOS
+from ...envs.scenarios.manoeuvres import SCENARIOS, scenario_from
+from ...envs.vehicle.vehicles import VEHICLES
 from ..harness.results import made_of, read_objects, write_text
 
 YAW = "sideslip/YawFusion-v0"
@@ -72,6 +73,21 @@ class Contest:
         car = {"vehicle": self.vehicle, "nominal": self.vehicle} if self.vehicle else {}
         judged = {"reference": self.reference} if self.reference else {}
         return {"scenario": self.scenario} | car | judged
+
+
+def changed(contest: Contest, change: Mapping[str, Any]) -> dict[str, Any]:
+    """A contest's scenario, over its name, with some fields changed.
+
+    change: fields of `Scenario`; noise comes to the scenario's own, and "mass" is a factor on the
+    true car's, of which controllers and filters know nothing.
+    """
+    fields, base = dict(change), scenario_from(contest.scenario)
+    if "noise" in fields:
+        fields["noise"] = dict(base.noise) | fields["noise"]
+    if "mass" in fields:
+        mass = fields.pop("mass") * VEHICLES[contest.vehicle].mass
+        fields["vehicle"] = dict(base.vehicle) | {"mass": mass}
+    return {"base": contest.scenario} | fields
 
 
 @dataclass(frozen=True)

@@ -4,15 +4,19 @@ import json
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
+import numpy as np
 import pytest
 from rich.console import Console
 
 pytest.importorskip("stable_baselines3")
+from sideslip.agents import make_agent
 from sideslip.agents.rollout import costs_of
 from sideslip.agents.rungs import make_rung
 from sideslip.agents.training import keeper
-from sideslip.agents.training.train import CURVE, Means, Task, train
-from sideslip.benchmarks.curves import table_of
+from sideslip.agents.training.train import CURVE, POLICY, Means, Task, train
+from sideslip.benchmarks import curves
+from sideslip.benchmarks.curves import FURTHER, further, table_of
 
 SHORT: dict[str, Any] = {"scenario": {"base": "random-steering", "duration": 0.5}}
 
@@ -39,6 +43,23 @@ def test_a_training_stands_over_nominal_by_cpu_seconds(folder: Path) -> None:
     with console.capture() as shown:
         console.print(table)
     assert str(folder) in shown.get()
+
+
+def test_on_further_seeds_the_best_policy_is_driven_beside_nominal(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The kept one, not the last; level is one that may cost as little as nominal."""
+    found = further([folder], 16)
+    mean, better = (str(next(iter(found.columns[i].cells))) for i in (2, 4))
+    seeds = range(FURTHER, FURTHER + 16)
+    cars = gym.make_vec("sideslip/YawVision-v0", num_envs=16, **SHORT)
+    costs = costs_of(cars, make_agent(str(folder / POLICY), cars), seeds)
+    nominal = costs_of(*make_rung("nominal", "sideslip/YawVision-v0", 16, **SHORT), seeds)
+    assert mean.split()[0] == f"{costs.mean() / nominal.mean():.3f}"
+    assert better == f"{100 * np.mean(costs < nominal):.0f} %"
+    for dearer, level in ((0.1, "0 of 1 level"), (10.0, "1 of 1 level")):
+        monkeypatch.setattr(curves, "nominal_costs", lambda *_, of=dearer: of * nominal)
+        assert level in str(further([folder], 16).title)
 
 
 def test_what_cannot_be_compared_is_refused(folder: Path, tmp_path: Path) -> None:

@@ -8,7 +8,8 @@ import pytest
 pytest.importorskip("torch")
 from sideslip.benchmarks.control.cells import ADAPTIVE
 from sideslip.benchmarks.control.contests import contests
-from sideslip.benchmarks.distillation import FILTERS, card_of, contests_of, lessons_of
+from sideslip.benchmarks.distillation import FILTERS, VARIED, card_of, contests_of, lessons_of
+from sideslip.envs.vehicle.vehicles import VEHICLES
 from tests.benchmarks.conftest import Run
 
 
@@ -42,6 +43,38 @@ def test_a_policy_teaches_on_the_filter_of_its_card() -> None:
     cars, twins, agent = lessons_of("coms-zero-slip", "distill-coms-yaw", "", 2)[0]
     there = [{entry.name for entry in env.layout} for env in (cars, twins)]
     assert set(agent.needs) <= there[1] and "beta_hat" in there[1] - there[0]
+
+
+def test_varied_lessons_differ_in_what_training_is_to_cover() -> None:
+    """Tyres, mass, camera and GPS are others; not the observation, nor the teacher's cars."""
+    lessons = lessons_of("coms-zero-slip", "oracle-state-lqr", "", 32, varied=1)
+    assert len(lessons) == 2 * len(contests_of("coms-zero-slip"))
+    masses, late = set(), set()
+    for plain, varied in zip(lessons[::2], lessons[1::2], strict=True):
+        assert plain.cars.layout == varied.cars.layout
+        for env in (plain.cars, varied.cars, varied.teachers):
+            env.reset(seed=list(range(32)))
+        assert list(varied.cars.vehicle) == list(varied.teachers.unwrapped.vehicle)
+        usual, drawn = (
+            [car.front_stiffness / VEHICLES["coms"].front_stiffness for car in lesson.cars.vehicle]
+            for lesson in (plain, varied)
+        )
+        assert min(drawn) < 0.6 <= min(usual) and max(usual) <= 1.4 < max(drawn)
+        masses.add(varied.cars.vehicle[0].mass / VEHICLES["coms"].mass)
+        late.add(varied.cars.slow_sensors[0]["camera"].delays)
+    assert len(masses) == len(late) == 7
+    assert VARIED["mass"][0] < min(masses) < 1.0 < max(masses) < VARIED["mass"][1]
+
+
+def test_the_gps_of_a_varied_lesson_is_out_for_seconds() -> None:
+    plain, varied = (lesson.cars for lesson in lessons_of("coms-zero-slip", "none", "", 1, 1)[:2])
+    ages = []
+    for cars in (plain, varied):
+        column = [entry.name for entry in cars.layout].index("gps_age")
+        cars.reset(seed=[3])
+        steps = [cars.step(np.zeros((1, 1), np.float32))[0][0, column] for _ in range(500)]
+        ages.append(max(steps[60:]))  # before it none has come
+    assert ages[0] < 0.6 and ages[1] > 1.0
 
 
 def test_every_contest_is_in_one_class() -> None:

@@ -21,7 +21,7 @@ def joint(front: float, rear: float, **options: Any) -> Any:
 
 
 TYRES, LATE = ((1.0, 1.0), (0.7, 1.3), (1.4, 0.7)), (0.0, 0.013, 0.06, 0.1)
-QUICK = {(TYRES[0], 0.0), (TYRES[0], 0.06), (TYRES[1], 0.1), (TYRES[2], 0.013)}
+QUICK = {(TYRES[0], 0.0), (TYRES[2], 0.06)}
 SLOW = [pair for pair in itertools.product(TYRES, LATE) if pair not in QUICK]
 
 
