@@ -7,8 +7,8 @@ from typing import Any
 from ..envs.backend.extras import extra
 from ..envs.backend.files import whole
 from ..envs.rendering.palette import INK, colour
+from .control.answer import on_its_own
 from .control.contests import TITLES
-from .control.ladder import on_its_own
 from .harness.metrics import METRICS
 from .harness.results import Row, ShareMap, Suite
 from .report.colours import SHARE_SCALE

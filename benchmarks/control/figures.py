@@ -15,12 +15,12 @@ from ..harness.explorer import Explorer, Panel
 from ..harness.results import Suite
 from ..harness.stats import Estimate, geometric_mean
 from ..report.kml import track_kml
+from .answer import best_controller, on_its_own
 from .build import agent_options, estimate_options, name_of
 from .cells import REFERENCE_CONTROLLER, RUNGS, TRUTH, Cell
 from .contests import NOMINAL, TITLES, Contest
-from .delay_price import DELAYS, PRICE_CONTEST, Price, lines
 from .episodes import SIGNALS
-from .ladder import best_controller, on_its_own
+from .ladder import DELAYS, PRICE_CONTEST, Price, lines
 from .run import Results
 from .tables import Standing
 

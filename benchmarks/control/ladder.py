@@ -1,24 +1,41 @@
-"""The ladder of rungs: its yardsticks, whether it falls, what each step of knowledge costs, and the
-answer."""
+"""The ladder of rungs: its yardsticks, whether it falls, what each step of knowledge costs, and
+what knowing late does: the price of delay."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+from rich.console import Console
 
 from ...envs.task.failures import FAILURES
 from ..harness.results import Table
 from ..harness.stats import Estimate, average, chance_of_no_less, geometric_mean, holm
-from ..harness.verdict import leader, some, verdict
-from .cells import ADAPTIVE, REFERENCE_CONTROLLER, REFERENCE_FILTER, RUNGS, TRUTH, Cell
-from .contests import NOMINAL, PARAMETERS, STATE, TITLES, Contest, oracle_of
-from .delay_price import DELAYS, Price
+from .cells import REFERENCE_CONTROLLER, REFERENCE_FILTER, RUNGS, Cell
+from .contests import (
+    NOMINAL,
+    ORACLES,
+    PARAMETERS,
+    STATE,
+    TITLES,
+    YAW,
+    Contest,
+    oracle_of,
+)
 from .episodes import Array
-from .run import Results
-from .scores import NOTHING, Yardstick, survived
+from .run import Results, measure
+from .scores import NOTHING, Yardstick, gains, survived
 from .tables import Standing
 
 _OF_THE_CAR = ("none", "spin", "off-road")
 CLAIRVOYANT = "clairvoyant"
+DELAYS = (0.0, 0.05, 0.1, 0.2, 0.3)  # s, of camera and GPS alike, beside what the seed draws
+FRAME = 0.05  # s: so slow that a camera's frames 0.3 s late find room under way
+PRICE_CONTEST = Contest("1", YAW, "coms", "zero-slip", "coms-random")
+CONTESTANTS = (
+    *((NOMINAL, ""), (ORACLES[PARAMETERS][0], ""), (ORACLES[STATE][0], "")),
+    *((REFERENCE_CONTROLLER, each) for each in (REFERENCE_FILTER, "multirate-kf", "bicycle-kf")),
+)
 
 
 def yardsticks(results: Results, contests: Sequence[Contest]) -> dict[Contest, Yardstick]:
@@ -144,137 +161,6 @@ def knowledge_table(results: Results, tiers: Mapping[str, Sequence[Contest]],
     return Table("What not knowing costs", header, cells, note, keyed=False)
 
 
-Gains = dict[Contest, Array]
-"""r of a contestant's episodes in the contests that count."""
-
-
-def answer(
-    found: Mapping[str, Sequence[Standing]],
-    prices: Sequence[Price] = (),
-    ahead: Mapping[Contest, Array] | None = None,
-) -> str:
-    """The verdict over all tiers: the best estimator, the best controller, and why.
-
-    ahead: (n,) log(J_oracle-state / J_clairvoyant) of calibrated contests.
-    """
-    filters, others = _estimators(found), _controllers(found)
-    none = others.get("none", {})
-    best = best_controller(found)
-    over = _over(others[best], none) if none and best != "none" else None
-    text = f", {100.0 * over.value:.0f} % of no control's" if over else ""
-    episodes = max((len(r) for each in others.values() for r in each.values()), default=0)
-    return verdict(
-        "Estimators infer how the car slides, controllers make torque of it; cost: squared error.",
-        f"Best estimator: {_first(filters)}.",
-        f"Best controller: {_first(others)}{text}.",
-        _why(found, prices, ahead or {}),
-        f"{_elsewhere(found)}Not covered: other cars and roads, and less than {episodes} "
-        "episodes a contest can tell.",
-    )
-
-
-def on_its_own(controller: str, estimator: str) -> bool:
-    """Whether that is the filter on which a controller is compared with others: the reference,
-    none, or the one whose tyres it follows."""
-    return estimator in ("", REFERENCE_FILTER) or ADAPTIVE.get(estimator) == controller
-
-
-def best_controller(found: Mapping[str, Sequence[Standing]]) -> str:
-    """Who leads over all tiers, "" where nobody has a score."""
-    return next(iter(_ranked(_controllers(found))), "")
-
-
-def _estimators(found: Mapping[str, Sequence[Standing]]) -> dict[str, Gains]:
-    """What each estimator under the reference controller gains, the truth left out."""
-    return _gains(found, "estimator", lambda cell: (
-        cell.controller == REFERENCE_CONTROLLER and cell.estimator != TRUTH))  # fmt: skip
-
-
-def _controllers(found: Mapping[str, Sequence[Standing]]) -> dict[str, Gains]:
-    """What each controller gains on its own filter, the rungs left out."""
-    return _gains(found, "controller", lambda cell: (
-        cell.controller not in RUNGS and on_its_own(cell.controller, cell.estimator)))  # fmt: skip
-
-
-def _gains(
-    found: Mapping[str, Sequence[Standing]], attribute: str, among: Callable[[Cell], bool]
-) -> dict[str, Gains]:
-    made: dict[str, Gains] = {}
-    for each in (each for standings in found.values() for each in standings if among(each.cell)):
-        mine = made.setdefault(getattr(each.cell, attribute), {})
-        mine |= {contest: r for contest, (r, _) in each.pairs.items()}
-    return {name: each for name, each in made.items() if each}
-
-
-def _over(one: Gains, other: Gains) -> Estimate:
-    """One's cost over the other's on the contests and seeds of both; NaN where there are none."""
-    both = [(r, other[contest]) for contest, r in one.items() if contest in other]
-    return geometric_mean(*(b[: len(a)] - a[: len(b)] for a, b in both))
-
-
-def _ranked(those: Mapping[str, Gains]) -> dict[str, dict[str, Estimate]]:
-    """Each one's cost over its rivals', the best first: who costs more than the fewest, of these
-    who costs least of nominal's. Rivals that share no contest are left out, the closest first."""
-    over = {
-        name: {other: _over(mine, theirs) for other, theirs in those.items() if other != name}
-        for name, mine in those.items()
-    }
-    beaten = {name: sum(each.value > 1.0 for each in over[name].values()) for name in those}
-    gained = {name: np.mean([r.mean() for r in mine.values()]) for name, mine in those.items()}
-    order = sorted(those, key=lambda name: (beaten[name], -gained[name]))
-    return {
-        name: dict(sorted(
-            ((other, each) for other, each in over[name].items() if np.isfinite(each.value)),
-            key=lambda rival: -rival[1].value,
-        ))
-        for name in order
-    }  # fmt: skip
-
-
-def _first(those: Mapping[str, Gains]) -> str:
-    """Who leads, and by how much."""
-    ranked = _ranked(those)
-    return leader(*next(iter(ranked.items())), "cost") if ranked else "nobody has a score"
-
-
-def _elsewhere(found: Mapping[str, Sequence[Standing]]) -> str:
-    """The tiers in which somebody else surely leads."""
-    parts = []
-    for tier, standings in found.items():
-        for of in (_estimators, _controllers):
-            overall, here = _ranked(of(found)), _ranked(of({tier: standings}))
-            first, best = (next(iter(each), "") for each in (overall, here))
-            if best != first and first in here.get(best, {}) and here[best][first].high < 1.0:
-                parts.append(f"{best} in tier {tier}")
-    return f"But {some(parts)}. " if parts else ""
-
-
-def _why(
-    found: Mapping[str, Sequence[Standing]],
-    prices: Sequence[Price],
-    ahead: Mapping[Contest, Array],
-) -> str:
-    """What the rungs save: the price of the model, of sensing, of foresight and of delay."""
-    every = [each for standings in found.values() for each in standings]
-    rung = [r for each in every if each.cell.controller == PARAMETERS for r in each.pairs.values()]
-    steps = (
-        ("the true car and road", [r for r, _ in rung]),
-        ("its exact motion", [own - r for r, own in rung]),
-        ("what is ahead", list(ahead.values())),
-    )
-    texts = [
-        f"{what} saves {100.0 * (1.0 - geometric_mean(*(-r for r in logs)).value):.0f} %"
-        for what, logs in steps
-        if logs
-    ]
-    late = [price.over for price in prices if price.cell.controller == REFERENCE_CONTROLLER]
-    delay = ""
-    if late and np.isfinite(late[0][-1].value):
-        grown = 100.0 * (late[0][-1].value / late[0][0].value - 1.0)
-        delay = f"; {DELAYS[-1]:g} s of delay costs {grown:.0f} %"
-    return f"Why: knowing {', then '.join(texts)} of the cost{delay}." if rung else ""
-
-
 def refusals_of(results: Results, late: float = 0.0) -> list[list[str]]:
     """A line for every cell that could not be driven, or whose episodes ended by a failure that is
     not the car's (a NaN, an action that is none): tier, contest, contestant, what happened.
@@ -298,3 +184,51 @@ def refusals_of(results: Results, late: float = 0.0) -> list[list[str]]:
         elif (codes != 0).all():
             lines.append([*where, "every car fails"])
     return lines
+
+
+@dataclass
+class Price:
+    """A contestant's cost over that of nominal with sensors in time, at each delay."""
+
+    cell: Cell
+    over: list[Estimate]
+
+
+def late_cells(delay: float) -> list[Cell]:
+    """The contestants with camera (every FRAME) and GPS a delay (s) late."""
+    late = {"camera_delays": [delay], "camera_jitter": 0.0, "gps_delays": [delay]}
+    scenario = {"base": PRICE_CONTEST.scenario, **late}
+    options = {"scenario": scenario, "camera": {"period": FRAME}}
+    return [Cell(PRICE_CONTEST, estimator, who, options) for who, estimator in CONTESTANTS]
+
+
+def price_of_delay(
+    seeds: Sequence[int],
+    *,
+    jobs: int | None = None,
+    console: Console | None = None,
+    keep: Path | None = None,
+) -> tuple[list[Price], list[Results]]:
+    """Every contestant at each of DELAYS, all on the same seeds, and the results by delay."""
+    found = [measure(late_cells(d), seeds, jobs=jobs, console=console, keep=keep) for d in DELAYS]
+    in_time = found[0].of(PRICE_CONTEST, NOMINAL)
+    prices = []
+    for who, estimator in CONTESTANTS:
+        price = Price(Cell(PRICE_CONTEST, estimator, who), [])
+        for results in found:
+            driven = results.of(PRICE_CONTEST, who, estimator)
+            there = survived(in_time)[: len(driven.costs)]
+            wrong = driven.error or in_time.error
+            logs = np.empty(0) if wrong else -gains(in_time.costs[: len(there)], driven)[there]
+            price.over.append(geometric_mean(logs))
+        prices.append(price)
+    return prices, found
+
+
+def lines(prices: Sequence[Price]) -> Mapping[str, tuple[Array, Array, Array]]:
+    """name to (value, low, high) over the delays, of those that were driven at all of them."""
+    return {
+        price.cell.label: (*np.array(price.over).T,)
+        for price in prices
+        if np.isfinite(price.over).all()
+    }

@@ -10,19 +10,22 @@ from rich.console import Console
 from ... import __version__
 from ...agents.learned.files import is_policy, load_policy
 from ..harness.results import Row, Suite, Table
+from .answer import answer
 from .build import decision_time
 from .calibration import FILE, Entry, check_fresh, driven_there, leads, read_calibration
 from .cells import EPISODES, LEARNED, Cell, cells, some_of
 from .contests import STATE, TITLES, Contest, contests
-from .delay_price import DELAYS, PRICE_CONTEST, Price, price_of_delay
 from .episodes import Array
 from .figures import illustrate
 from .ladder import (
-    answer,
+    DELAYS,
+    PRICE_CONTEST,
+    Price,
     below_the_clairvoyant,
     findings,
     knowledge_table,
     ladder_table,
+    price_of_delay,
     refusals_of,
     yardsticks,
 )

@@ -10,7 +10,7 @@ import pytest
 import sideslip
 from sideslip.agents.learned.files import ENDING
 from sideslip.agents.rollout import rollout
-from sideslip.benchmarks.control import delay_price, run, seeds
+from sideslip.benchmarks.control import ladder, run, seeds
 from sideslip.benchmarks.control.cells import Cell
 from sideslip.benchmarks.control.contests import Contest, contests
 from sideslip.benchmarks.control.episodes import NUMBERS, Driven
@@ -86,8 +86,8 @@ def test_contests_share_no_car(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_the_price_of_delay_is_taken_on_the_salts_seeds(monkeypatch: pytest.MonkeyPatch) -> None:
     cases = asked(monkeypatch)
-    delay_price.price_of_delay(salted_seeds(OTHER, 4))
-    assert len(cases) == len(delay_price.DELAYS) * len(delay_price.CONTESTANTS)
+    ladder.price_of_delay(salted_seeds(OTHER, 4))
+    assert len(cases) == len(ladder.DELAYS) * len(ladder.CONTESTANTS)
     assert {chunk.seeds for _, chunk in cases} == {tuple(salted_seeds(OTHER, 4))}
 
 

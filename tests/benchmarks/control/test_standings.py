@@ -6,13 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sideslip.benchmarks.control.answer import answer, best_controller
 from sideslip.benchmarks.control.cells import REFERENCE_FILTER, Cell
 from sideslip.benchmarks.control.contests import NOMINAL, PARAMETERS, STATE, Contest
 from sideslip.benchmarks.control.episodes import NUMBERS, Driven
 from sideslip.benchmarks.control.ladder import (
-    answer,
     below_the_clairvoyant,
-    best_controller,
     findings,
     knowledge_table,
     ladder_table,
@@ -205,6 +204,18 @@ def test_the_answer_calls_a_tie_a_tie_and_names_who_leads_elsewhere() -> None:
         each.__dict__["pairs"] = {k: there[each.label].pairs[c] for k, c in elsewhere.items()}
     *_, rest = answer({"1": table(found), "2": two}).splitlines()
     assert rest.startswith("But esc in tier 2. ")
+
+
+def test_who_drives_a_part_of_the_contests_is_not_the_best_but_is_named() -> None:
+    """A policy of one class of contests, however little it costs there."""
+    found = results()
+    found.found[Cell(TWO, "joint", "distill-car-yaw")] = episodes(1.2)
+    *_, controller, _, rest = answer({"1": table(found)}).splitlines()
+    assert "controller: lqr, with 33 % [" in controller
+    assert rest.startswith("But distill-car-yaw where it drives. ")
+    found.found[Cell(ONE, "joint", "distill-car-yaw")] = episodes(1.2)
+    *_, controller, _, rest = answer({"1": table(found)}).splitlines()
+    assert "controller: distill-car-yaw, with" in controller and not rest.startswith("But")
 
 
 def test_without_an_episode_that_counts_nobody_wins() -> None:
