@@ -11,7 +11,8 @@ from sideslip.benchmarks.control.build import estimate_options
 from sideslip.benchmarks.control.cells import LEARNED, Cell
 from sideslip.benchmarks.control.contests import NOMINAL, PARAMETERS
 from sideslip.benchmarks.control.episodes import NUMBERS, Driven
-from sideslip.benchmarks.learned import CONDITIONS, TRAINED, Found, chosen, scenario_in
+from sideslip.benchmarks.distillation import VARIED
+from sideslip.benchmarks.learned import CONDITIONS, NEVER_MET, TRAINED, Found, chosen, scenario_in
 from sideslip.envs.scenarios.manoeuvres import scenario_from
 
 
@@ -37,6 +38,23 @@ def test_the_heavier_car_is_heavier_than_controllers_know() -> None:
     env: Any = gym.make(contest.env_id, **contest.env_options | {"scenario": scenario}).unwrapped
     assert env.vehicle.mass == pytest.approx(1.25 * env.nominal.mass)
     assert env.scenario.front_stiffness == scenario_from(contest.scenario).front_stiffness
+
+
+def test_what_training_met_is_what_varied_lessons_vary() -> None:
+    """Else the verdict calls new what is not, or known what is new."""
+    kept = {name: change for name, change in CONDITIONS.items() if name not in NEVER_MET}
+    low, high = VARIED["tyres"]
+    for change in kept.values():
+        tyres = change.get("front_stiffness", (1.0, 1.0))
+        assert low <= tyres[0] and tyres[1] <= high
+        assert VARIED["mass"][0] <= change.get("mass", 1.0) <= VARIED["mass"][1]
+        assert max(change.get("camera_delays", [0.0])) <= VARIED["camera"][1]
+        begins, ends = change.get("gps_outage", (0.0, VARIED["gps"][0]))
+        assert VARIED["gps"][0] <= ends - begins <= VARIED["gps"][1]
+    varied = {"front_stiffness", "rear_stiffness", "mass", "camera_delays", "gps_outage"}
+    for name in NEVER_MET:
+        assert not varied & set(CONDITIONS[name])
+    assert {key for each in kept.values() for key in each} == varied | {"camera_jitter"}
 
 
 def driven(costs: Any, failed: Any = 0.0) -> Driven:
