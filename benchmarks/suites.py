@@ -55,7 +55,7 @@ def _control(suite: Any, r: Request) -> Any:
 
 def _learned(suite: Any, r: Request) -> Any:
     usual = suite.QUICK_EPISODES if r.quick else suite.EPISODES
-    return suite.run(r.episodes or usual, r.jobs, r.console, r.keep)
+    return suite.run(r.episodes or usual, r.jobs, r.console, r.keep, r.quick)
 
 
 def _following(suite: Any, r: Request) -> Any:

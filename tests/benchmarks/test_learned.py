@@ -82,3 +82,16 @@ def test_the_share_is_of_the_gap_between_nominal_and_the_car_that_is_known() -> 
     ratios = found.ratios("fails")
     assert np.isinf(ratios).mean() == found.failed("fails").mean()
     assert ratios[np.isfinite(ratios)] == pytest.approx(0.25, abs=1e-3)
+
+
+def test_the_verdict_tells_what_training_met_from_what_it_never_did() -> None:
+    nominal = np.random.default_rng(0).uniform(1.0, 2.0, 400)
+    (_, policy), *_ = LEARNED["car-yaw"]
+    costs = {TRAINED: 0.25, "a quarter heavier": 0.5, "no camera from 2 to 7 s": 2.0}
+    found = Found("car-yaw")
+    for condition, factor in costs.items():
+        cases = {NOMINAL: 1.0, PARAMETERS: 0.25, policy: factor, learned.RIVALS[0]: 0.3}
+        found.driven[condition] = [{who: driven(each * nominal) for who, each in cases.items()}]
+    said = learned.answer([found])
+    assert f"{policy} closes 1.00 of the gap; at worst 0.50 where it trained, -0.50 where" in said
+    assert "beats adaptive-lqr in 33 %" in said
