@@ -32,6 +32,8 @@ SHOWN: Mapping[str, tuple[str, str]] = {
     "policy `distill-car-yaw` on `joint`": ("distill-car-yaw", "joint"),
     "policy `distill-coms-yaw` on `joint`": ("distill-coms-yaw", "joint"),
     "policy `distill-coms-steering` on `joint`": ("distill-coms-steering", "joint"),
+    "policy `raw-car-steering`, no filter": ("raw-car-steering", ""),
+    "policy `raw-car-yaw`, no filter": ("raw-car-yaw", ""),
     "`model-following` on `exact-kf`": ("model-following", REFERENCE_FILTER),
     "`two-dof` on `exact-kf`": ("two-dof", REFERENCE_FILTER),
     "`esc` on `exact-kf`": ("esc", REFERENCE_FILTER),

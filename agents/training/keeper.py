@@ -121,7 +121,7 @@ class Keeper(BaseCallback):
             self.scaling = start.scaling
         if self.scaling is None:
             spread, seed = spread_of(task.settings), _SCALING + task.seed
-            self.scaling = measured(task.vector_env(_MEASURED), spread, seed)
+            self.scaling = measured(task.vector_env(_MEASURED), spread, seed, task.reads)
         env = make_vec_env(
             task.env_id,
             task.num_envs,
@@ -202,6 +202,7 @@ class Keeper(BaseCallback):
         task = self.task
         described = options_of(task.settings, self.period, task.num_envs)
         described |= {"num_envs": task.num_envs, "policy": task.settings["policy"]}
+        described |= {"reads": task.reads} if task.reads else {}
         mixture: dict[str, Any] = {"scenarios": task.scenarios} if task.scenarios else {}
         first = {"scenario": task.scenarios[0]} if task.scenarios else {}
         card = Card.of(

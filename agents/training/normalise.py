@@ -5,6 +5,7 @@ reads plain observations.
 """
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -13,6 +14,7 @@ import numpy.typing as npt
 from gymnasium.vector import VectorEnv
 
 from ...envs.backend.extras import extra
+from ..env_facts import facts_of
 from ..vec_env.env import Observations
 
 with extra("train", "training needs {}"):
@@ -63,8 +65,20 @@ class Standardised(FlattenExtractor):
         return torch.clamp((observations - self.mean) * self.scale, -self.clip, self.clip)
 
 
-def measured(env: VectorEnv[Any, Any, Any], spread: float, seed: int) -> Scaling:
-    """Of each entry, under random actions of this standard deviation."""
+def measured(
+    env: VectorEnv[Any, Any, Any], spread: float, seed: int, reads: Sequence[str] = ()
+) -> Scaling:
+    """Of each entry, under random actions of this standard deviation.
+
+    reads: names of the entries that are read, none for all. Raises ValueError for a name that the
+    observation has not.
+    """
+    names = [entry.name for entry in facts_of(env).layout]
+    unknown = [name for name in reads if name not in names]
+    if unknown:
+        raise ValueError(
+            f"the observation has no {', '.join(unknown)} to read; it has {', '.join(names)}"
+        )
     rng = np.random.default_rng(seed)
     shape = env.action_space.shape or ()
     env.reset(seed=seed)
@@ -77,6 +91,8 @@ def measured(env: VectorEnv[Any, Any, Any], spread: float, seed: int) -> Scaling
     samples = np.concatenate(seen).astype(np.float64)
     deviation = samples.std(axis=0)
     varies = deviation > _CONSTANT
+    if reads:
+        varies &= np.isin(names, reads)
     scale = np.where(varies, 1.0 / np.where(varies, deviation, 1.0), 0.0)
     return samples.mean(axis=0).tolist(), scale.tolist(), CLIP
 

@@ -20,7 +20,8 @@ class Task:
     `gym.make`; JSON types. seed: of the weights, the episodes and the exploration. num_envs: side
     by side, 0: as many as the settings say. scenarios: a mixture, which the environments have in
     turn, each one for all its episodes. settings: of `settings_of`; empty: the package's own.
-    n_eval_envs: episodes of an evaluation, side by side.
+    n_eval_envs: episodes of an evaluation, side by side. reads: names of the observation's entries
+    that the network reads, empty: all of them.
 
     Raises ValueError for an unknown algorithm, setting or scenario, a negative seed, no
     environment, or fewer of them than scenarios.
@@ -36,6 +37,7 @@ class Task:
     estimator_options: dict[str, Any] = field(default_factory=dict)
     settings: Settings = field(default_factory=dict)
     n_eval_envs: int = 256
+    reads: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         settings = self.settings or settings_of(self.algo, self.env_id)

@@ -41,6 +41,10 @@ def train_command(
     scenarios: Annotated[
         list[str] | None, typer.Option(help="Of a mixture: a name or a file; repeatable.")
     ] = None,
+    reads: Annotated[
+        list[str] | None,
+        typer.Option(help="An entry of the observation that the network reads (all); repeatable."),
+    ] = None,
     steps: Annotated[
         int | None,
         typer.Option("--steps", "--n-timesteps", "-n", help="Control periods, all in all."),
@@ -94,6 +98,7 @@ def train_command(
         "seed": seed,
         "num_envs": num_envs,
         "n_eval_envs": n_eval_envs,
+        "reads": reads or None,
     }
     options = {name: value for name, value in options.items() if value is not None}
     if env is not None:
@@ -136,6 +141,7 @@ def _words(task: "Task", steps: int) -> list[str]:
         for name, value in values.items():
             words += [option, f"{name}={value if isinstance(value, str) else json.dumps(value)}"]
     words += [word for each in task.scenarios for word in ("--scenarios", str(each))]
+    words += [word for each in task.reads for word in ("--reads", each)]
     numbers = {"--steps": steps, "--seed": task.seed, "--num-envs": task.num_envs}
     return words + [word for name, value in numbers.items() for word in (name, str(value))]
 

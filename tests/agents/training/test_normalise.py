@@ -24,3 +24,15 @@ def test_observations_are_standardised_by_the_network() -> None:
     free = Standardised(env.single_observation_space, mean, scale, None)
     assert float(free(torch.tensor(obs, dtype=torch.float32)).abs().max()) > CLIP
     assert free.numbers[2] is None and layer.numbers[2] == clip
+
+
+def test_a_network_reads_what_it_is_told_to_and_nothing_else() -> None:
+    env = Task().vector_env(8)
+    plain = measured(env, 0.4, 5)
+    names = [entry.name for entry in env.unwrapped.layout]  # type: ignore[attr-defined]
+    some = measured(env, 0.4, 5, ["gyro", "steer"])
+    read = np.isin(names, ["gyro", "steer"])
+    assert np.array_equal(some[1], np.where(read, plain[1], 0.0)) and some[0] == plain[0]
+    assert np.count_nonzero(some[1]) == 2 < np.count_nonzero(plain[1])
+    with pytest.raises(ValueError, match=r"the observation has no beta_hat to read; it has gyro, "):
+        measured(env, 0.4, 5, ["gyro", "beta_hat"])

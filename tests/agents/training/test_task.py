@@ -42,6 +42,21 @@ def test_a_policy_of_a_mixture_names_it(tmp_path: Path, monkeypatch: pytest.Monk
     assert task_in(tmp_path) == task
 
 
+def test_a_policy_reads_what_its_task_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever the other entries are, it acts the same; its card names those that count."""
+    monkeypatch.setattr(keeper, "_MEASURED", 8)
+    task = dataclasses.replace(TINY, reads=["gyro", "steer"])
+    train.train(task, ROLLOUT, tmp_path)
+    policy = load_policy(tmp_path / POLICY)
+    assert policy.card.algorithm_options["reads"] == ["gyro", "steer"]
+    names = [entry.name for entry in task.vector_env(1).unwrapped.layout]  # type: ignore[attr-defined]
+    seen = np.zeros((2, len(names)))
+    seen[1, ~np.isin(names, ["gyro", "steer"])] = 3.0
+    assert np.array_equal(*policy.network(seen))
+    seen[1, names.index("gyro")] = 0.1
+    assert not np.array_equal(*policy.network(seen))
+
+
 @pytest.mark.parametrize(
     ("scenarios", "message"),
     [
