@@ -53,6 +53,7 @@ CONTROLLERS = {
     "lane-keeping": "#486C3F",
     "learned": "#D8636C",
     "ppo-yaw-vision": "#AB6387",
+    "ppo-exact-kf": "#8A4FBF",
     "distill-coms-steering": "#8C6D1F",
     "distill-coms-yaw": "#2E8B9E",
     "distill-car-steering": "#B0603A",
