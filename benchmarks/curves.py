@@ -26,8 +26,8 @@ from .control.scores import FLOOR
 from .harness.stats import geometric_mean, interval, ratio_of_means, won
 
 EPISODES = 1024
-FURTHER = 7_000_000
-"""First of the seeds on which no policy was chosen."""
+FURTHER = 8_000_000
+"""First of the seeds on which neither a policy nor a setting was chosen."""
 
 
 def nominal_costs(task: Task, seeds: Sequence[int]) -> Array:
@@ -43,14 +43,14 @@ def nominal_costs(task: Task, seeds: Sequence[int]) -> Array:
 
 def further(folders: Sequence[str | Path], episodes: int = EPISODES) -> Table:
     """The best policy of each training beside `nominal` on seeds that chose nothing, and which of
-    them are level: the ratio's interval reaches 1 or lies below. Raises as `table_of`."""
-    task = _task_of(folders)
+    them are level: not surely dearer, the ratio's interval reaches 1. Raises as `table_of`."""
+    tasks = _tasks_of(folders)
     seeds = range(FURTHER, FURTHER + episodes)
-    nominal = nominal_costs(task, seeds)
+    nominal = nominal_costs(tasks[0], seeds)
     table = Table("training", "CPU-s", "mean", "geometric mean", "better", "level")
     level = 0
-    for folder in map(Path, folders):
-        env = task.vector_env(episodes)
+    for folder, own in zip(map(Path, folders), tasks, strict=True):
+        env = own.vector_env(episodes)
         costs = costs_of(env, Learned(env, load_policy(folder / POLICY)), seeds)
         ratio = interval(costs, ratio_of_means, nominal)
         logs = geometric_mean(np.log((costs + FLOOR) / (nominal + FLOOR)))
@@ -70,7 +70,7 @@ def table_of(folders: Sequence[str | Path]) -> Table:
     Raises ValueError for trainings that were evaluated on different tasks, and what `task_in`
     raises.
     """
-    task = _task_of(folders)
+    task = _tasks_of(folders)[0]
     nominal = float(nominal_costs(task, evaluation_seeds(task.n_eval_envs)).mean())
     curves = [_curve(Path(folder), nominal) for folder in folders]
     table = Table("CPU-s", *map(str, folders), title=f"mean cost / nominal's {nominal:.4g}")
@@ -83,13 +83,13 @@ def table_of(folders: Sequence[str | Path]) -> Table:
     return table
 
 
-def _task_of(folders: Sequence[str | Path]) -> Task:
-    """The task that all of these trainings were evaluated on; ValueError where there is none."""
+def _tasks_of(folders: Sequence[str | Path]) -> list[Task]:
+    """Each training's task; ValueError where they were not evaluated on the same drives."""
     tasks = [task_in(folder) for folder in folders]
-    judged = [(each.env_id, each.env_options, each.n_eval_envs, each.around) for each in tasks]
+    judged = [(each.env_id, each.env_options, each.n_eval_envs) for each in tasks]
     if any(each != judged[0] for each in judged):
         raise ValueError("these trainings were evaluated on different tasks")
-    return tasks[0]
+    return tasks
 
 
 def _curve(folder: Path, nominal: float) -> list[tuple[float, float]]:

@@ -89,7 +89,6 @@ def lessons_of(
     from ..agents.training.distill import Lesson
 
     rng = np.random.default_rng(seed)
-
     reads = {who: name for name, who in ADAPTIVE.items()} | dict.fromkeys(_ALONE, "")
     if is_policy(teacher):
         reads[teacher] = load_policy(teacher).card.estimator

@@ -172,17 +172,19 @@ def answer(found: Sequence[Found]) -> str:
     for each in found:
         _, policy = LEARNED[each.kind][0]
         shares = {name: each.shared(policy, name).value for name in each.driven}
-        others = {True: [np.inf], False: [np.inf]}  # by whether training never met them
-        for name in each.driven:
-            if name != TRAINED:
-                others[name in NEVER_MET].append(np.nan_to_num(shares[name], nan=np.inf))
-        lowest = min(others[False]), min(others[True])
+        met = [share for name, share in shares.items() if name not in (TRAINED, *NEVER_MET)]
+        new = [share for name, share in shares.items() if name in NEVER_MET]
         better = won(each.costs(policy), each.costs(RIVALS[0])).value
         lines.append(
-            f"{policy} closes {shares[TRAINED]:.2f} of the gap; at worst {lowest[0]:.2f} where it "
-            f"trained, {lowest[1]:.2f} where never; beats {RIVALS[0]} in {100.0 * better:.0f} %."
+            f"{policy} closes {shares[TRAINED]:.2f} of the gap; at worst {_least(met)} where it "
+            f"trained, {_least(new)} where never; beats {RIVALS[0]} in {100.0 * better:.0f} %."
         )
     return verdict(*lines)
+
+
+def _least(shares: Sequence[float]) -> str:
+    """The least of those that are, "-" where none is."""
+    return f"{min(there):.2f}" if (there := [each for each in shares if each == each]) else "-"
 
 
 def _tabled(suite: Suite, found: Found) -> None:

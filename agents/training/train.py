@@ -64,6 +64,8 @@ def train(
     if trained_agent is not None:
         if resume:
             raise ValueError("a training goes on from its checkpoint or from a zip, not from both")
+        if task.reads:
+            raise ValueError("a zip's network reads what it was trained on: give reads or a zip")
         check_zip(Path(trained_agent), trust=True)
     if how.tensorboard_log is not None and find_spec("tensorboard") is None:
         raise ModuleNotFoundError("a log for TensorBoard needs it: pip install tensorboard")

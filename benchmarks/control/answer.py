@@ -123,11 +123,11 @@ def _elsewhere(found: Mapping[str, Sequence[Standing]]) -> str:
             first, best = (next(iter(each), "") for each in (overall, here))
             if best != first and first in here.get(best, {}) and here[best][first].high < 1.0:
                 parts.append(f"{best} in tier {tier}")
-    drivers, best = _controllers(found), best_controller(found)
-    ahead = {name: _over(mine, drivers[best]) for name, mine in drivers.items() if best}
-    there = sorted(ahead, key=lambda name: ahead[name].value)
-    parts += [f"{name} where it drives" for name in there
-              if name not in _everywhere(drivers) and ahead[name].high < 1.0]  # fmt: skip
+    drivers, overall_best = _controllers(found), best_controller(found)
+    parted = drivers.keys() - _everywhere(drivers).keys() if overall_best else ()
+    ahead = {name: _over(drivers[name], drivers[overall_best]) for name in parted}
+    parts += [f"{name} where it drives" for name in sorted(ahead, key=lambda who: ahead[who].value)
+              if ahead[name].high < 1.0]  # fmt: skip
     return f"But {some(parts)}. " if parts else ""
 
 

@@ -62,6 +62,17 @@ def test_on_further_seeds_the_best_policy_is_driven_beside_nominal(
         assert level in str(further([folder], 16).title)
 
 
+def test_trainings_that_read_different_things_stand_side_by_side(
+    folder: Path, tmp_path: Path
+) -> None:
+    """Each drives with its own estimator."""
+    task = Task(env_options=SHORT, num_envs=8, n_eval_envs=8, estimator="multirate-kf")
+    train(task, 256, tmp_path / "b")
+    table = further([folder, tmp_path / "b"], 4)
+    assert list(table.columns[0].cells) == [str(folder), str(tmp_path / "b")]
+    assert len(table_of([folder, tmp_path / "b"]).columns) == 3
+
+
 def test_what_cannot_be_compared_is_refused(folder: Path, tmp_path: Path) -> None:
     other = tmp_path / "b"
     train(Task(num_envs=8, n_eval_envs=4, env_options=SHORT), 256, other)

@@ -95,3 +95,5 @@ def test_the_verdict_tells_what_training_met_from_what_it_never_did() -> None:
     said = learned.answer([found])
     assert f"{policy} closes 1.00 of the gap; at worst 0.50 where it trained, -0.50 where" in said
     assert "beats adaptive-lqr in 33 %" in said
+    found.driven.pop("no camera from 2 to 7 s")
+    assert "at worst 0.50 where it trained, - where never" in learned.answer([found])
