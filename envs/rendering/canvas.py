@@ -5,6 +5,7 @@ Nothing here needs a display.
 
 import functools
 import os
+import warnings
 from typing import Any
 
 import numpy as np
@@ -132,7 +133,9 @@ def _scaled(points: Points) -> list[tuple[int, int]]:
 @functools.cache
 def _font(size: int, bold: bool) -> pygame.font.Font:
     pygame.font.init()
-    return pygame.font.SysFont(_FONTS, size, bold)
+    with warnings.catch_warnings():  # no list of fonts within a second, or none of these: its own
+        warnings.simplefilter("ignore", UserWarning)
+        return pygame.font.SysFont(_FONTS, size, bold)
 
 
 @functools.lru_cache(512)
