@@ -19,7 +19,7 @@ with extra("train", "training needs {}"):
 FORMAT = 1
 VARIABLES = "variables"
 """The part of the tensors that belong to no module, as the logarithm of an entropy's weight."""
-STATE = {"groups", "sideslip", "task", "steps", "none", "scaling", "evaluations"}
+STATE = {"groups", "sideslip", "task", "steps", "scaling", "evaluations"}
 """What a training goes on from, besides the tensors."""
 
 

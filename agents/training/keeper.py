@@ -11,6 +11,7 @@ import numpy as np
 
 from ... import __version__
 from ...envs.backend.files import whole, write_whole
+from ...envs.record import Array
 from ..controllers.base import NoControl
 from ..learned.card import Card
 from ..learned.files import save_policy
@@ -30,11 +31,19 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm  # 
 CHECKPOINT, CURVE = "checkpoint.safetensors", "curve.jsonl"
 POLICY, BEST = "policy.safetensors", "best_model.zip"
 
+_LEAST = 1e-3  # cost: a scenario in which the uncontrolled car has less weighs no more
 _MEASURED = 64  # environments whose observations make the scaling
 
 # No other seeds are as large: those of tests and of the calibration are below 2^63.
 _EVALUATION, _SCALING, _TRAINING = 2**64, 2**65, 2**66
 _ROOM = 2**40  # seeds of a training: it takes those from its steps on when it starts or goes on
+
+
+def _alike(costs: Array, scenarios: int) -> Array:
+    """Weights of so many scenarios, which drive in turn, with which the uncontrolled car's costs
+    are the same in all of them: else dear ones would outweigh the others."""
+    each = np.array([max(costs[i::scenarios].mean(), _LEAST) for i in range(scenarios)])
+    return np.asarray(each.mean() / each)
 
 
 def evaluation_seeds(episodes: int) -> list[int]:
@@ -45,7 +54,8 @@ def evaluation_seeds(episodes: int) -> list[int]:
 class Evaluation(NamedTuple):
     """Of the deterministic policy: mean cost, its share of the uncontrolled car's on these seeds.
 
-    cpu_seconds: of the training up to here, evaluations apart.
+    Of a mixture the share is the mean over its scenarios, and the cost that of all drives by this
+    share. cpu_seconds: of the training up to here, evaluations apart.
     """
 
     steps: int
@@ -101,7 +111,9 @@ class Keeper(BaseCallback):
         self.period: float = base.control_period * base.dt  # s
         saved = {} if checkpoint is None else checkpoint
         self.evaluations = [Evaluation(*each) for each in saved.get("evaluations", [])]
-        self.none: float = saved.get("none") or self._cost(NoControl(self.tested))
+        alone = costs_of(self.tested, NoControl(self.tested), self.seeds)
+        self.weights = _alike(alone, max(len(task.scenarios), 1))
+        self.none = float((alone * np.resize(self.weights, len(alone))).mean())
         self.scaling: Any = saved.get("scaling")
         self.spent = self.evaluations[-1].cpu_seconds if self.evaluations else 0.0
         self.since = time.process_time()
@@ -130,7 +142,7 @@ class Keeper(BaseCallback):
         )
         steps = 0 if checkpoint is None else int(checkpoint["steps"])
         seed = (task.seed + steps) % 2**32
-        rated = PerSecond(env, self.period)
+        rated = PerSecond(env, self.period, np.resize(self.weights, task.num_envs))
         further = {"device": means.device, "tensorboard_log": means.tensorboard_log}
         model = make_model(
             task.algo, task.settings, rated, self.period, self.scaling, seed, **further
@@ -147,8 +159,9 @@ class Keeper(BaseCallback):
         return model
 
     def _cost(self, agent: Any) -> float:
-        """Mean over the evaluation's drives."""
-        return float(costs_of(self.tested, agent, self.seeds).mean())
+        """Mean over the evaluation's drives, scenarios weighed alike."""
+        costs = costs_of(self.tested, agent, self.seeds)
+        return float((costs * np.resize(self.weights, len(costs))).mean())
 
     def _on_step(self) -> bool:
         return True
@@ -189,7 +202,6 @@ class Keeper(BaseCallback):
             "sideslip": __version__,
             "task": asdict(self.task),
             "steps": self.model.num_timesteps,
-            "none": self.none,
             "scaling": self.scaling,
             "evaluations": self.evaluations,
         }

@@ -100,12 +100,13 @@ def measured(
 class PerSecond(VecEnvWrapper):
     """Rewards as minus the cost rate: of the order of one, whatever the control period.
 
-    seconds: of a control period. It stands outside of the monitor, which counts costs.
+    seconds: of a control period. weights: (N,), of each environment's cost. It stands outside of
+    the monitor, which counts costs.
     """
 
-    def __init__(self, venv: VecEnv, seconds: float) -> None:
+    def __init__(self, venv: VecEnv, seconds: float, weights: Array) -> None:
         super().__init__(venv)
-        self._rate = np.float32(1.0 / seconds)
+        self._rate = (weights / seconds).astype(np.float32)
 
     def reset(self) -> Observations:
         """The inner env's."""

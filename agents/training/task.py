@@ -51,11 +51,12 @@ class Task:
                 raise ValueError(f"{name} is at least 1, got {getattr(self, name)}")
         if self.estimator_options and not self.estimator:
             raise ValueError("options of an estimator need an estimator")
-        if self.num_envs < len(self.scenarios):
-            raise ValueError(
-                f"an environment has one scenario for all its episodes: {len(self.scenarios)} "
-                f"scenarios take as many environments, got {self.num_envs}"
-            )
+        for name in ("num_envs", "n_eval_envs"):
+            if getattr(self, name) < len(self.scenarios):
+                raise ValueError(
+                    f"an environment has one scenario for all its episodes: {len(self.scenarios)} "
+                    f"scenarios take as many environments, got {name} {getattr(self, name)}"
+                )
         for i, scenario in enumerate(self.scenarios):
             try:
                 scenario_from(scenario)

@@ -8,10 +8,13 @@ import numpy as np
 import pytest
 
 pytest.importorskip("stable_baselines3")
+from sideslip.agents.controllers.base import NoControl
 from sideslip.agents.learned.files import load_policy
+from sideslip.agents.learned.policy import Learned
+from sideslip.agents.rollout import costs_of
 from sideslip.agents.training import keeper, train
 from sideslip.agents.training.task import Task
-from sideslip.agents.training.train import POLICY, task_in
+from sideslip.agents.training.train import POLICY, Means, task_in
 
 TINY, ROLLOUT = Task(num_envs=8, seed=3, n_eval_envs=4), 256  # steps of 8 environments
 MIXTURE: list[Any] = ["coms-slalom", {"base": "coms-step", "duration": 0.3}]
@@ -42,6 +45,31 @@ def test_a_policy_of_a_mixture_names_it(tmp_path: Path, monkeypatch: pytest.Monk
     assert task_in(tmp_path) == task
 
 
+def test_the_scenarios_of_a_mixture_weigh_alike(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The uncontrolled car's rewards, and a policy's share of its cost."""
+    monkeypatch.setattr(keeper, "_MEASURED", 8)
+    task = dataclasses.replace(TINY, scenarios=["coms-brake-in-turn", "coms-step"], n_eval_envs=8)
+    env, seeds = task.vector_env(8), keeper.evaluation_seeds(8)
+    none = costs_of(env, NoControl(env), seeds)
+    assert none[::2].mean() > 3.0 * none[1::2].mean()  # else there is nothing to weigh
+    cars: Any = keeper.Keeper(task, tmp_path, None, Means()).build(None).get_env()
+    cars.seed(seeds[0])
+    cars.reset()
+    returns, running = np.zeros(8), np.ones(8)
+    while running.any():
+        _, rewards, dones, _ = cars.step(np.zeros((8, 1), np.float32))
+        returns += running * rewards
+        running *= ~dones
+    assert returns[::2].mean() == pytest.approx(returns[1::2].mean(), rel=1e-4)
+    best = train.train(task, ROLLOUT, tmp_path).best
+    costs = costs_of(env, Learned(env, tmp_path / POLICY), seeds)
+    shares = [costs[i::2].mean() / none[i::2].mean() for i in range(2)]
+    assert best.of_none == pytest.approx(np.mean(shares), rel=1e-4)
+    assert best.cost == pytest.approx(np.mean(shares) * none.mean(), rel=1e-4)
+
+
 def test_a_policy_reads_what_its_task_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever the other entries are, it acts the same; its card names those that count."""
     monkeypatch.setattr(keeper, "_MEASURED", 8)
@@ -62,7 +90,8 @@ def test_a_policy_reads_what_its_task_says(tmp_path: Path, monkeypatch: pytest.M
     [
         (["coms-slalom", "moon"], "scenario 1 of the mixture: unknown scenario 'moon'"),
         ([7], "scenario 0 of the mixture: a scenario is a name"),
-        (["coms-slalom"] * 9, "9 scenarios take as many environments, got 8"),
+        (["coms-slalom"] * 9, "9 scenarios take as many environments, got num_envs 8"),
+        (["coms-slalom"] * 5, "5 scenarios take as many environments, got n_eval_envs 4"),
     ],
 )
 def test_a_mixture_of_what_there_is_not_is_refused(scenarios: list[Any], message: str) -> None:
