@@ -47,7 +47,7 @@ def test_a_policy_teaches_on_the_filter_of_its_card() -> None:
 
 def test_varied_lessons_differ_in_what_training_is_to_cover() -> None:
     """Tyres, mass, camera and GPS are others; not the observation, nor the teacher's cars."""
-    lessons = lessons_of("coms-zero-slip", "oracle-state-lqr", "", 32, varied=1)
+    lessons = lessons_of("coms-zero-slip", "none", "", 32, varied=1)
     assert len(lessons) == 2 * len(contests_of("coms-zero-slip"))
     masses, late = set(), set()
     for plain, varied in zip(lessons[::2], lessons[1::2], strict=True):
