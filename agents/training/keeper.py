@@ -79,6 +79,7 @@ class Means:
 
     eval_freq: steps from one evaluation to the next. device: torch's name. tensorboard_log: a
     folder for TensorBoard. report: called after every rollout. command: for the policy's card.
+    track: a project of Weights & Biases, "" for none.
 
     Raises ValueError for evaluations that are less than a step apart.
     """
@@ -88,6 +89,7 @@ class Means:
     tensorboard_log: str | None = None
     report: Callable[[Progress], None] | None = None
     command: str = ""
+    track: str = ""
 
     def __post_init__(self) -> None:
         if self.eval_freq < 1:

@@ -6,6 +6,7 @@ stable-baselines3's format) and `curve.jsonl` (the evaluations).
 """
 
 from dataclasses import asdict, fields
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,6 +19,8 @@ from .zips import check_zip
 
 import torch  # isort: skip  # after ours, which say which extra is missing
 from stable_baselines3.common.base_class import BaseAlgorithm  # isort: skip
+from stable_baselines3.common.callbacks import BaseCallback  # isort: skip
+from stable_baselines3.common.logger import KVWriter  # isort: skip
 
 __all__ = [
     "BEST", "CHECKPOINT", "CURVE", "POLICY",
@@ -69,23 +72,67 @@ def train(
         check_zip(Path(trained_agent), trust=True)
     if how.tensorboard_log is not None and find_spec("tensorboard") is None:
         raise ModuleNotFoundError("a log for TensorBoard needs it: pip install tensorboard")
+    tracked = _Tracked(how.track, Path(folder).name, asdict(task)) if how.track else None
     torch.set_num_threads(1)  # on small matrices threads only wait for each other
     place = Path(folder)
     checkpoint = _start(task, place, resume)
     keeper = Keeper(task, place, checkpoint, how)
+    watchers: list[BaseCallback] = [keeper] if tracked is None else [tracked, keeper]
     model = keeper.build(checkpoint, trained_agent, trust)
     done = model.num_timesteps
     if done < steps:
         try:
             first = done == 0
             model.learn(
-                steps - done, callback=keeper, reset_num_timesteps=first, tb_log_name=task.algo
+                steps - done, callback=watchers, reset_num_timesteps=first, tb_log_name=task.algo
             )
+            keeper.evaluate()
         except ValueError:  # torch's, of a distribution that is none, or the env's, of actions
             keeper.check()
             raise
-        keeper.evaluate()
+        finally:
+            if tracked is not None:
+                tracked.finish()
     return Trained(model, tuple(keeper.evaluations))
+
+
+class _Tracked(BaseCallback):
+    """Hands what stable-baselines3 logs to a run of Weights & Biases.
+
+    project, name: the run's. config: told to it. Raises ModuleNotFoundError without wandb.
+    """
+
+    def __init__(self, project: str, name: str, config: dict[str, Any]) -> None:
+        super().__init__()
+        try:
+            wandb: Any = import_module("wandb")
+        except ImportError:
+            raise ModuleNotFoundError("tracking needs wandb: pip install wandb") from None
+        self._wandb, self._about = wandb, {"project": project, "name": name, "config": config}
+        self._run: Any = None
+
+    def _on_training_start(self) -> None:
+        self._run = self._wandb.init(**self._about)
+        self.logger.output_formats.append(_Writer(self._run))
+
+    def _on_step(self) -> bool:
+        return True
+
+    def finish(self) -> None:
+        """End the run, if one began; the last evaluation comes after the training's end."""
+        if self._run is not None:
+            self._run.finish()
+
+
+class _Writer(KVWriter):
+    def __init__(self, run: Any) -> None:
+        self._run = run
+
+    def write(self, key_values: dict[str, Any], key_excluded: Any, step: int = 0) -> None:
+        self._run.log(dict(key_values), step=step)  # the logger empties its own
+
+    def close(self) -> None:
+        """Nothing: the run ends with the training."""
 
 
 def task_in(folder: str | Path, **arguments: Any) -> Task:

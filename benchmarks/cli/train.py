@@ -64,6 +64,8 @@ def train_command(
     tensorboard_log: Annotated[
         _Text, typer.Option("--tensorboard-log", "-tb", help="A folder for TensorBoard.")
     ] = None,
+    track: Annotated[bool, typer.Option("--track", help="Log to Weights & Biases.")] = False,
+    wandb_project_name: Annotated[str, typer.Option(help="With --track.")] = "sideslip",
     device: Annotated[str, typer.Option(help="Of the networks, as torch calls it.")] = "cpu",
     progress: Annotated[
         bool, typer.Option("--progress/--no-progress", "-P", help="Show a bar.")
@@ -114,7 +116,10 @@ def train_command(
     words += ["--trained-agent", str(trained_agent)] if trained_agent else []
     console = Console()
     with _Bar(console, steps, disable=not progress) as bar:
-        means = Means(eval_freq, device, tensorboard_log, bar.show, shlex.join(words))
+        project = wandb_project_name if track else ""
+        means = Means(
+            eval_freq, device, tensorboard_log, bar.show, shlex.join(words), track=project
+        )
         trained = train(task, steps, folder, resume, means, trained_agent, trust)
     console.print(_table(trained))
     costs = evaluation(evaluate(folder / POLICY, EPISODES))["cost"]
