@@ -100,7 +100,7 @@ def table_of(folders: Sequence[str | Path]) -> Table:
 def _tasks_of(folders: Sequence[str | Path]) -> list[Task]:
     """Each training's task; ValueError where they were not evaluated on the same drives."""
     tasks = [task_in(folder) for folder in folders]
-    judged = [(each.env_id, each.env_options, each.n_eval_envs) for each in tasks]
+    judged = [(each.env_id, each.env_options, each.scenarios, each.n_eval_envs) for each in tasks]
     if any(each != judged[0] for each in judged):
         raise ValueError("these trainings were evaluated on different tasks")
     return tasks

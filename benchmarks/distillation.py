@@ -125,6 +125,9 @@ def _judged(path: Path, contest: Contest, episodes: int) -> JsonMap:
         PARAMETERS: Cell(contest, "", PARAMETERS),
     }
     driven = {name: drive(Chunk(cell, seeds)) for name, cell in cells.items()}
+    for name, each in driven.items():
+        if each.error:
+            raise ValueError(f"{name} cannot drive {contest.name}: {each.error}")
     costs = driven[NOMINAL].costs
     shown: JsonMap = {
         name: _rounded(geometric_mean(-gains(costs, each)), 100.0)

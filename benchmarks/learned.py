@@ -97,7 +97,8 @@ class Found:
         """A contestant's share of the gap in a condition; NaN of one below `LEAST`."""
         there = self.driven[condition]
         yards = [Yardstick(each[NOMINAL], each[PARAMETERS]) for each in there]
-        if not np.mean([yard.gap for yard in yards]) > LEAST:
+        gaps = [yard.gap for yard in yards if not np.isnan(yard.gap)]  # NaN: nobody survived
+        if not gaps or not np.mean(gaps) > LEAST:
             return Estimate(np.nan)
         return score([yard.paired(each[name]) for yard, each in zip(yards, there, strict=True)])
 

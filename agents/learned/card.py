@@ -9,6 +9,7 @@ import gymnasium as gym
 
 from ... import __version__
 from ...envs.documents import check_types
+from ...estimators.user_files import is_user_file
 from ...estimators.wrappers.estimate import EstimateObservation
 from ..env_facts import AnyEnv, facts_of
 
@@ -53,11 +54,7 @@ class Card:
         object.__setattr__(self, "observation", tuple((name, unit) for name, unit in pairs))
         if len({name for name, _ in pairs}) != len(pairs):
             raise ValueError("observation names an entry twice")
-        if ":" in str(self.estimator):  # a file from elsewhere would name code to be imported
-            raise ValueError(
-                f"estimator is a name, got the entry point {self.estimator!r}: "
-                "sideslip.register_estimator gives it one"
-            )
+        check_names_no_code(str(self.env_id), str(self.estimator))
         check_types(Card, vars(self), "the card")
         self.to_json()
 
@@ -103,6 +100,20 @@ class Card:
             return json.dumps(asdict(self) | more, allow_nan=False)
         except (TypeError, ValueError) as error:
             raise ValueError(f"the card holds what JSON has not: {error}") from None
+
+
+def check_names_no_code(env_id: str, estimator: str) -> None:
+    """ValueError where a file from elsewhere names code to be imported instead of what is there."""
+    if ":" in env_id:
+        raise ValueError(
+            f"env_id is that of a registered env, got {env_id!r}, which names a module: import it "
+            "first and give the id alone"
+        )
+    if ":" in estimator or is_user_file(estimator):
+        raise ValueError(
+            f"estimator is a name, got the entry point {estimator!r}: "
+            "sideslip.register_estimator gives it one"
+        )
 
 
 def _is_entry(pair: Any) -> bool:

@@ -130,7 +130,8 @@ def options_of(settings: Settings, seconds: float, num_envs: int) -> Settings:
     found = {name: value for name, value in settings.items() if name not in _OF_TRAINING}
     if "gamma" in found:
         found["gamma"] = found["gamma"] ** (seconds / PERIOD)
-    if "n_steps" in found and "batch_size" in found:
+    of_returns = "buffer_size" in found or "train_freq" in found  # n_steps of sac, tqc
+    if "n_steps" in found and "batch_size" in found and not of_returns:
         rollout = num_envs * found["n_steps"]
         most = min(found["batch_size"], rollout)
         found["batch_size"] = max(n for n in range(1, most + 1) if rollout % n == 0)

@@ -16,10 +16,10 @@ with extra("train", "training needs {}"):
     import torch
     from safetensors.torch import save
 
-FORMAT = 1
+FORMAT = 2
 VARIABLES = "variables"
 """The part of the tensors that belong to no module, as the logarithm of an entropy's weight."""
-STATE = {"groups", "sideslip", "task", "steps", "scaling", "evaluations"}
+STATE = {"groups", "sideslip", "task", "steps", "aim", "scaling", "evaluations"}
 """What a training goes on from, besides the tensors."""
 
 

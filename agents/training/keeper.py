@@ -15,8 +15,8 @@ from ...envs.record import Array
 from ..controllers.base import NoControl
 from ..learned.card import Card
 from ..learned.files import save_policy
-from ..rollout import costs_of
-from ..vec_env.env import make_vec_env
+from ..rollout import costs_of, steps_of
+from ..vec_env.env import make_native_env, make_vec_env
 from .algorithms import make_model, options_of, spread_of
 from .checkpoint import load_parameters, save_checkpoint
 from .export import network_from_sb3
@@ -31,19 +31,30 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm  # 
 CHECKPOINT, CURVE = "checkpoint.safetensors", "curve.jsonl"
 POLICY, BEST = "policy.safetensors", "best_model.zip"
 
-_LEAST = 1e-3  # cost: a scenario in which the uncontrolled car has less weighs no more
+_LEAST = 0.05  # of the mean: a scenario that costs less uncontrolled weighs no more
+_ALONE = 32  # uncontrolled drives by which a scenario is weighed
 _MEASURED = 64  # environments whose observations make the scaling
 
 # No other seeds are as large: those of tests and of the calibration are below 2^63.
-_EVALUATION, _SCALING, _TRAINING = 2**64, 2**65, 2**66
+_WEIGHING, _EVALUATION, _SCALING, _TRAINING = 2**63, 2**64, 2**65, 2**66
 _ROOM = 2**40  # seeds of a training: it takes those from its steps on when it starts or goes on
 
 
-def _alike(costs: Array, scenarios: int) -> Array:
-    """Weights of so many scenarios, which drive in turn, with which the uncontrolled car's costs
-    are the same in all of them: else dear ones would outweigh the others."""
-    each = np.array([max(costs[i::scenarios].mean(), _LEAST) for i in range(scenarios)])
-    return np.asarray(each.mean() / each)
+def _alike(costs: Array) -> Array:
+    """Weights with which scenarios' costs (k,) are the same: dear ones would outweigh others."""
+    return np.asarray(costs.mean() / np.maximum(costs, _LEAST * costs.mean()))
+
+
+def _cost_rates(task: Task) -> Array:
+    """What the uncontrolled car pays in a second of each scenario, (k,)."""
+    k = max(len(task.scenarios), 1)
+    rows = _ALONE * k
+    env = make_native_env(task.env_id, rows, None, task.options(rows))
+    costs, steps = np.zeros(rows), -np.ones(rows)  # the first one is the reset
+    for step in steps_of(env, None, [_WEIGHING + i for i in range(rows)]):
+        costs -= np.where(step.running, step.reward, 0.0)
+        steps += step.running
+    return np.array([costs[i::k].sum() / steps[i::k].sum() for i in range(k)])
 
 
 def evaluation_seeds(episodes: int) -> list[int]:
@@ -54,8 +65,8 @@ def evaluation_seeds(episodes: int) -> list[int]:
 class Evaluation(NamedTuple):
     """Of the deterministic policy: mean cost, its share of the uncontrolled car's on these seeds.
 
-    Of a mixture the share is the mean over its scenarios, and the cost that of all drives by this
-    share. cpu_seconds: of the training up to here, evaluations apart.
+    Of a mixture the share is the mean of its scenarios' shares, and the cost the same share of
+    their mean uncontrolled one. cpu_seconds: of the training up to here, evaluations apart.
     """
 
     steps: int
@@ -99,23 +110,30 @@ class Means:
 class Keeper(BaseCallback):
     """Builds the model; evaluates it between rollouts and keeps what is needed to go on.
 
-    checkpoint: the state of one, None for a new training.
+    checkpoint: the state of one, None for a new training. steps: it is to have.
     """
 
     def __init__(
-        self, task: Task, folder: Path, checkpoint: Mapping[str, Any] | None, means: Means
+        self,
+        task: Task,
+        folder: Path,
+        checkpoint: Mapping[str, Any] | None,
+        means: Means,
+        steps: int = 0,
     ) -> None:
         super().__init__()
-        self.task, self.folder, self.means = task, folder, means
+        self.task, self.folder, self.means, self.aim = task, folder, means, steps
         self.seeds = evaluation_seeds(task.n_eval_envs)
         self.tested = task.vector_env(task.n_eval_envs)
         base: Any = self.tested.unwrapped
         self.period: float = base.control_period * base.dt  # s
         saved = {} if checkpoint is None else checkpoint
         self.evaluations = [Evaluation(*each) for each in saved.get("evaluations", [])]
-        alone = costs_of(self.tested, NoControl(self.tested), self.seeds)
-        self.weights = _alike(alone, max(len(task.scenarios), 1))
-        self.none = float((alone * np.resize(self.weights, len(alone))).mean())
+        none = self._costs(NoControl(self.tested))
+        if none.mean() == 0.0:
+            raise ValueError("the uncontrolled car costs nothing there: there is nothing to learn")
+        self.alike, self.none = _alike(none), float(np.mean(none * _alike(none)))
+        self.weights = _alike(_cost_rates(task)) if task.scenarios else np.ones(1)
         self.scaling: Any = saved.get("scaling")
         self.spent = self.evaluations[-1].cpu_seconds if self.evaluations else 0.0
         self.since = time.process_time()
@@ -160,10 +178,10 @@ class Keeper(BaseCallback):
         self.init_callback(model)
         return model
 
-    def _cost(self, agent: Any) -> float:
-        """Mean over the evaluation's drives, scenarios weighed alike."""
-        costs = costs_of(self.tested, agent, self.seeds)
-        return float((costs * np.resize(self.weights, len(costs))).mean())
+    def _costs(self, agent: Any) -> Array:
+        """Mean over the evaluation's drives of each scenario, (k,)."""
+        costs, k = costs_of(self.tested, agent, self.seeds), max(len(self.task.scenarios), 1)
+        return np.array([costs[i::k].mean() for i in range(k)])
 
     def _on_step(self) -> bool:
         return True
@@ -193,7 +211,7 @@ class Keeper(BaseCallback):
         """Cost of the policy as it is; the best one so far and the checkpoint are written."""
         self.check()
         self.spent += time.process_time() - self.since
-        cost = self._cost(self.model)
+        cost = float(np.mean(self._costs(self.model) * self.alike))
         now = Evaluation(self.model.num_timesteps, round(self.spent, 3), cost, cost / self.none)
         if all(cost < each.cost for each in self.evaluations):
             self._keep_best(now)
@@ -204,6 +222,7 @@ class Keeper(BaseCallback):
             "sideslip": __version__,
             "task": asdict(self.task),
             "steps": self.model.num_timesteps,
+            "aim": [self.aim, self.means.eval_freq, self.means.command],
             "scaling": self.scaling,
             "evaluations": self.evaluations,
         }
@@ -217,7 +236,9 @@ class Keeper(BaseCallback):
         described = options_of(task.settings, self.period, task.num_envs)
         described |= {"num_envs": task.num_envs, "policy": task.settings["policy"]}
         described |= {"reads": task.reads} if task.reads else {}
-        mixture: dict[str, Any] = {"scenarios": task.scenarios} if task.scenarios else {}
+        mixture: dict[str, Any] = {}
+        if task.scenarios:
+            mixture = {"scenarios": task.scenarios, "weights": self.weights.round(3).tolist()}
         first = {"scenario": task.scenarios[0]} if task.scenarios else {}
         card = Card.of(
             task.env_id,

@@ -258,8 +258,8 @@ def fitted(
             added = torch.einsum("bti,bij,btj->bt", error, S, error) * w
             loss = length * added.sum() / there.sum().clamp(min=1)  # of an episode
             if course.told:
-                missed = (out[..., y.shape[-1] :] - q)[there].square().mean()
-                loss = loss / idle + course.told * missed
+                missed = (out[..., y.shape[-1] :] - q)[there].square().mean(-1).sum()
+                loss = loss / idle + course.told * missed / there.sum().clamp(min=1)
             optimiser.zero_grad()
             loss.backward()
             norm = nn.utils.clip_grad_norm_(model.parameters(), 1.0)

@@ -12,6 +12,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ... import __version__
+from ...envs.documents import check_types
+from ..learned.card import check_names_no_code
 from .checkpoint import read_state
 from .keeper import BEST, CHECKPOINT, CURVE, POLICY, Evaluation, Keeper, Means, Progress
 from .task import Task
@@ -76,7 +78,7 @@ def train(
     torch.set_num_threads(1)  # on small matrices threads only wait for each other
     place = Path(folder)
     checkpoint = _start(task, place, resume)
-    keeper = Keeper(task, place, checkpoint, how)
+    keeper = Keeper(task, place, checkpoint, how, steps)
     watchers: list[BaseCallback] = [keeper] if tracked is None else [tracked, keeper]
     model = keeper.build(checkpoint, trained_agent, trust)
     done = model.num_timesteps
@@ -94,6 +96,21 @@ def train(
             if tracked is not None:
                 tracked.finish()
     return Trained(model, tuple(keeper.evaluations))
+
+
+class Aim(NamedTuple):
+    """What a training was told besides its task: steps, those between two evaluations, the command
+    for the policy's card."""
+
+    steps: int
+    eval_freq: int
+    command: str
+
+
+def aim_in(folder: str | Path) -> Aim:
+    """Of a folder's checkpoint. Raises as `task_in`."""
+    task_in(folder)
+    return Aim(*read_state(Path(folder) / CHECKPOINT)["aim"])
 
 
 class _Tracked(BaseCallback):
@@ -150,10 +167,17 @@ def task_in(folder: str | Path, **arguments: Any) -> Task:
             f"{path} was made by sideslip {version}, this is {__version__}, whose cars and costs "
             "may be others: train anew, in another folder"
         )
-    missing = [each.name for each in fields(Task) if each.name not in saved]
+    names = [each.name for each in fields(Task)]
+    missing = [name for name in names if not isinstance(saved, dict) or name not in saved]
     if missing:
         raise ValueError(f"{path}: the checkpoint's task lacks {', '.join(missing)}")
-    task = Task(**{each.name: saved[each.name] for each in fields(Task)})
+    values = {name: saved[name] for name in names}
+    try:
+        check_types(Task, values, "the task")
+        check_names_no_code(values["env_id"], values["estimator"])
+        task = Task(**values)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{path}: {error}") from None
     for name, value in arguments.items():
         if value != getattr(task, name):
             raise ValueError(

@@ -58,6 +58,7 @@ Jobs = Annotated[int | None, typer.Option("--jobs", "-j", min=1, help="Processes
 
 _OF_USERS = (
     ValueError, TypeError, ModuleNotFoundError, OSError, RecursionError, GymnasiumError,
+    FloatingPointError,
 )  # fmt: skip
 
 

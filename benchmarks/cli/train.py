@@ -57,7 +57,9 @@ def train_command(
         Path | None,
         typer.Option("--conf-file", "-conf", help="YAML of settings; default: the package's own."),
     ] = None,
-    eval_freq: Annotated[int, typer.Option(help="Steps between two evaluations.")] = 250_000,
+    eval_freq: Annotated[
+        int | None, typer.Option(help="Steps between two evaluations (250000).")
+    ] = None,
     n_eval_envs: Annotated[
         int | None, typer.Option(min=1, help="Episodes of an evaluation (256).")
     ] = None,
@@ -87,7 +89,7 @@ def train_command(
     With --resume the options left out are those of the training in the folder.
     """
     from ...agents.training.algorithms import settings_of
-    from ...agents.training.train import CURVE, POLICY, Means, Task, task_in, train
+    from ...agents.training.train import CURVE, POLICY, Aim, Means, Task, aim_in, task_in, train
     from ..policies import evaluate, evaluation
 
     options: dict[str, Any] = {
@@ -105,26 +107,30 @@ def train_command(
     options = {name: value for name, value in options.items() if value is not None}
     if env is not None:
         check_env(env)
+    folder = out or Path(_name_of(Task(**options)))
+    task = task_in(folder) if resume else Task(**options)
     if conf_file is not None:
-        options["settings"] = settings_of(algo or Task.algo, env or Task.env_id, conf_file)
-    task = Task(**options)
-    folder = out or Path(_name_of(task))
-    if resume:
-        task = task_in(folder, **options)
-    steps = task.settings["n_timesteps"] if steps is None else steps
-    words = [*_words(task, steps), *(["--conf-file", str(conf_file)] if conf_file else [])]
+        options["settings"] = settings_of(task.algo, task.env_id, conf_file)
+    task = task_in(folder, **options) if resume else Task(**options)
+    aim = aim_in(folder) if resume else Aim(int(task.settings["n_timesteps"]), Means.eval_freq, "")
+    steps = aim.steps if steps is None else steps
+    eval_freq = aim.eval_freq if eval_freq is None else eval_freq
+    words = [*_words(task, steps), "--eval-freq", str(eval_freq)]
+    words += ["--conf-file", str(conf_file)] if conf_file else []
     words += ["--trained-agent", str(trained_agent)] if trained_agent else []
+    command = shlex.join(words)
+    if resume:
+        command = f"{aim.command}; sideslip train --resume --steps {steps}"
     console = Console()
     with _Bar(console, steps, disable=not progress) as bar:
         project = wandb_project_name if track else ""
-        means = Means(
-            eval_freq, device, tensorboard_log, bar.show, shlex.join(words), track=project
-        )
+        means = Means(eval_freq, device, tensorboard_log, bar.show, command, project)
         trained = train(task, steps, folder, resume, means, trained_agent, trust)
     console.print(_table(trained))
     costs = evaluation(evaluate(folder / POLICY, EPISODES))["cost"]
     shown = ", ".join(f"{name} {each['mean']:.4g}" for name, each in costs.items())
-    console.print(f"mean cost on test seeds: {shown}", highlight=False, soft_wrap=True)
+    where = f" of {task.scenarios[0]}, the mixture's first" if task.scenarios else ""
+    console.print(f"mean cost on test seeds{where}: {shown}", highlight=False, soft_wrap=True)
     wrote(console, folder / POLICY)
     wrote(console, folder / CURVE)
 
@@ -148,6 +154,7 @@ def _words(task: "Task", steps: int) -> list[str]:
     words += [word for each in task.scenarios for word in ("--scenarios", str(each))]
     words += [word for each in task.reads for word in ("--reads", each)]
     numbers = {"--steps": steps, "--seed": task.seed, "--num-envs": task.num_envs}
+    numbers |= {"--n-eval-envs": task.n_eval_envs}
     return words + [word for name, value in numbers.items() for word in (name, str(value))]
 
 

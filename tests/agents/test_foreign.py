@@ -135,5 +135,8 @@ def test_a_policys_card_names_no_code() -> None:
     """It comes with a file from elsewhere."""
     from sideslip.agents.learned.card import Card
 
-    with pytest.raises(ValueError, match="estimator is a name, got the entry point"):
-        Card(VISION, (("gyro", "rad/s"),), 10, "zero-slip", estimator="os:system")
+    for name in ("os:system", "evil.py", "folder/evil.py:Filter"):
+        with pytest.raises(ValueError, match="estimator is a name, got the entry point"):
+            Card(VISION, (("gyro", "rad/s"),), 10, "zero-slip", estimator=name)
+    with pytest.raises(ValueError, match="env_id is that of a registered env, got 'evil:Car-v0'"):
+        Card("evil:Car-v0", (("gyro", "rad/s"),), 10, "zero-slip")

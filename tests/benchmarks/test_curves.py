@@ -92,5 +92,10 @@ def test_what_cannot_be_compared_is_refused(folder: Path, tmp_path: Path) -> Non
     train(mixture, 256, tmp_path / "c")
     with pytest.raises(ValueError, match="designed for one scenario"):
         table_of([tmp_path / "c"])
+    plain = Task(num_envs=8, n_eval_envs=4)
+    train(plain, 256, tmp_path / "d")
+    for two in (["d", "c"], ["c", "d"]):
+        with pytest.raises(ValueError, match="evaluated on different tasks"):
+            table_of([tmp_path / each for each in two])
     with pytest.raises(FileNotFoundError, match="holds no training"):
         table_of([tmp_path])

@@ -1,11 +1,13 @@
 """`sideslip distill`: contests of a class as lessons, and each way to type it wrong."""
 
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
 pytest.importorskip("torch")
+from sideslip.benchmarks import distillation
 from sideslip.benchmarks.control.cells import ADAPTIVE
 from sideslip.benchmarks.control.contests import contests
 from sideslip.benchmarks.distillation import FILTERS, VARIED, card_of, contests_of, lessons_of
@@ -75,6 +77,15 @@ def test_the_gps_of_a_varied_lesson_is_out_for_seconds() -> None:
         steps = [cars.step(np.zeros((1, 1), np.float32))[0][0, column] for _ in range(500)]
         ages.append(max(steps[60:]))  # before it none has come
     assert ages[0] < 0.6 and ages[1] > 1.0
+
+
+def test_who_cannot_drive_a_contest_is_no_number_of_a_card(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(distillation, "load_policy", Mock())
+    monkeypatch.setattr(distillation, "salted_seeds", lambda *_: [0])
+    monkeypatch.setattr(distillation, "drive", lambda _: Mock(error="no camera"))
+    contest = contests_of("coms-model")[0]
+    with pytest.raises(ValueError, match=f"policy cannot drive {contest.name}: no camera"):
+        distillation._judged(Path("mine"), contest, 1)
 
 
 def test_every_contest_is_in_one_class() -> None:

@@ -77,6 +77,11 @@ def test_the_share_is_of_the_gap_between_nominal_and_the_car_that_is_known() -> 
     for name, share in expected.items():
         assert found.shared(name, TRAINED).value == pytest.approx(share, abs=2e-3)
     assert found.shared("fails", TRAINED).high < 0.9
+    gone = {name: driven(nominal, 1.0) for name in mine}
+    assert Found("car-yaw", {TRAINED: [mine, gone]}).shared("half", TRAINED) == found.shared(
+        "half", TRAINED
+    )
+    assert np.isnan(Found("car-yaw", {TRAINED: [gone]}).shared("half", TRAINED).value)
     found.driven.pop("a quarter heavier")
     assert found.failed("fails").mean() == pytest.approx(0.1, abs=0.05)
     ratios = found.ratios("fails")

@@ -20,6 +20,7 @@ from sideslip.agents.training.algorithms import (
     HYPERPARAMS,
     algorithm_of,
     check_settings,
+    options_of,
     settings_of,
 )
 from sideslip.agents.training.checkpoint import read_state
@@ -179,3 +180,11 @@ def test_a_fault_in_a_file_of_settings_is_named(text: str, said: str, tmp_path: 
     with pytest.raises(ValueError, match=said) as caught:
         settings_of("ppo", VISION, path)
     assert str(caught.value).startswith(str(path))
+
+
+def test_a_batch_divides_a_rollout_where_there_is_one() -> None:
+    """n_steps of sac and tqc is that of returns, and a batch is drawn from the buffer."""
+    ppo = options_of({"n_steps": 3, "batch_size": 256}, 0.01, 64)
+    assert ppo["batch_size"] == 192
+    replayed = {"n_steps": 3, "batch_size": 256, "buffer_size": 1000}
+    assert options_of(replayed, 0.01, 64)["batch_size"] == 256

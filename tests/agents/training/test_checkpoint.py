@@ -22,6 +22,11 @@ def without(key: str, values: dict[str, object]) -> dict[str, object]:
     return {name: value for name, value in values.items() if name != key}
 
 
+def of(**change: object) -> dict[str, object]:
+    """A state whose task has something else."""
+    return WHOLE | {"task": dataclasses.asdict(Task()) | change}
+
+
 @pytest.mark.parametrize(
     ("state", "message"),
     [
@@ -34,6 +39,12 @@ def without(key: str, values: dict[str, object]) -> dict[str, object]:
         ([1], "is no checkpoint of this format"),
         (WHOLE | {"sideslip": "0.0.1"}, "was made by sideslip 0.0.1, this is"),
         ("cut", "is no checkpoint: its state is no JSON"),
+        (WHOLE | {"task": 0}, "'s task lacks env_id"),
+        (of(seed="3"), ": the task: seed is '3', not int"),
+        (of(reads=3), ": the task: reads is 3, not list"),
+        (of(algo="dqn"), ": unknown algorithm 'dqn'"),
+        (of(estimator="evil.py"), ": estimator is a name, got the entry point 'evil.py'"),
+        (of(env_id="evil:Car-v0"), ": env_id is that of a registered env, got 'evil:Car-v0'"),
     ],
 )
 def test_what_a_checkpoint_lacks_is_named(state: object, message: str, tmp_path: Path) -> None:

@@ -48,26 +48,46 @@ def test_a_policy_of_a_mixture_names_it(tmp_path: Path, monkeypatch: pytest.Monk
 def test_the_scenarios_of_a_mixture_weigh_alike(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The uncontrolled car's rewards, and a policy's share of its cost."""
+    """In each second of driving, however long its episodes are; and a policy's share of the cost,
+    however many drives each scenario has."""
     monkeypatch.setattr(keeper, "_MEASURED", 8)
-    task = dataclasses.replace(TINY, scenarios=["coms-brake-in-turn", "coms-step"], n_eval_envs=8)
-    env, seeds = task.vector_env(8), keeper.evaluation_seeds(8)
+    scenarios = ["coms-brake-in-turn", {"base": "coms-slalom", "duration": 3.0}]
+    task = dataclasses.replace(TINY, scenarios=scenarios, n_eval_envs=7)
+    env, seeds = task.vector_env(7), keeper.evaluation_seeds(7)
     none = costs_of(env, NoControl(env), seeds)
     assert none[::2].mean() > 3.0 * none[1::2].mean()  # else there is nothing to weigh
-    cars: Any = keeper.Keeper(task, tmp_path, None, Means()).build(None).get_env()
-    cars.seed(seeds[0])
+    wide = dataclasses.replace(task, num_envs=64)
+    cars: Any = keeper.Keeper(wide, tmp_path, None, Means()).build(None).get_env()
+    cars.seed(2**63)
     cars.reset()
-    returns, running = np.zeros(8), np.ones(8)
+    returns, driven, running = np.zeros(64), np.zeros(64), np.ones(64)
     while running.any():
-        _, rewards, dones, _ = cars.step(np.zeros((8, 1), np.float32))
-        returns += running * rewards
+        _, rewards, dones, _ = cars.step(np.zeros((64, 1), np.float32))
+        returns, driven = returns + running * rewards, driven + running
         running *= ~dones
-    assert returns[::2].mean() == pytest.approx(returns[1::2].mean(), rel=1e-4)
+    rates = [returns[i::2].sum() / driven[i::2].sum() for i in range(2)]
+    assert rates[0] == pytest.approx(rates[1], rel=0.01)
     best = train.train(task, ROLLOUT, tmp_path).best
     costs = costs_of(env, Learned(env, tmp_path / POLICY), seeds)
     shares = [costs[i::2].mean() / none[i::2].mean() for i in range(2)]
+    means = [none[i::2].mean() for i in range(2)]
     assert best.of_none == pytest.approx(np.mean(shares), rel=1e-4)
-    assert best.cost == pytest.approx(np.mean(shares) * none.mean(), rel=1e-4)
+    assert best.cost == pytest.approx(np.mean(shares) * np.mean(means), rel=1e-4)
+    assert load_policy(tmp_path / POLICY).card.algorithm_options["weights"][1] > 1.0
+
+
+def test_weights_do_not_depend_on_the_evaluation_and_are_bounded() -> None:
+    rates = keeper._cost_rates(dataclasses.replace(TINY, scenarios=MIXTURE, n_eval_envs=2))
+    assert np.array_equal(rates, keeper._cost_rates(dataclasses.replace(TINY, scenarios=MIXTURE)))
+    assert keeper._alike(np.array([1e-9, 10.0]))[0] == pytest.approx(20.0)
+    assert keeper._alike(np.array([4.0, 2.0])).tolist() == [0.75, 1.5]
+
+
+def test_where_the_uncontrolled_car_costs_nothing_there_is_nothing_to_learn(tmp_path: Path) -> None:
+    quiet = {"base": "straight", "duration": 0.3, "disturbance_force": 0.0}
+    task = dataclasses.replace(TINY, env_options={"scenario": quiet | {"disturbance_moment": 0.0}})
+    with pytest.raises(ValueError, match="costs nothing there: there is nothing to learn"):
+        train.train(task, ROLLOUT, tmp_path)
 
 
 def test_a_policy_reads_what_its_task_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

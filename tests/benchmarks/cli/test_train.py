@@ -37,6 +37,7 @@ def test_the_policys_card_says_how_it_was_made_and_what_it_costs(run: Run) -> No
     assert shlex.split(card.command)[1:] == [
         "train", "--algo", "ppo", "--env", "sideslip/YawVision-v0",
         "--option", "scenario=sine-with-dwell", "--steps", "256", "--seed", "0", "--num-envs", "8",
+        "--n-eval-envs", "256", "--eval-freq", "250000",
     ]  # fmt: skip
     costs = card.evaluation["cost"]
     assert card.evaluation["salt"] and len(costs) == 3
@@ -53,6 +54,12 @@ def test_it_goes_on_with_what_the_folder_holds(
     status, _, err = run("--resume", "--out", folder, "-n", 512, "-P")
     assert status == 0, err
     assert len((tmp_path / folder / train.CURVE).read_text().splitlines()) == 3
+    status, _, err = run("--resume", "--out", folder, "-n", 768, "--eval-freq", 512)
+    assert status == 0, err
+    aim = train.aim_in(folder)
+    assert aim[:2] == (768, 512) and aim.command.count("sideslip train") == 3
+    assert run("--resume", "--out", folder)[0] == 0  # nothing is left to do
+    assert train.aim_in(folder) == aim
     status, _, err = run(*TINY, "--steps", 256)
     assert status == 2 and "holds a training already" in err
     status, _, err = run("--resume", "--out", folder, "--seed", 4)
