@@ -6,7 +6,7 @@ reads plain observations.
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
@@ -27,8 +27,7 @@ Scaling = tuple[list[float], list[float], float | None]
 """Mean, scale and clip of `Standardised`, in JSON types."""
 
 CLIP = 10.0  # standard deviations
-_WARM_UP = 20  # steps until every sensor has spoken
-_STEPS = 400
+_WARM_UP, _LONG = 0.2, 4.0  # s: until every sensor has spoken, and of the whole drive
 _CONSTANT = 1e-9  # what varies less is not read
 
 
@@ -71,9 +70,11 @@ def measured(
     """Of each entry, under random actions of this standard deviation.
 
     reads: names of the entries that are read, none for all. Raises ValueError for a name that the
-    observation has not.
+    observation has not, and where nothing of what is read varies.
     """
-    names = [entry.name for entry in facts_of(env).layout]
+    facts, base = facts_of(env), cast(Any, env.unwrapped)
+    names = [entry.name for entry in facts.layout]
+    period = facts.control_period * base.dt
     unknown = [name for name in reads if name not in names]
     if unknown:
         raise ValueError(
@@ -83,16 +84,18 @@ def measured(
     shape = env.action_space.shape or ()
     env.reset(seed=seed)
     seen = []
-    for step in range(_STEPS):
+    for step in range(round(_LONG / period)):
         actions = spread * rng.standard_normal(shape)
         obs, *_ = env.step(actions.astype(np.float32))
-        if step >= _WARM_UP:
+        if step >= round(_WARM_UP / period):
             seen.append(obs)
     samples = np.concatenate(seen).astype(np.float64)
     deviation = samples.std(axis=0)
     varies = deviation > _CONSTANT
     if reads:
         varies &= np.isin(names, reads)
+    if not varies.any():
+        raise ValueError(f"nothing of what the network reads varies within {_LONG:g} s")
     scale = np.where(varies, 1.0 / np.where(varies, deviation, 1.0), 0.0)
     return samples.mean(axis=0).tolist(), scale.tolist(), CLIP
 

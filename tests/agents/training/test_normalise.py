@@ -36,3 +36,13 @@ def test_a_network_reads_what_it_is_told_to_and_nothing_else() -> None:
     assert np.count_nonzero(some[1]) == 2 < np.count_nonzero(plain[1])
     with pytest.raises(ValueError, match=r"the observation has no beta_hat to read; it has gyro, "):
         measured(env, 0.4, 5, ["gyro", "beta_hat"])
+    with pytest.raises(ValueError, match="nothing of what the network reads varies within 4 s"):
+        measured(env, 0.4, 5, ["gamma_ref"])  # zero-slip
+
+
+def test_scales_are_of_seconds_however_short_a_control_period_is() -> None:
+    """In 0.4 s nobody steers: what was measured over steps was never read."""
+    options = {"scenario": "sine-with-dwell", "control_period": 2}
+    env = Task(env_options=options).vector_env(4)
+    names = [entry.name for entry in env.unwrapped.layout]  # type: ignore[attr-defined]
+    assert measured(env, 0.4, 5)[1][names.index("steer_command")] > 0.0
