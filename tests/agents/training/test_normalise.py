@@ -42,7 +42,7 @@ def test_a_network_reads_what_it_is_told_to_and_nothing_else() -> None:
 
 def test_scales_are_of_seconds_however_short_a_control_period_is() -> None:
     """In 0.4 s nobody steers: what was measured over steps was never read."""
-    options = {"scenario": "sine-with-dwell", "control_period": 2}
+    options = {"scenario": "sine-with-dwell", "control_period": 1}
     env = Task(env_options=options).vector_env(4)
     names = [entry.name for entry in env.unwrapped.layout]  # type: ignore[attr-defined]
     assert measured(env, 0.4, 5)[1][names.index("steer_command")] > 0.0
