@@ -8,7 +8,7 @@ from ..envs.backend.extras import extra
 from ..envs.backend.files import whole
 from ..envs.rendering.palette import INK, colour
 from .control.answer import on_its_own
-from .control.contests import TITLES
+from .control.contests import TITLES, contests
 from .harness.metrics import METRICS
 from .harness.results import Row, ShareMap, Suite
 from .report.colours import SHARE_SCALE
@@ -24,7 +24,8 @@ def write_picture(path: str | Path, suites: Sequence[Suite]) -> None:
     with extra("report", "pictures need matplotlib"):
         from matplotlib.figure import Figure
     rows = [row for suite in suites for row in suite.rows]
-    error, score = "error of sideslip / mrad", "score (0: nominal, 1: oracle-state)"
+    error = "error of sideslip / mrad"
+    score = "score (0: nominal, 1: oracle-state)\nhatched: of a part of the contests"
     panels = [
         (title, [r for r in rows if (r.scenario, r.metric) == key and _shown(r)], label)
         for title, key, label in (
@@ -46,7 +47,9 @@ def write_picture(path: str | Path, suites: Sequence[Suite]) -> None:
     down = -(-len(panels) // max(across, 1))
     heights = [down] * bool(panels) + [1] * len(maps)
     wide = max([4.0 * across, *(2.4 * len(each.shares) for each in maps)])
-    figure = Figure(figsize=(wide, 2.6 * sum(heights)), layout="constrained")
+    most = max([len(mine) for _, mine, _ in panels], default=0)
+    high = down * max(2.6, 0.17 * most + 0.8) * bool(panels) + 2.6 * len(maps)
+    figure = Figure(figsize=(wide, high), layout="constrained")
     strips = figure.subfigures(len(heights), 1, squeeze=False, height_ratios=heights)[:, 0]
     for strip, each in zip(strips[bool(panels) :], maps, strict=True):
         _maps(strip, each)
@@ -54,7 +57,7 @@ def write_picture(path: str | Path, suites: Sequence[Suite]) -> None:
     for axis in axes[len(panels) :]:
         axis.set_axis_off()
     for axis, (title, mine, label) in zip(axes, panels, strict=False):
-        _bars(axis, mine, title, label)
+        _bars(axis, mine, title, label, in_part(rows, mine[0].scenario))
         over = {r.estimator: r.value for r in rows
                 if r.metric == "rmse_over_bound" and r.scenario == mine[0].scenario}  # fmt: skip
         for row in mine:
@@ -68,6 +71,17 @@ def write_picture(path: str | Path, suites: Sequence[Suite]) -> None:
 def _shown(row: Row) -> bool:
     """Whether a row stands in the picture: of the scores those on the controller's own filter."""
     return row.metric != "score" or on_its_own(row.controller, row.estimator)
+
+
+def in_part(rows: Sequence[Row], tier: str) -> set[str]:
+    """Controllers that drive a part of a tier's contests, so that theirs is another's score."""
+    of_tier = {each.name for each in contests() if f"tier {each.tier}" == tier}
+    driven: dict[str, set[str]] = {}
+    for row in rows:
+        if row.metric == "score" and row.scenario in of_tier:
+            driven.setdefault(row.controller, set()).add(row.scenario)
+    every = set[str]().union(*driven.values())
+    return {name for name, mine in driven.items() if mine != every}
 
 
 def _maps(strip: Any, shown: ShareMap) -> None:
@@ -94,7 +108,7 @@ def _limit(axis: Any, value: float) -> None:
     axis.text(value, -0.4, " the bound", color=INK, fontsize=8, va="center", bbox=box)
 
 
-def _bars(axis: Any, rows: Sequence[Row], title: str, label: str) -> None:
+def _bars(axis: Any, rows: Sequence[Row], title: str, label: str, parted: set[str]) -> None:
     """Horizontal bars, the best on top: the smallest error or the highest score."""
     sign = 1.0 if rows[0].metric == "score" else -1.0
     ordered = sorted(rows, key=lambda row: sign * row.value)
@@ -108,7 +122,7 @@ def _bars(axis: Any, rows: Sequence[Row], title: str, label: str) -> None:
     ]
     bars = axis.barh(names, values, color=colours, xerr=errors, ecolor="0.3", capsize=2)
     for bar, name in zip(bars, names, strict=True):
-        if "," in name:  # a variant of a known name wears its colour, hatched
+        if "," in name or name in parted:  # a variant of a known name wears its colour, hatched
             bar.set(hatch="//", edgecolor="white")
     axis.set_title(title, fontsize=9)
     axis.set_xlabel(label, fontsize=8)

@@ -1,0 +1,29 @@
+"""The benchmark's picture: who drives a part of the contests is marked."""
+
+from pathlib import Path
+
+import pytest
+
+from sideslip.benchmarks.control.contests import contests
+from sideslip.benchmarks.harness.results import Row, Suite
+from sideslip.benchmarks.picture import in_part, write_picture
+
+MINE = [each.name for each in contests() if each.tier == "2a"]
+STEERING = [name for name in MINE if name.endswith("steering")]
+
+
+def driven(who: str, names: list[str]) -> list[Row]:
+    return [Row("control", name, "score", 0.5, controller=who) for name in (*names, "tier 2a")]
+
+
+def test_a_score_over_a_part_of_a_tiers_contests_is_marked(tmp_path: Path) -> None:
+    """Of this tier: what anybody drives of another one is no part of it."""
+    assert 0 < len(STEERING) < len(MINE)
+    elsewhere = next(each.name for each in contests() if each.tier == "1")
+    rows = driven("lqr", MINE) + driven("model-following", STEERING)
+    rows += [Row("control", elsewhere, "score", 0.5, controller="lqr")]
+    assert in_part(rows, "tier 2a") == {"model-following"}
+    assert in_part(rows, "tier 1") == set()
+    pytest.importorskip("matplotlib")
+    write_picture(tmp_path / "bench.png", [Suite("control", "Who", "How", rows)])
+    assert (tmp_path / "bench.png").stat().st_size > 10_000
