@@ -52,7 +52,7 @@ def facts_of(env: AnyEnv) -> EnvFacts:
         period, kind = base.control_period, base.reference
     elif isinstance(env, VectorEnv):
         base = env.unwrapped
-        layout, width = _layout(env), base.single_action_space.shape[0]
+        layout, width = layout_of(env), base.single_action_space.shape[0]
         nominals, vehicles = _rows(base, "nominal"), _rows(base, "vehicle")
         period, kind = _common(base, "control_period"), _common(base, "reference")
     else:
@@ -89,7 +89,7 @@ def _plain(env: Any, layout: tuple[Entry, ...]) -> tuple[Entry, ...]:
     return layout
 
 
-def _layout(env: VectorEnv[Any, Any, Any]) -> tuple[Entry, ...]:
+def layout_of(env: VectorEnv[Any, Any, Any]) -> tuple[Entry, ...]:
     """The outermost layout that a layer offers, else that of the sub-environments."""
     layer: Any = env
     while True:

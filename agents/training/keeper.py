@@ -12,7 +12,6 @@ import numpy as np
 from ... import __version__
 from ...envs.backend.files import whole, write_whole
 from ...envs.record import Array
-from ..controllers.base import NoControl
 from ..learned.card import Card
 from ..learned.files import save_policy
 from ..rollout import costs_of, steps_of
@@ -129,7 +128,7 @@ class Keeper(BaseCallback):
         self.period: float = base.control_period * base.dt  # s
         saved = {} if checkpoint is None else checkpoint
         self.evaluations = [Evaluation(*each) for each in saved.get("evaluations", [])]
-        none = self._costs(NoControl(self.tested))
+        none = self._costs(None)
         if none.mean() == 0.0:
             raise ValueError("the uncontrolled car costs nothing there: there is nothing to learn")
         self.alike, self.none = _alike(none), float(np.mean(none * _alike(none)))
@@ -179,7 +178,7 @@ class Keeper(BaseCallback):
         return model
 
     def _costs(self, agent: Any) -> Array:
-        """Mean over the evaluation's drives of each scenario, (k,)."""
+        """Mean over the evaluation's drives of each scenario, (k,); agent: None for no control."""
         costs, k = costs_of(self.tested, agent, self.seeds), max(len(self.task.scenarios), 1)
         return np.array([costs[i::k].mean() for i in range(k)])
 

@@ -6,7 +6,7 @@ reads plain observations.
 
 import math
 from collections.abc import Sequence
-from typing import Any, cast
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -14,7 +14,7 @@ import numpy.typing as npt
 from gymnasium.vector import VectorEnv
 
 from ...envs.backend.extras import extra
-from ..env_facts import facts_of
+from ..env_facts import layout_of
 from ..vec_env.env import Observations
 
 with extra("train", "training needs {}"):
@@ -72,9 +72,9 @@ def measured(
     reads: names of the entries that are read, none for all. Raises ValueError for a name that the
     observation has not, and where nothing of what is read varies.
     """
-    facts, base = facts_of(env), cast(Any, env.unwrapped)
-    names = [entry.name for entry in facts.layout]
-    period = facts.control_period * base.dt
+    names = [entry.name for entry in layout_of(env)]  # rows may believe in other nominal cars
+    base: Any = env.unwrapped
+    period = base.control_period * base.dt
     unknown = [name for name in reads if name not in names]
     if unknown:
         raise ValueError(

@@ -35,6 +35,20 @@ def test_a_mixture_survives_autoreset() -> None:
     assert durations == [durations[0], 0.3, durations[0], 0.3, durations[0]] and durations[0] > 1.0
 
 
+def test_a_mixture_may_be_of_roads_on_which_controllers_are_told_other_friction(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They would need a design for each kind of car; a network needs none."""
+    monkeypatch.setattr(keeper, "_MEASURED", 8)
+    options = {"vehicle": "passenger-car", "nominal": "passenger-car"}
+    scenarios = ["car-step", "any-friction-step"]
+    task = dataclasses.replace(TINY, env_options=options, scenarios=scenarios)
+    cars: Any = task.vector_env(2).unwrapped
+    assert cars.nominal[0] != cars.nominal[1]
+    train.train(task, ROLLOUT, tmp_path)
+    assert load_policy(tmp_path / POLICY).card.algorithm_options["scenarios"] == scenarios
+
+
 def test_a_policy_of_a_mixture_names_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(keeper, "_MEASURED", 8)
     task = dataclasses.replace(TINY, scenarios=MIXTURE)
