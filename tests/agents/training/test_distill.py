@@ -108,6 +108,17 @@ def test_what_is_told_is_what_the_teacher_reads_and_the_student_does_not_see() -
     assert Student(5, 1, COURSE, 2).tell is None
 
 
+def test_windows_in_which_every_episode_is_over_tell_nothing() -> None:
+    """Such as those of a car that spins early, in a batch of its own."""
+    seen = drive(lesson(), None, range(CARS), 0.1)
+    weights = seen.weights.copy()
+    weights[:, 1:] = 0.0
+    course = replace(COURSE, cells=4, told=1.0, batch=1)
+    model = Student(seen.obs.shape[2], 1, course, seen.told.shape[2])
+    scaling = scaling_of([seen], lesson()[0].layout, ("beta_hat",))
+    assert np.isfinite(fitted(model, [seen._replace(weights=weights)], scaling, course, 1))
+
+
 def test_a_teacher_of_other_cars_is_refused() -> None:
     with pytest.raises(ValueError, match="cars are others than the student's"):
         drive(lesson(scenario=SHORT | {"friction": 0.5}), None, range(CARS), 0.0)
