@@ -7,7 +7,7 @@ from typing import Any
 from ..envs.backend.extras import extra
 from ..envs.backend.files import whole
 from ..envs.rendering.palette import INK, colour
-from .control.answer import on_its_own
+from .control.answer import everywhere, on_its_own
 from .control.contests import TITLES, contests
 from .harness.metrics import METRICS
 from .harness.results import Row, ShareMap, Suite
@@ -78,10 +78,9 @@ def in_part(rows: Sequence[Row], tier: str) -> set[str]:
     of_tier = {each.name for each in contests() if f"tier {each.tier}" == tier}
     driven: dict[str, set[str]] = {}
     for row in rows:
-        if row.metric == "score" and row.scenario in of_tier:
+        if row.metric == "score" and row.scenario in of_tier and _shown(row):
             driven.setdefault(row.controller, set()).add(row.scenario)
-    every = set[str]().union(*driven.values())
-    return {name for name, mine in driven.items() if mine != every}
+    return set(driven.keys() - everywhere(driven).keys())
 
 
 def _maps(strip: Any, shown: ShareMap) -> None:

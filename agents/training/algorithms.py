@@ -30,6 +30,7 @@ from ...envs.backend.extras import extra
 from .normalise import Scaling, Standardised  # first: it says which extra is missing
 
 from stable_baselines3.common.base_class import BaseAlgorithm  # isort: skip
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm  # isort: skip
 from stable_baselines3.common.utils import LinearSchedule  # isort: skip
 from stable_baselines3.common.vec_env import VecEnv  # isort: skip
 
@@ -124,14 +125,15 @@ def spread_of(settings: Settings) -> float:
     return math.exp(settings.get("policy_kwargs", {}).get("log_std_init", EVENLY))
 
 
-def options_of(settings: Settings, seconds: float, num_envs: int) -> Settings:
+def options_of(algo: str, settings: Settings, seconds: float, num_envs: int) -> Settings:
     """Arguments of the class, in JSON types, for a control period and a number of environments:
     gamma forgets as much in a second as in the file, a batch divides a rollout."""
     found = {name: value for name, value in settings.items() if name not in _OF_TRAINING}
     if "gamma" in found:
         found["gamma"] = found["gamma"] ** (seconds / PERIOD)
-    of_returns = "buffer_size" in found or "train_freq" in found  # n_steps of sac, tqc
-    if "n_steps" in found and "batch_size" in found and not of_returns:
+    kind: Any = algorithm_of(algo).load()
+    rolls_out = issubclass(kind, OnPolicyAlgorithm)  # elsewhere n_steps is that of returns
+    if rolls_out and "n_steps" in found and "batch_size" in found:
         rollout = num_envs * found["n_steps"]
         most = min(found["batch_size"], rollout)
         found["batch_size"] = max(n for n in range(1, most + 1) if rollout % n == 0)
@@ -149,7 +151,7 @@ def make_model(
 ) -> BaseAlgorithm:
     """An untrained model. settings: of `settings_of`. seconds: of a control period. scaling: of
     `Standardised`. rest: further arguments of the class, as its device."""
-    options = options_of(settings, seconds, env.num_envs)
+    options = options_of(algo, settings, seconds, env.num_envs)
     options |= {name: _schedule(name, options[name]) for name in _SCHEDULED if name in options}
     mean, scale, clip = scaling
     options["policy_kwargs"] = {

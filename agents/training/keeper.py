@@ -45,9 +45,8 @@ def _alike(costs: Array) -> Array:
 
 
 def _cost_rates(task: Task) -> Array:
-    """What the uncontrolled car pays in a second of each scenario, (k,)."""
-    k = max(len(task.scenarios), 1)
-    rows = _ALONE * k
+    """What the uncontrolled car pays in a control period of each scenario of a mixture, (k,)."""
+    k, rows = len(task.scenarios), _ALONE * len(task.scenarios)
     env = make_native_env(task.env_id, rows, None, task.options(rows))
     costs, steps = np.zeros(rows), -np.ones(rows)  # the first one is the reset
     for step in steps_of(env, None, [_WEIGHING + i for i in range(rows)]):
@@ -106,10 +105,20 @@ class Means:
             raise ValueError(f"eval_freq is at least 1, got {self.eval_freq}")
 
 
+@dataclass(frozen=True)
+class Aim:
+    """What a training was told besides its task: steps, those between two evaluations, the command
+    for the policy's card."""
+
+    steps: int
+    eval_freq: int
+    command: str = ""
+
+
 class Keeper(BaseCallback):
     """Builds the model; evaluates it between rollouts and keeps what is needed to go on.
 
-    checkpoint: the state of one, None for a new training. steps: it is to have.
+    checkpoint: the state of one, None for a new training. steps: as many as it is to have.
     """
 
     def __init__(
@@ -121,7 +130,8 @@ class Keeper(BaseCallback):
         steps: int = 0,
     ) -> None:
         super().__init__()
-        self.task, self.folder, self.means, self.aim = task, folder, means, steps
+        self.task, self.folder, self.means = task, folder, means
+        self.aim = Aim(steps, means.eval_freq, means.command)
         self.seeds = evaluation_seeds(task.n_eval_envs)
         self.tested = task.vector_env(task.n_eval_envs)
         base: Any = self.tested.unwrapped
@@ -131,7 +141,8 @@ class Keeper(BaseCallback):
         none = self._costs(None)
         if none.mean() == 0.0:
             raise ValueError("the uncontrolled car costs nothing there: there is nothing to learn")
-        self.alike, self.none = _alike(none), float(np.mean(none * _alike(none)))
+        self.alike = _alike(none)
+        self.none = float(np.mean(none * self.alike))
         self.weights = _alike(_cost_rates(task)) if task.scenarios else np.ones(1)
         self.scaling: Any = saved.get("scaling")
         self.spent = self.evaluations[-1].cpu_seconds if self.evaluations else 0.0
@@ -221,7 +232,7 @@ class Keeper(BaseCallback):
             "sideslip": __version__,
             "task": asdict(self.task),
             "steps": self.model.num_timesteps,
-            "aim": [self.aim, self.means.eval_freq, self.means.command],
+            "aim": asdict(self.aim),
             "scaling": self.scaling,
             "evaluations": self.evaluations,
         }
@@ -232,7 +243,7 @@ class Keeper(BaseCallback):
 
     def _keep_best(self, now: Evaluation) -> None:
         task = self.task
-        described = options_of(task.settings, self.period, task.num_envs)
+        described = options_of(task.algo, task.settings, self.period, task.num_envs)
         described |= {"num_envs": task.num_envs, "policy": task.settings["policy"]}
         described |= {"reads": task.reads} if task.reads else {}
         mixture: dict[str, Any] = {}

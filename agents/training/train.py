@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ... import __version__
-from ...envs.documents import check_types
+from ...envs.documents import made_of
 from ..learned.card import check_names_no_code
 from .checkpoint import read_state
-from .keeper import BEST, CHECKPOINT, CURVE, POLICY, Evaluation, Keeper, Means, Progress
+from .keeper import BEST, CHECKPOINT, CURVE, POLICY, Aim, Evaluation, Keeper, Means, Progress
 from .task import Task
 from .zips import check_zip
 
@@ -26,7 +26,7 @@ from stable_baselines3.common.logger import KVWriter  # isort: skip
 
 __all__ = [
     "BEST", "CHECKPOINT", "CURVE", "POLICY",
-    "Keeper", "Means", "Progress", "Task", "Trained", "task_in", "train",
+    "Aim", "Keeper", "Means", "Progress", "Task", "Trained", "task_in", "train",
 ]  # fmt: skip
 
 
@@ -98,19 +98,11 @@ def train(
     return Trained(model, tuple(keeper.evaluations))
 
 
-class Aim(NamedTuple):
-    """What a training was told besides its task: steps, those between two evaluations, the command
-    for the policy's card."""
-
-    steps: int
-    eval_freq: int
-    command: str
-
-
 def aim_in(folder: str | Path) -> Aim:
     """Of a folder's checkpoint. Raises as `task_in`."""
     task_in(folder)
-    return Aim(*read_state(Path(folder) / CHECKPOINT)["aim"])
+    path = Path(folder) / CHECKPOINT
+    return made_of(Aim, read_state(path)["aim"], f"{path}: the aim")
 
 
 class _Tracked(BaseCallback):
@@ -167,16 +159,14 @@ def task_in(folder: str | Path, **arguments: Any) -> Task:
             f"{path} was made by sideslip {version}, this is {__version__}, whose cars and costs "
             "may be others: train anew, in another folder"
         )
-    names = [each.name for each in fields(Task)]
+    names = [each.name for each in fields(Task)]  # a default for none of them
     missing = [name for name in names if not isinstance(saved, dict) or name not in saved]
     if missing:
         raise ValueError(f"{path}: the checkpoint's task lacks {', '.join(missing)}")
-    values = {name: saved[name] for name in names}
+    task = made_of(Task, saved, f"{path}: the task")
     try:
-        check_types(Task, values, "the task")
-        check_names_no_code(values["env_id"], values["estimator"])
-        task = Task(**values)
-    except (TypeError, ValueError) as error:
+        check_names_no_code(task.env_id, task.estimator)
+    except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
     for name, value in arguments.items():
         if value != getattr(task, name):

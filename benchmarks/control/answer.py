@@ -1,6 +1,7 @@
 """The matrix's verdict: the best estimator, the best controller, and why."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -16,6 +17,7 @@ _POLICIES = {pair for pairs in LEARNED.values() for pair in pairs}
 
 Gains = dict[Contest, Array]
 """r of a contestant's episodes in the contests that count."""
+Driven = TypeVar("Driven", bound=Collection[Any])
 
 
 def answer(
@@ -28,7 +30,7 @@ def answer(
     ahead: (n,) log(J_oracle-state / J_clairvoyant) of calibrated contests.
     """
     filters, drivers = _estimators(found), _controllers(found)
-    others, none = _everywhere(drivers), drivers.get("none", {})
+    others, none = everywhere(drivers), drivers.get("none", {})
     best = best_controller(found)
     over = _over(others[best], none) if best not in ("", "none") and none else None
     text = f", {100.0 * over.value:.0f} % of no control's" if over else ""
@@ -52,11 +54,14 @@ def on_its_own(controller: str, estimator: str) -> bool:
 
 def best_controller(found: Mapping[str, Sequence[Standing]]) -> str:
     """Who leads over all tiers of those who drive everywhere, "" where nobody has a score."""
-    return next(iter(_ranked(_everywhere(_controllers(found)))), "")
+    return next(iter(_ranked(everywhere(_controllers(found)))), "")
 
 
-def _everywhere(those: Mapping[str, Gains]) -> dict[str, Gains]:
-    """Who drives every contest that anybody drives: who drives a part is not the best over all."""
+def everywhere(those: Mapping[str, Driven]) -> dict[str, Driven]:
+    """Who drives every contest that anybody drives: who drives a part is not the best over all.
+
+    those: by name, the contests or what is known of each.
+    """
     every = {contest for mine in those.values() for contest in mine}
     return {name: mine for name, mine in those.items() if set(mine) == every}
 
@@ -118,13 +123,13 @@ def _elsewhere(found: Mapping[str, Sequence[Standing]]) -> str:
     """The tiers in which somebody else surely leads, and who does where he drives a part."""
     parts = []
     for tier, standings in found.items():
-        for of in (_estimators, lambda there: _everywhere(_controllers(there))):
+        for of in (_estimators, lambda there: everywhere(_controllers(there))):
             overall, here = _ranked(of(found)), _ranked(of({tier: standings}))
             first, best = (next(iter(each), "") for each in (overall, here))
             if best != first and first in here.get(best, {}) and here[best][first].high < 1.0:
                 parts.append(f"{best} in tier {tier}")
     drivers, overall_best = _controllers(found), best_controller(found)
-    parted = drivers.keys() - _everywhere(drivers).keys() if overall_best else ()
+    parted = drivers.keys() - everywhere(drivers).keys() if overall_best else ()
     ahead = {name: _over(drivers[name], drivers[overall_best]) for name in parted}
     parts += [f"{name} where it drives" for name in sorted(ahead, key=lambda who: ahead[who].value)
               if ahead[name].high < 1.0]  # fmt: skip

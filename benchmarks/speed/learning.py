@@ -45,7 +45,7 @@ def _settings() -> dict[str, Any]:
     """Those of `sideslip train`."""
     from ...agents.training.algorithms import options_of, settings_of
 
-    options = options_of(settings_of("ppo", YAW), 10 * TICK, COUNT)
+    options = options_of("ppo", settings_of("ppo", YAW), 10 * TICK, COUNT)
     return {name: options[name] for name in ("n_steps", "n_epochs", "batch_size", "gamma")}
 
 

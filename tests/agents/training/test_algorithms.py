@@ -184,7 +184,7 @@ def test_a_fault_in_a_file_of_settings_is_named(text: str, said: str, tmp_path: 
 
 def test_a_batch_divides_a_rollout_where_there_is_one() -> None:
     """n_steps of sac and tqc is that of returns, and a batch is drawn from the buffer."""
-    ppo = options_of({"n_steps": 3, "batch_size": 256}, 0.01, 64)
+    ppo = options_of("ppo", {"n_steps": 3, "batch_size": 256}, 0.01, 64)
     assert ppo["batch_size"] == 192
-    replayed = {"n_steps": 3, "batch_size": 256, "buffer_size": 1000}
-    assert options_of(replayed, 0.01, 64)["batch_size"] == 256
+    replayed = {"n_steps": 3, "batch_size": 256}
+    assert options_of("sac", replayed, 0.01, 64)["batch_size"] == 256

@@ -12,7 +12,7 @@ from safetensors.torch import save
 
 from sideslip import __version__
 from sideslip.agents.training.checkpoint import FORMAT, STATE
-from sideslip.agents.training.train import CHECKPOINT, Task, task_in
+from sideslip.agents.training.train import CHECKPOINT, Task, aim_in, task_in
 
 WHOLE: dict[str, object] = dict.fromkeys(sorted(STATE), 0)
 WHOLE |= {"format": FORMAT, "task": dataclasses.asdict(Task()), "sideslip": __version__}
@@ -42,7 +42,7 @@ def of(**change: object) -> dict[str, object]:
         (WHOLE | {"task": 0}, "'s task lacks env_id"),
         (of(seed="3"), ": the task: seed is '3', not int"),
         (of(reads=3), ": the task: reads is 3, not list"),
-        (of(algo="dqn"), ": unknown algorithm 'dqn'"),
+        (of(algo="dqn"), ": the task: unknown algorithm 'dqn'"),
         (of(estimator="evil.py"), ": estimator is a name, got the entry point 'evil.py'"),
         (of(env_id="evil:Car-v0"), ": env_id is that of a registered env, got 'evil:Car-v0'"),
     ],
@@ -59,3 +59,14 @@ def test_a_whole_checkpoint_is_read(tmp_path: Path) -> None:
     state = {"checkpoint": json.dumps(WHOLE)}
     (tmp_path / CHECKPOINT).write_bytes(save({"a": torch.zeros(1)}, state))
     assert task_in(tmp_path) == Task()
+
+
+def test_what_a_training_was_told_is_typed(tmp_path: Path) -> None:
+    for aim, said in (
+        (7, "the aim: expected a JSON object"),
+        ({"steps": "7"}, "missing eval_freq"),
+    ):
+        state = {"checkpoint": json.dumps(WHOLE | {"aim": aim})}
+        (tmp_path / CHECKPOINT).write_bytes(save({"a": torch.zeros(1)}, state))
+        with pytest.raises(ValueError, match=said):
+            aim_in(tmp_path)

@@ -270,7 +270,7 @@ def test_the_network_of_the_file_standardises_as_torch_does(folder: Path) -> Non
 @pytest.mark.parametrize("num_envs", [1, 7, 100, 256, 1000])
 def test_batches_divide_a_rollout(num_envs: int) -> None:
     settings = Task().settings
-    told = options_of(settings, 0.02, num_envs)
+    told = options_of("ppo", settings, 0.02, num_envs)
     assert num_envs * told["n_steps"] % told["batch_size"] == 0
     assert told["batch_size"] <= settings["batch_size"]
     assert told["gamma"] == pytest.approx(settings["gamma"] ** 2, rel=1e-12)  # a longer period

@@ -57,11 +57,17 @@ def test_it_goes_on_with_what_the_folder_holds(
     status, _, err = run("--resume", "--out", folder, "-n", 768, "--eval-freq", 512)
     assert status == 0, err
     aim = train.aim_in(folder)
-    assert aim[:2] == (768, 512) and aim.command.count("sideslip train") == 3
+    assert (aim.steps, aim.eval_freq) == (768, 512) and aim.command.count("sideslip train") == 3
     assert run("--resume", "--out", folder)[0] == 0  # nothing is left to do
     assert train.aim_in(folder) == aim
     status, _, err = run(*TINY, "--steps", 256)
     assert status == 2 and "holds a training already" in err
+    settings = (tmp_path / "mine.yml", "sideslip/YawGps-v0:\n  n_envs: 8\n  policy: MlpPolicy\n")
+    settings[0].write_text(settings[1] + "  n_timesteps: 256\n  n_steps: 32\n")
+    own = ("--conf-file", settings[0], "--out", "own")
+    assert run(*TINY, "--env", "sideslip/YawGps-v0", *own)[0] == 0
+    status, _, err = run("--resume", *own)  # the folder says which env's settings they are
+    assert status == 0, err
     status, _, err = run("--resume", "--out", folder, "--seed", 4)
     assert status == 2 and "is of seed 0, not 4" in err
 
