@@ -1,4 +1,5 @@
-"""The algorithms of `sideslip train`: stable-baselines3's, with settings that learn here.
+"""The algorithms of `sideslip train`: stable-baselines3's and one of ours, with settings that learn
+here.
 
 The settings stand in `hyperparams/`, in rl-baselines3-zoo's format, and were chosen on YawVision-v0
 with seed 0. PPO on its sensors alone (600,000 steps, about 20 CPU-s; mean cost over none's on 256
@@ -42,15 +43,17 @@ EVENLY = -0.55  # log of the deviation of actions drawn evenly
 
 _OF_TRAINING = ("n_timesteps", "n_envs", "policy", "normalize")
 _SCHEDULED = ("learning_rate", "clip_range")
-_OURS = {"env", "seed", "device", "verbose", "tensorboard_log", "stats_window_size"}
+_OURS = {"env", "seed", "device", "verbose", "tensorboard_log", "stats_window_size", "source"}
 
 
 @dataclass(frozen=True)
 class Algorithm:
-    """Where the class is, "module:name", and how rl-baselines3-zoo calls it."""
+    """Where the class is, "module:name", how rl-baselines3-zoo calls it or would, and whether it
+    follows gradients through cars on tensors."""
 
     kind: str
     zoo: str
+    on_tensors: bool = False
 
     def load(self) -> Callable[..., BaseAlgorithm]:
         """The class; ModuleNotFoundError without its package."""
@@ -65,6 +68,7 @@ ALGORITHMS = {
     "sac": Algorithm("stable_baselines3:SAC", "sac"),
     "tqc": Algorithm("sb3_contrib:TQC", "tqc"),
     "recurrent-ppo": Algorithm("sb3_contrib:RecurrentPPO", "ppo_lstm"),
+    "gradient": Algorithm(f"{__package__}.gradient:Gradient", "gradient", on_tensors=True),
 }
 
 

@@ -1,6 +1,7 @@
 """The deterministic actor of a stable-baselines3 model as a `Network`, which needs no torch."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -42,6 +43,8 @@ def network_from_sb3(model: Any, normaliser: Any = None, history: int = 1) -> Ne
         raise ValueError(f"one activation in all layers, got {', '.join(activations)}")
     cells = _cells(actor.recurrent)
     wide = (cells[0].weight_in if cells else weights[0]).shape[1]
+    if actor.mixing is not None:
+        cells[0] = replace(cells[0], weight_in=cells[0].weight_in @ _array(actor.mixing).T)
     mean, scale, clip = normalisation(normaliser, wide, history)
     if isinstance(actor.extractor, Standardised):
         if clip is not None:
@@ -61,12 +64,14 @@ def network_from_sb3(model: Any, normaliser: Any = None, history: int = 1) -> Ne
 
 
 class _Actor(NamedTuple):
-    """What acts in a policy: layers, whether tanh follows, features extractor, recurrent layers."""
+    """What acts in a policy: layers, whether tanh follows, features extractor, recurrent layers,
+    and what mixes features before these."""
 
     layers: list[Any]
     squashed: bool
     extractor: Any
     recurrent: Any = None
+    mixing: Any = None
 
 
 def _on_policy(policy: Any) -> _Actor:
@@ -76,6 +81,11 @@ def _on_policy(policy: Any) -> _Actor:
 
 def _recurrent(policy: Any) -> _Actor:
     return _on_policy(policy)._replace(recurrent=policy.lstm_actor)
+
+
+def _mixed(policy: Any) -> _Actor:
+    layers = list(policy.layers)
+    return _Actor(layers, False, policy.features_extractor, policy.cell, policy.mixing)
 
 
 def _gaussian(policy: Any) -> _Actor:
@@ -95,9 +105,10 @@ ACTORS: dict[str, Callable[[Any], _Actor]] = {
     "stable_baselines3.td3.policies.TD3Policy": _certain,
     "sb3_contrib.tqc.policies.TQCPolicy": _gaussian,
     "sb3_contrib.common.recurrent.policies.RecurrentActorCriticPolicy": _recurrent,
+    f"{__package__}.gradient.GruPolicy": _mixed,
 }
 """The policies whose actor is known: "MlpPolicy" and "MlpLstmPolicy" of PPO, A2C, SAC, TD3, DDPG,
-TQC and RecurrentPPO. A subclass may compute anything and is none of them."""
+TQC and RecurrentPPO, and ours. A subclass may compute anything and is none of them."""
 
 
 def known_policy(kind: type) -> Callable[[Any], _Actor]:
@@ -110,14 +121,14 @@ def known_policy(kind: type) -> Callable[[Any], _Actor]:
 
 
 def _cells(module: Any) -> list[Cell]:
-    """The cells of torch's LSTM, None for a policy without one."""
+    """The cells of torch's GRU or LSTM, none for a policy without them."""
     if module is None:
         return []
     if module.bidirectional or module.proj_size or module.batch_first or not module.bias:
-        raise ValueError(f"an LSTM with further arguments is not known: {module}")
+        raise ValueError(f"recurrent layers with further arguments are not known: {module}")
     names = ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
     return [
-        Cell("lstm", *(_array(getattr(module, f"{name}_l{i}")) for name in names))
+        Cell(module.mode.lower(), *(_array(getattr(module, f"{name}_l{i}")) for name in names))
         for i in range(module.num_layers)
     ]
 

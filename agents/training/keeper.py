@@ -4,6 +4,7 @@ import json
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,7 +17,7 @@ from ..learned.card import Card
 from ..learned.files import save_policy
 from ..rollout import costs_of, steps_of
 from ..vec_env.env import make_native_env, make_vec_env
-from .algorithms import make_model, options_of, spread_of
+from .algorithms import algorithm_of, make_model, options_of, spread_of
 from .checkpoint import load_parameters, save_checkpoint
 from .export import network_from_sb3
 from .normalise import PerSecond, measured
@@ -53,6 +54,17 @@ def _cost_rates(task: Task) -> Array:
         costs -= np.where(step.running, step.reward, 0.0)
         steps += step.running
     return np.array([costs[i::k].sum() / steps[i::k].sum() for i in range(k)])
+
+
+def _source(task: Task, first: int, rate: Any, device: Any, compile: bool) -> Any:
+    """What `Gradient` drives: the task's environments on tensors, from this seed on."""
+    from ...envs.device.env import DeviceVectorEnv
+    from .gradient import Source
+
+    how: dict[str, Any] = {"device": device, "dtype": "float32", "grad": True, "compile": compile}
+    how |= {"autoreset_mode": "SameStep", **task.options(task.num_envs)}
+    cars = DeviceVectorEnv.make(task.env_id, task.num_envs, **how)
+    return Source(cars, [first + i for i in range(task.num_envs)], rate)
 
 
 def evaluation_seeds(episodes: int) -> list[int]:
@@ -173,7 +185,10 @@ class Keeper(BaseCallback):
         steps = 0 if checkpoint is None else int(checkpoint["steps"])
         seed = (task.seed + steps) % 2**32
         rated = PerSecond(env, self.period, np.resize(self.weights, task.num_envs))
-        further = {"device": means.device, "tensorboard_log": means.tensorboard_log}
+        first = _TRAINING + task.seed * _ROOM + steps
+        further: dict[str, Any] = {"device": means.device, "tensorboard_log": means.tensorboard_log}
+        if algorithm_of(task.algo).on_tensors:
+            further["source"] = partial(_source, task, first, rated.rate)
         model = make_model(
             task.algo, task.settings, rated, self.period, self.scaling, seed, **further
         )
@@ -184,7 +199,7 @@ class Keeper(BaseCallback):
         if start is not None:
             give(start, model)
         model.num_timesteps = steps
-        env.seed(_TRAINING + task.seed * _ROOM + steps)
+        env.seed(first)
         self.init_callback(model)
         return model
 

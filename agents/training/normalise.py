@@ -103,13 +103,13 @@ def measured(
 class PerSecond(VecEnvWrapper):
     """Rewards as minus the cost rate: of the order of one, whatever the control period.
 
-    seconds: of a control period. weights: (N,), of each environment's cost. It stands outside of
-    the monitor, which counts costs.
+    seconds: of a control period. weights: (N,), of each environment's cost; `rate` is what rewards
+    are multiplied by. It stands outside of the monitor, which counts costs.
     """
 
     def __init__(self, venv: VecEnv, seconds: float, weights: Array) -> None:
         super().__init__(venv)
-        self._rate = (weights / seconds).astype(np.float32)
+        self.rate = (weights / seconds).astype(np.float32)
 
     def reset(self) -> Observations:
         """The inner env's."""
@@ -118,4 +118,4 @@ class PerSecond(VecEnvWrapper):
     def step_wait(self) -> Any:
         """The inner env's, with the rewards divided by the time they are for."""
         obs, rewards, dones, infos = self.venv.step_wait()
-        return obs, rewards * self._rate, dones, infos
+        return obs, rewards * self.rate, dones, infos

@@ -8,7 +8,7 @@ from gymnasium.vector import VectorEnv
 
 from ...envs.scenarios.manoeuvres import scenario_from
 from ..vec_env.env import make_native_env
-from .algorithms import Settings, check_settings, settings_of
+from .algorithms import Settings, algorithm_of, check_settings, settings_of
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class Task:
     that the network reads, empty: all of them.
 
     Raises ValueError for an unknown algorithm, setting or scenario, a negative seed, no
-    environment, or fewer of them than scenarios.
+    environment, fewer of them than scenarios, or an estimator where cars are driven on tensors.
     """
 
     env_id: str = "sideslip/YawVision-v0"
@@ -49,6 +49,8 @@ class Task:
         for name in ("num_envs", "n_eval_envs"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is at least 1, got {getattr(self, name)}")
+        if self.estimator and algorithm_of(self.algo).on_tensors:
+            raise ValueError(f"{self.algo} reads sensors alone: no estimator runs on tensors")
         if self.estimator_options and not self.estimator:
             raise ValueError("options of an estimator need an estimator")
         for name in ("num_envs", "n_eval_envs"):

@@ -27,7 +27,9 @@ _Text = str | None
 
 
 def train_command(
-    algo: Annotated[_Text, typer.Option(help="ppo (default), sac, tqc or recurrent-ppo.")] = None,
+    algo: Annotated[
+        _Text, typer.Option(help="ppo (default), sac, tqc, recurrent-ppo or gradient.")
+    ] = None,
     env: Annotated[_Text, typer.Option(help="An environment's id (sideslip/YawVision-v0).")] = None,
     estimator: Annotated[_Text, typer.Option(help="An estimator's name (none).")] = None,
     estimator_option: Annotated[

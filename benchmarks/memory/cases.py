@@ -87,7 +87,7 @@ def cases_of(
     seeds: int = SEEDS,
 ) -> list[Case]:
     """What a run trains, the repeated seeds last; arguments as of the suite's `run`."""
-    from ...agents.training.memories import MEMORIES
+    from ...agents.training.memory.networks import MEMORIES
 
     for each in conditions:
         check_choice("condition", each, CONDITIONS)

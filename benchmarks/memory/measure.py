@@ -74,7 +74,7 @@ def measured(case: Case) -> Found:
         agent, steps = _rewarded(case, cars), case.budget.ppo
     else:
         agent, steps = _imitated(case)
-        from ...agents.training.inputs import Prepared
+        from ...agents.training.memory.inputs import Prepared
 
         cars = Prepared(_cars(case, count))
     seconds = time.process_time() - begun if steps else 0.0
@@ -89,9 +89,9 @@ def _cars(case: Case, count: int) -> Any:
 def _imitated(case: Case) -> tuple[Any, int]:
     """(a memory that acts, steps that it saw)."""
     from ...agents.training.distill import Lesson
-    from ...agents.training.inputs import Prepared
-    from ...agents.training.memories import MEMORIES
-    from ...agents.training.remembering import imitated
+    from ...agents.training.memory.inputs import Prepared
+    from ...agents.training.memory.networks import MEMORIES
+    from ...agents.training.memory.imitation import imitated
     from ...agents.training.student import Course
 
     budget = case.budget

@@ -36,8 +36,16 @@ def numbers(dtype: torch.dtype) -> dict[str, Callable[..., Any]]:
         return a.to(dtype) if isinstance(a, torch.Tensor) else a * 1.0
 
     def frexp(a: Any) -> Any:
-        m, e = torch.frexp(a) if isinstance(a, torch.Tensor) else math.frexp(a)
-        return m, to_float(e)
+        if not isinstance(a, torch.Tensor):
+            return math.frexp(a)[0], math.frexp(a)[1] * 1.0
+        # by the bits, of a normal number: torch.frexp does not compile for AVX-512
+        integer, digits, bias = (
+            (torch.int64, 52, 1022) if a.dtype == torch.float64 else (torch.int32, 23, 126)
+        )
+        bits, ones = a.view(integer), (1 << digits) - 1
+        half = (bits & ones) | (bias << digits)
+        m = half.view(a.dtype)
+        return torch.where(a < 0.0, -m, m), to_float(((bits >> digits) & (2 * bias + 3)) - bias)
 
     def sqrt(a: Any) -> Any:
         if not isinstance(a, torch.Tensor):

@@ -13,6 +13,7 @@ pytest.importorskip("stable_baselines3")
 pytest.importorskip("sb3_contrib")
 import torch
 
+from sideslip.agents.learned.files import load_policy
 from sideslip.agents.learned.policy import Learned
 from sideslip.agents.training import keeper, train
 from sideslip.agents.training.algorithms import (
@@ -44,7 +45,9 @@ def tiny(algo: str, **more: Any) -> Task:
     settings = settings_of(algo, VISION)
     settings |= {name: value for name, value in SMALL.items() if name in settings}
     settings |= {"train_freq": 16, "gradient_steps": 4} if "train_freq" in settings else {}
-    scenario = {"scenario": {"base": "sine-with-dwell", "duration": 0.5}}
+    scenario: dict[str, Any] = {"scenario": {"base": "sine-with-dwell", "duration": 0.5}}
+    if "compile" in settings:  # on tensors a tick costs a thousand small operations
+        settings["compile"], scenario["control_period"] = False, 2
     return Task(VISION, algo, "", scenario, 3, 8, settings=settings | more, n_eval_envs=4)
 
 
@@ -87,12 +90,11 @@ def test_it_goes_on_where_the_checkpoint_is(trained: Any) -> None:
 
 def test_numpys_policy_drives_as_torchs(trained: Any) -> None:
     """Through an episode's end and with the memory of each, where there is one."""
-    _, folder, _ = trained
-    card = Learned(tiny("ppo").vector_env(2), folder / POLICY).policy.card
+    task, folder, _ = trained
+    card = load_policy(folder / POLICY).card
     model: Any = algorithm_of(card.algorithm).load().load(folder / BEST, device="cpu")  # type: ignore[attr-defined]
-    env = Task(
-        VISION, env_options={"scenario": {"base": "step-steer", "duration": 0.5}}
-    ).vector_env(4)
+    other = {"scenario": {"base": "step-steer", "duration": 0.5}}
+    env = Task(VISION, env_options=task.env_options | other).vector_env(4)
     ours = Learned(env, folder / POLICY)
     obs, _ = env.reset(seed=0)
     mine, theirs, start = None, None, np.ones(4, np.bool_)

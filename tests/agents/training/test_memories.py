@@ -11,9 +11,9 @@ import torch
 
 from sideslip.agents.optimum import Lqg, estimated
 from sideslip.agents.training.distill import Lesson, drive
-from sideslip.agents.training.inputs import LATEST, RATE, Prepared
-from sideslip.agents.training.memories import MEMORIES, Kalman, make_memory
-from sideslip.agents.training.remembering import Remembering, imitated
+from sideslip.agents.training.memory.imitation import Remembering, imitated
+from sideslip.agents.training.memory.inputs import LATEST, RATE, Prepared
+from sideslip.agents.training.memory.networks import MEMORIES, Kalman, make_memory
 from sideslip.agents.training.student import Course, normalised, scaling_of
 
 ID, CARS, INPUTS, FRESH, STEPS = "sideslip/LinearYawVision-v0", 16, 5, 4, 90

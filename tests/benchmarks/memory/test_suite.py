@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 pytest.importorskip("torch")
-from sideslip.agents.training.memories import MEMORIES
+from sideslip.agents.training.memory.networks import MEMORIES
 from sideslip.benchmarks.harness.results import Suite
 from sideslip.benchmarks.harness.verdict import LETTERS, LINES
 from sideslip.benchmarks.memory import cases, measure, suite

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from .distill import DISTILLING, Lesson, Round, drive
-from .memories import Memory, make_memory
-from .student import LONGER, Array, Course, Drives, Scaling, Single, fitted, normalised, scaling_of
+from ..distill import DISTILLING, Lesson, Round, drive
+from ..student import LONGER, Array, Course, Drives, Scaling, Single, fitted, normalised, scaling_of
+from .networks import Memory, make_memory
 
 import torch  # isort: skip  # after ours, which say which extra is missing
 

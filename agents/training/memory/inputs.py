@@ -8,7 +8,7 @@ import numpy.typing as npt
 from gymnasium.vector import VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
-from ...envs.task.observation import AGE_CAP, Entry, space_of
+from ....envs.task.observation import AGE_CAP, Entry, space_of
 
 Single = npt.NDArray[np.float32]
 

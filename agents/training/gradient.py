@@ -1,0 +1,267 @@
+"""Policies by the slope of the cost itself, through cars, actuators and late sensors.
+
+Many cars on tensors are driven for a window of control periods, and the mean cost rate is led back
+through all of it to the weights: truncated back-propagation through time. It is the short-horizon
+actor-critic (Xu et al., ICLR 2022) without its critic: a window of 0.16 s is longer than most of
+what an action does, and the critic, learned beside it, cost more than it gave (docs/training.md).
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ...envs.record import Array
+from .normalise import Standardised
+from .student import whitening
+
+import torch  # isort: skip  # after ours, which say which extra is missing
+from stable_baselines3.common.base_class import BaseAlgorithm  # isort: skip
+from stable_baselines3.common.policies import BasePolicy  # isort: skip
+from stable_baselines3.common.vec_env import VecEnv  # isort: skip
+from torch import nn  # isort: skip
+
+_LEAST = 1e-3  # variance, of what varies by 1, that a mixture of inputs has at least
+_PERIODS, _SPREAD, _MEMORY = 200, 0.3, 0.95  # of the drives that say how inputs go together
+_LARGEST = 1.0  # norm of a step's gradient
+
+
+class Source(NamedTuple):
+    """What a training drives: a `DeviceVectorEnv` with gradients that resets itself in the same
+    step; the seeds of its cars; (N,) what a car's reward is multiplied by."""
+
+    cars: Any
+    seeds: list[int]
+    rate: Any
+
+
+class GruPolicy(BasePolicy):
+    """A GRU on standardised observations without correlation, and dense layers behind it.
+
+    cells: of the GRU. net_arch: sizes of the layers. The others are stable-baselines3's.
+    """
+
+    def __init__(
+        self,
+        observation_space: Any,
+        action_space: Any,
+        lr_schedule: Callable[[float], float],
+        cells: int = 64,
+        net_arch: Sequence[int] = (64, 64),
+        features_extractor_class: Any = Standardised,
+        features_extractor_kwargs: Mapping[str, Any] | None = None,
+    ) -> None:
+        further = dict(features_extractor_kwargs or {})
+        super().__init__(observation_space, action_space, features_extractor_class, further)
+        self.features_extractor = self.make_features_extractor()
+        inputs, last = self.features_extractor.features_dim, cells
+        self.mixing: torch.Tensor
+        self.register_buffer("mixing", torch.eye(inputs))
+        self.cell = nn.GRU(inputs, cells)
+        layers: list[nn.Module] = []
+        for size in net_arch:
+            layers += [nn.Linear(last, size), nn.SiLU()]
+            last = size
+        last_layer = nn.Linear(last, action_space.shape[0])
+        self.layers = nn.Sequential(*layers, last_layer)
+        with torch.no_grad():
+            last_layer.weight.mul_(0.1)  # a car that is steered at random teaches little
+        self.optimizer = torch.optim.Adam(self.parameters(), lr_schedule(1.0), betas=(0.7, 0.95))
+
+    def whiten(self, observations: Array) -> None:
+        """Mix the inputs so that they have no correlation on observations (n, k)."""
+        seen = torch.as_tensor(observations, dtype=torch.float32, device=self.device)
+        mixing = whitening(self.features_extractor(seen).cpu().numpy(), _LEAST)
+        self.mixing.copy_(torch.from_numpy(mixing))
+
+    @property
+    def whitened(self) -> bool:
+        """Whether `whiten` was called, here or on what the weights came from."""
+        return not torch.equal(self.mixing, torch.eye(len(self.mixing), device=self.device))
+
+    def forward(self, observations: Any, state: Any) -> tuple[Any, Any]:
+        """(actions (N, m), the next state (N, cells)) of observations (N, k)."""
+        z = self.features_extractor(observations) @ self.mixing
+        _, after = self.cell(z[None], state[None])
+        return self.layers(after[0]), after[0]
+
+    def begin(self, count: int) -> Any:
+        """The state of so many cars at the start of an episode."""
+        return torch.zeros(count, self.cell.hidden_size, device=self.device)
+
+    def predict(
+        self,
+        observation: Any,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = True,
+    ) -> tuple[Any, Any]:
+        """(actions within [-1, 1], the next state), as stable-baselines3's; nothing is drawn."""
+        seen, one = self.obs_to_tensor(observation)[0], np.ndim(observation) == 1
+        before = self.begin(len(seen)) if state is None else torch.as_tensor(state[0])
+        if state is not None and episode_start is not None:
+            over = torch.as_tensor(np.asarray(episode_start, np.bool_), device=self.device)
+            before = torch.where(over[:, None], 0.0, before)
+        with torch.no_grad():
+            actions, after = self(seen, before)
+        acted = actions.clamp(-1.0, 1.0).cpu().numpy()
+        return acted[0] if one else acted, (after,)
+
+    def _predict(self, observation: Any, deterministic: bool = False) -> Any:
+        return self(observation, self.begin(len(observation)))[0]
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        layers = [each.out_features for each in self.layers if isinstance(each, nn.Linear)]
+        own = {"cells": self.cell.hidden_size, "net_arch": layers[:-1]}
+        shared: dict[str, Any] = super()._get_constructor_parameters()
+        kind: dict[str, Any] = {"features_extractor_class": self.features_extractor_class}
+        kind |= {"features_extractor_kwargs": self.features_extractor_kwargs}
+        return shared | own | kind | {"lr_schedule": lambda _: 0.0}
+
+
+class Gradient(BaseAlgorithm):
+    """Stable-baselines3's form of an algorithm that follows the cost's slope.
+
+    policy: "GruPolicy". env: as of every algorithm; how its observations go together is measured
+    by it. learning_rate: of Adam. n_steps: control periods of a window. compile: of
+    `DeviceVectorEnv`. source: called with `device` and `compile`, makes what is driven; not needed
+    to load a zip. The others are stable-baselines3's.
+    """
+
+    policy_aliases = {"GruPolicy": GruPolicy}  # noqa: RUF012  as in stable-baselines3
+
+    def __init__(
+        self,
+        policy: Any,
+        env: Any,
+        learning_rate: Any = 5e-3,
+        n_steps: int = 16,
+        compile: bool = True,
+        source: Callable[..., Source] | None = None,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: Any = "auto",
+        _init_setup_model: bool = True,
+    ) -> None:
+        if n_steps < 1:
+            raise ValueError(f"n_steps is at least 1, got {n_steps}")
+        super().__init__(
+            policy,
+            env,
+            learning_rate,
+            policy_kwargs=policy_kwargs,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            verbose=verbose,
+            device=device,
+            support_multi_env=True,
+            seed=seed,
+            supported_action_spaces=None,
+        )
+        self.n_steps, self.compile, self.source = n_steps, compile, source
+        if _init_setup_model:
+            self._setup_model()
+
+    def _setup_model(self) -> None:
+        self._setup_lr_schedule()
+        self.set_random_seed(self.seed)
+        spaces = self.observation_space, self.action_space
+        built = self.policy_class(*spaces, self.lr_schedule, **self.policy_kwargs)
+        self.policy = built.to(self.device)
+
+    def learn(
+        self,
+        total_timesteps: int,
+        callback: Any = None,
+        log_interval: int = 1,
+        tb_log_name: str = "gradient",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> "Gradient":
+        """Windows until so many steps are driven, as of every algorithm.
+
+        Raises ValueError without a source, FloatingPointError, with the step, where the slope is
+        not finite.
+        """
+        if self.source is None:
+            raise ValueError("Gradient drives cars on tensors: it needs their source")
+        total, callback = self._setup_learn(
+            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
+        )
+        policy: Any = self.policy
+        if not policy.whitened:  # a checkpoint's and a zip's are
+            policy.whiten(_seen(self.env, self.seed))
+        cars, seeds, rate = self.source(device=self.device, compile=self.compile)
+        weights = torch.as_tensor(rate, dtype=cars.dtype, device=self.device)
+        obs, _ = cars.reset(seed=seeds)
+        state = policy.begin(cars.num_envs)
+        callback.on_training_start(locals(), globals())
+        going, windows = True, 0
+        while going and self.num_timesteps < total:
+            callback.on_rollout_start()
+            paid, obs, state = driven(policy, cars, obs, state, weights, self.n_steps)
+            self.num_timesteps += self.n_steps * cars.num_envs
+            self._update_current_progress_remaining(self.num_timesteps, total)
+            self._descend(paid)
+            cars.detach()
+            obs, state, windows = obs.detach(), state.detach(), windows + 1
+            going = callback.on_step()
+            self.logger.record("train/cost_rate", paid.item())
+            if log_interval and windows % log_interval == 0:
+                self.logger.dump(self.num_timesteps)
+            callback.on_rollout_end()
+        callback.on_training_end()
+        return self
+
+    def _descend(self, paid: Any) -> None:
+        """One step of the weights down the slope of what a window cost."""
+        optimizer = self.policy.optimizer
+        self._update_learning_rate(optimizer)
+        optimizer.zero_grad()
+        paid.backward()
+        norm = nn.utils.clip_grad_norm_(self.policy.parameters(), _LARGEST)
+        if not norm.isfinite():
+            raise FloatingPointError(
+                f"the cost's slope is not finite after step {self.num_timesteps}"
+            )
+        optimizer.step()
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "source"]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        return ["policy", "policy.optimizer"], []
+
+
+def driven(
+    policy: Any, cars: Any, obs: Any, state: Any, weights: Any, steps: int
+) -> tuple[Any, Any, Any]:
+    """(mean of the weighted costs of so many steps, with its graph, last observations and state).
+
+    policy: a `GruPolicy`. cars: of a `Source`. obs: (N, k). state: (N, cells), zero where an
+    episode begins. weights: (N,).
+    """
+    paid = torch.zeros((), dtype=cars.dtype, device=cars.device)
+    for _ in range(steps):
+        actions, state = policy(obs, state)
+        obs, rewards, terminated, truncated, _ = cars.step(actions)
+        paid = paid - (rewards * weights).mean() / steps
+        state = torch.where((terminated | truncated)[:, None], 0.0, state)
+    return paid, obs, state
+
+
+def _seen(env: VecEnv | None, seed: int | None) -> Array:
+    """Observations (n, k) of cars under actions of coloured noise."""
+    assert env is not None
+    rng, seen = np.random.default_rng(seed), list[Array]()
+    shape = (env.num_envs, *(env.action_space.shape or ()))
+    env.reset()
+    noise = np.zeros(shape)
+    for _ in range(_PERIODS):
+        noise = _MEMORY * noise + (1.0 - _MEMORY**2) ** 0.5 * rng.standard_normal(shape)
+        actions = np.clip(_SPREAD * noise, -1.0, 1.0).astype(np.float32)
+        seen.append(np.asarray(env.step(actions)[0]))
+    return np.concatenate(seen)

@@ -1,0 +1,1 @@
+"""Kinds of memory in the linear environments, whose optimum is known."""

@@ -1,0 +1,151 @@
+"""`gradient`: its slope is the cost's own, episodes keep apart, faults are named."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("stable_baselines3")
+import torch
+
+from sideslip.agents.training.gradient import Gradient, GruPolicy, Source, driven
+from sideslip.agents.training.task import Task
+from sideslip.agents.vec_env.env import make_vec_env
+from sideslip.envs.device import DeviceVectorEnv
+
+VISION = "sideslip/YawVision-v0"
+SHORT = {"scenario": {"base": "sine-with-dwell", "duration": 0.03}, "control_period": 2}
+
+
+def cars_of(count: int, **options: Any) -> Any:
+    how: dict[str, Any] = {"grad": True, "autoreset_mode": "SameStep", **SHORT, **options}
+    return DeviceVectorEnv.make(VISION, count, **how)
+
+
+def policy_of(cars: Any, **more: Any) -> Any:
+    """A policy of a few cells in double precision, which acts and reads in size."""
+    torch.manual_seed(0)
+    k = len(cars.layout)
+    scaling = {"mean": [0.0] * k, "scale": [0.3] * k}
+    policy: Any = GruPolicy(
+        cars.single_observation_space,
+        cars.single_action_space,
+        lambda _: 1e-3,
+        cells=5,
+        net_arch=[4],
+        features_extractor_kwargs=scaling,
+        **more,
+    )
+    with torch.no_grad():
+        policy.layers[-1].weight *= 10.0
+    return policy.double()
+
+
+def paid_by(policy: Any, cars: Any, weights: Any, steps: int) -> Any:
+    obs, _ = cars.reset(seed=list(range(cars.num_envs)))
+    return driven(policy, cars, obs, policy.begin(cars.num_envs).double(), weights, steps)
+
+
+def test_the_slope_is_that_of_the_cost() -> None:
+    """Along random directions of all weights, by central differences, over episodes' ends."""
+    cars, weights = cars_of(3), torch.tensor([1e3, 2e3, 500.0], dtype=torch.float64)
+    policy = policy_of(cars)
+    steps = 20  # an episode has 15
+    parts = list(policy.parameters())
+    paid_by(policy, cars, weights, steps)[0].backward()
+    slopes = [each.grad.clone() for each in parts]
+    generator = torch.Generator().manual_seed(1)
+    for _ in range(3):
+        way = [torch.randn(each.shape, generator=generator).double() for each in parts]
+        costs = []
+        for size in (1e-5, -1e-5):
+            with torch.no_grad():
+                for each, by in zip(parts, way, strict=True):
+                    each += size * by
+                costs.append(paid_by(policy, cars, weights, steps)[0].item())
+                for each, by in zip(parts, way, strict=True):
+                    each -= size * by
+        expected = (costs[0] - costs[1]) / 2e-5
+        found = sum(float((a * b).sum()) for a, b in zip(slopes, way, strict=True))
+        assert abs(expected) > 1e-4 and found == pytest.approx(expected, rel=1e-5)
+
+
+def test_a_car_of_weight_zero_teaches_nothing() -> None:
+    cars, policy = cars_of(2), policy_of(cars_of(2))
+    paid, *_ = paid_by(policy, cars, torch.tensor([0.0, 1.0], dtype=torch.float64), 4)
+    alone = cars_of(1)
+    obs, _ = alone.reset(seed=[1])
+    one, *_ = driven(policy, alone, obs, policy.begin(1).double(), torch.ones(1), 4)
+    assert paid.item() == pytest.approx(0.5 * one.item(), rel=1e-12) and one.item() > 0.0
+
+
+def test_where_an_episode_ends_the_memory_does_too() -> None:
+    cars = cars_of(1)
+    policy, ones = policy_of(cars), torch.ones(1, dtype=torch.float64)
+    assert paid_by(policy, cars, ones, 14)[2].abs().min() > 0.0
+    assert (paid_by(policy, cars, ones, 15)[2] == 0.0).all()
+
+
+def test_whitened_inputs_have_no_correlation() -> None:
+    cars = cars_of(1)
+    policy = policy_of(cars).float()
+    k = len(cars.layout)
+    x = np.random.default_rng(0).standard_normal((4000, k)) @ (np.eye(k) + 0.5)
+    policy.whiten(x)
+    seen = policy.features_extractor(torch.as_tensor(x, dtype=torch.float32)) @ policy.mixing
+    assert np.allclose(np.cov(seen.numpy(), rowvar=False), np.eye(k), atol=1e-3)
+
+
+class Torn:
+    """Cars whose rewards have no finite slope."""
+
+    num_envs, dtype, device = 2, torch.float32, torch.device("cpu")
+
+    def reset(self, seed: Any) -> Any:
+        return torch.zeros(2, 26), {}
+
+    def step(self, actions: Any) -> Any:
+        never = torch.zeros(2, dtype=torch.bool)
+        return torch.zeros(2, 26), (actions[:, 0] - actions[:, 0]).sqrt(), never, never, {}
+
+    def detach(self) -> None:
+        pass
+
+
+def made(source: Any, **more: Any) -> Any:
+    env = make_vec_env(VISION, 2)
+    k = env.observation_space.shape[0]  # type: ignore[index]
+    scaling = {"features_extractor_kwargs": {"mean": [0.0] * k, "scale": [0.1] * k}}
+    return Gradient("GruPolicy", env, source=source, policy_kwargs=scaling, device="cpu", **more)
+
+
+def test_a_slope_that_is_not_finite_stops_it_at_its_step() -> None:
+    width = made(None).observation_space.shape[0]
+
+    class Cars(Torn):
+        def reset(self, seed: Any) -> Any:
+            return torch.zeros(2, width), {}
+
+        def step(self, actions: Any) -> Any:
+            return torch.zeros(2, width), *super().step(actions)[1:]
+
+    def torn(device: Any, compile: bool) -> Source:
+        return Source(Cars(), [0, 1], np.ones(2))
+
+    model = made(torn, n_steps=3)
+    model.policy.mixing *= 2.0  # as one that was measured before
+    mixing = model.policy.mixing.clone()
+    before = [each.clone() for each in model.policy.parameters()]
+    with pytest.raises(FloatingPointError, match="slope is not finite after step 6"):
+        model.learn(12)
+    assert torch.equal(model.policy.mixing, mixing)
+    assert all(torch.equal(a, b) for a, b in zip(before, model.policy.parameters(), strict=True))
+
+
+def test_what_it_cannot_do_is_said() -> None:
+    with pytest.raises(ValueError, match="gradient reads sensors alone: no estimator runs on"):
+        Task(VISION, "gradient", "exact-kf")
+    with pytest.raises(ValueError, match="n_steps is at least 1, got 0"):
+        made(None, n_steps=0)
+    with pytest.raises(ValueError, match="needs their source"):
+        made(None).learn(1)
