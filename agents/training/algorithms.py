@@ -157,11 +157,11 @@ def make_model(
     `Standardised`. rest: further arguments of the class, as its device."""
     options = options_of(algo, settings, seconds, env.num_envs)
     options |= {name: _schedule(name, options[name]) for name in _SCHEDULED if name in options}
-    mean, scale, clip = scaling
+    mean, scale, clip, mixing = scaling
     options["policy_kwargs"] = {
         **options.get("policy_kwargs", {}),
         "features_extractor_class": Standardised,
-        "features_extractor_kwargs": {"mean": mean, "scale": scale, "clip": clip},
+        "features_extractor_kwargs": {"mean": mean, "scale": scale, "clip": clip, "mixing": mixing},
     }
     kind = algorithm_of(algo).load()
     window = env.num_envs

@@ -16,7 +16,7 @@ with extra("train", "training needs {}"):
     import torch
     from safetensors.torch import save
 
-FORMAT = 2
+FORMAT = 3
 VARIABLES = "variables"
 """The part of the tensors that belong to no module, as the logarithm of an entropy's weight."""
 STATE = {"groups", "sideslip", "task", "steps", "aim", "scaling", "evaluations"}

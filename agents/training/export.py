@@ -43,13 +43,16 @@ def network_from_sb3(model: Any, normaliser: Any = None, history: int = 1) -> Ne
         raise ValueError(f"one activation in all layers, got {', '.join(activations)}")
     cells = _cells(actor.recurrent)
     wide = (cells[0].weight_in if cells else weights[0]).shape[1]
-    if actor.mixing is not None:
-        cells[0] = replace(cells[0], weight_in=cells[0].weight_in @ _array(actor.mixing).T)
     mean, scale, clip = normalisation(normaliser, wide, history)
     if isinstance(actor.extractor, Standardised):
         if clip is not None:
             raise ValueError("the observation is normalised twice: outside and by the network")
         mean, scale, clip = actor.extractor.numbers
+        mixing = _array(actor.extractor.mixing).T
+        if cells:
+            cells[0] = replace(cells[0], weight_in=cells[0].weight_in @ mixing)
+        else:
+            weights[0] = weights[0] @ mixing
     return Network(
         mean,
         scale,
@@ -64,14 +67,12 @@ def network_from_sb3(model: Any, normaliser: Any = None, history: int = 1) -> Ne
 
 
 class _Actor(NamedTuple):
-    """What acts in a policy: layers, whether tanh follows, features extractor, recurrent layers,
-    and what mixes features before these."""
+    """What acts in a policy: layers, whether tanh follows, features extractor, recurrent layers."""
 
     layers: list[Any]
     squashed: bool
     extractor: Any
     recurrent: Any = None
-    mixing: Any = None
 
 
 def _on_policy(policy: Any) -> _Actor:
@@ -83,9 +84,8 @@ def _recurrent(policy: Any) -> _Actor:
     return _on_policy(policy)._replace(recurrent=policy.lstm_actor)
 
 
-def _mixed(policy: Any) -> _Actor:
-    layers = list(policy.layers)
-    return _Actor(layers, False, policy.features_extractor, policy.cell, policy.mixing)
+def _ours(policy: Any) -> _Actor:
+    return _Actor(list(policy.layers), False, policy.features_extractor, policy.cell)
 
 
 def _gaussian(policy: Any) -> _Actor:
@@ -105,7 +105,7 @@ ACTORS: dict[str, Callable[[Any], _Actor]] = {
     "stable_baselines3.td3.policies.TD3Policy": _certain,
     "sb3_contrib.tqc.policies.TQCPolicy": _gaussian,
     "sb3_contrib.common.recurrent.policies.RecurrentActorCriticPolicy": _recurrent,
-    f"{__package__}.gradient.GruPolicy": _mixed,
+    f"{__package__}.gradient.GruPolicy": _ours,
 }
 """The policies whose actor is known: "MlpPolicy" and "MlpLstmPolicy" of PPO, A2C, SAC, TD3, DDPG,
 TQC and RecurrentPPO, and ours. A subclass may compute anything and is none of them."""

@@ -11,18 +11,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...envs.record import Array
 from .normalise import Standardised
-from .student import whitening
 
 import torch  # isort: skip  # after ours, which say which extra is missing
 from stable_baselines3.common.base_class import BaseAlgorithm  # isort: skip
 from stable_baselines3.common.policies import BasePolicy  # isort: skip
-from stable_baselines3.common.vec_env import VecEnv  # isort: skip
 from torch import nn  # isort: skip
 
-_LEAST = 1e-3  # variance, of what varies by 1, that a mixture of inputs has at least
-_PERIODS, _SPREAD, _MEMORY = 200, 0.3, 0.95  # of the drives that say how inputs go together
 _LARGEST = 1.0  # norm of a step's gradient
 
 
@@ -36,7 +31,7 @@ class Source(NamedTuple):
 
 
 class GruPolicy(BasePolicy):
-    """A GRU on standardised observations without correlation, and dense layers behind it.
+    """A GRU on standardised observations, and dense layers behind it.
 
     cells: of the GRU. net_arch: sizes of the layers. The others are stable-baselines3's.
     """
@@ -55,8 +50,6 @@ class GruPolicy(BasePolicy):
         super().__init__(observation_space, action_space, features_extractor_class, further)
         self.features_extractor = self.make_features_extractor()
         inputs, last = self.features_extractor.features_dim, cells
-        self.mixing: torch.Tensor
-        self.register_buffer("mixing", torch.eye(inputs))
         self.cell = nn.GRU(inputs, cells)
         layers: list[nn.Module] = []
         for size in net_arch:
@@ -68,20 +61,9 @@ class GruPolicy(BasePolicy):
             last_layer.weight.mul_(0.1)  # a car that is steered at random teaches little
         self.optimizer = torch.optim.Adam(self.parameters(), lr_schedule(1.0), betas=(0.7, 0.95))
 
-    def whiten(self, observations: Array) -> None:
-        """Mix the inputs so that they have no correlation on observations (n, k)."""
-        seen = torch.as_tensor(observations, dtype=torch.float32, device=self.device)
-        mixing = whitening(self.features_extractor(seen).cpu().numpy(), _LEAST)
-        self.mixing.copy_(torch.from_numpy(mixing))
-
-    @property
-    def whitened(self) -> bool:
-        """Whether `whiten` was called, here or on what the weights came from."""
-        return not torch.equal(self.mixing, torch.eye(len(self.mixing), device=self.device))
-
     def forward(self, observations: Any, state: Any) -> tuple[Any, Any]:
         """(actions (N, m), the next state (N, cells)) of observations (N, k)."""
-        z = self.features_extractor(observations) @ self.mixing
+        z = self.features_extractor(observations)
         _, after = self.cell(z[None], state[None])
         return self.layers(after[0]), after[0]
 
@@ -122,10 +104,9 @@ class GruPolicy(BasePolicy):
 class Gradient(BaseAlgorithm):
     """Stable-baselines3's form of an algorithm that follows the cost's slope.
 
-    policy: "GruPolicy". env: as of every algorithm; how its observations go together is measured
-    by it. learning_rate: of Adam. n_steps: control periods of a window. compile: of
-    `DeviceVectorEnv`. source: called with `device` and `compile`, makes what is driven; not needed
-    to load a zip. The others are stable-baselines3's.
+    policy: "GruPolicy". env: its spaces count. learning_rate: of Adam. n_steps: control periods of
+    a window. compile: of `DeviceVectorEnv`. source: called with `device` and `compile`, makes what
+    is driven; not needed to load a zip. The others are stable-baselines3's.
     """
 
     policy_aliases = {"GruPolicy": GruPolicy}  # noqa: RUF012  as in stable-baselines3
@@ -192,8 +173,6 @@ class Gradient(BaseAlgorithm):
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
         policy: Any = self.policy
-        if not policy.whitened:  # a checkpoint's and a zip's are
-            policy.whiten(_seen(self.env, self.seed))
         cars, seeds, rate = self.source(device=self.device, compile=self.compile)
         weights = torch.as_tensor(rate, dtype=cars.dtype, device=self.device)
         obs, _ = cars.reset(seed=seeds)
@@ -251,17 +230,3 @@ def driven(
         paid = paid - (rewards * weights).mean() / steps
         state = torch.where((terminated | truncated)[:, None], 0.0, state)
     return paid, obs, state
-
-
-def _seen(env: VecEnv | None, seed: int | None) -> Array:
-    """Observations (n, k) of cars under actions of coloured noise."""
-    assert env is not None
-    rng, seen = np.random.default_rng(seed), list[Array]()
-    shape = (env.num_envs, *(env.action_space.shape or ()))
-    env.reset()
-    noise = np.zeros(shape)
-    for _ in range(_PERIODS):
-        noise = _MEMORY * noise + (1.0 - _MEMORY**2) ** 0.5 * rng.standard_normal(shape)
-        actions = np.clip(_SPREAD * noise, -1.0, 1.0).astype(np.float32)
-        seen.append(np.asarray(env.step(actions)[0]))
-    return np.concatenate(seen)

@@ -1,7 +1,9 @@
-"""What a network reads instead of SI units: standardised observations, rewards per second.
+"""What a network reads instead of SI units: standardised observations without correlation, rewards
+per second.
 
-The scales are measured once, before the training, and stay: they are part of the network, which
-reads plain observations.
+Scales and mixing are measured once, before the training, and stay: they are part of the network,
+which reads plain observations. What varies little while its parts vary much, as course less
+heading, is what a policy needs; mixed, it varies as much as they do.
 """
 
 import math
@@ -16,6 +18,7 @@ from gymnasium.vector import VectorEnv
 from ...envs.backend.extras import extra
 from ..env_facts import layout_of
 from ..vec_env.env import Observations
+from .student import whitening
 
 with extra("train", "training needs {}"):
     import torch
@@ -23,19 +26,21 @@ with extra("train", "training needs {}"):
     from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
 Array = npt.NDArray[np.float64]
-Scaling = tuple[list[float], list[float], float | None]
-"""Mean, scale and clip of `Standardised`, in JSON types."""
+Scaling = tuple[list[float], list[float], float | None, list[list[float]] | None]
+"""Mean, scale, clip and mixing of `Standardised`, in JSON types."""
 
 CLIP = 10.0  # standard deviations
 _WARM_UP, _LONG = 0.2, 4.0  # s: until every sensor has spoken, and of the whole drive
+_HELD = 0.2  # s, in which random actions fade to 1/e
+_LEAST = 1e-3  # variance, of what varies by 1, that a mixture of entries has at least
 _CONSTANT = 1e-9  # what varies less is not read
 
 
 class Standardised(FlattenExtractor):
-    """A network's first layer, which is not trained: clip((x - mean) scale, +-clip).
+    """A network's first layer, which is not trained: clip((x - mean) scale, +-clip) mixing.
 
     mean, scale: one number an entry of the observation; an entry of scale 0 is not read. clip: None
-    for none.
+    for none. mixing: (k, k), None for none.
     """
 
     def __init__(
@@ -44,6 +49,7 @@ class Standardised(FlattenExtractor):
         mean: list[float],
         scale: list[float],
         clip: float | None = CLIP,
+        mixing: list[list[float]] | None = None,
     ) -> None:
         super().__init__(observation_space)
         self.mean: torch.Tensor
@@ -52,6 +58,9 @@ class Standardised(FlattenExtractor):
         self.clip: torch.Tensor
         self.register_buffer("scale", torch.tensor(scale, dtype=torch.float32))
         self.register_buffer("clip", torch.tensor(math.inf if clip is None else clip))
+        self.mixing: torch.Tensor
+        mixed = torch.eye(len(mean)) if mixing is None else torch.tensor(mixing)
+        self.register_buffer("mixing", mixed.to(torch.float32))
 
     @property
     def numbers(self) -> tuple[Array, Array, float | None]:
@@ -61,13 +70,14 @@ class Standardised(FlattenExtractor):
 
     def forward(self, observations: torch.Tensor) -> torch.Tensor:
         """(N, k) of observations (N, k)."""
-        return torch.clamp((observations - self.mean) * self.scale, -self.clip, self.clip)
+        z = torch.clamp((observations - self.mean) * self.scale, -self.clip, self.clip)
+        return z @ self.mixing
 
 
 def measured(
     env: VectorEnv[Any, Any, Any], spread: float, seed: int, reads: Sequence[str] = ()
 ) -> Scaling:
-    """Of each entry, under random actions of this standard deviation.
+    """Of each entry, under random actions of this standard deviation that are held for a while.
 
     reads: names of the entries that are read, none for all. Raises ValueError for a name that the
     observation has not, and where nothing of what is read varies.
@@ -83,10 +93,10 @@ def measured(
     rng = np.random.default_rng(seed)
     shape = env.action_space.shape or ()
     env.reset(seed=seed)
-    seen = []
+    seen, noise, kept = [], np.zeros(shape), math.exp(-period / _HELD)
     for step in range(round(_LONG / period)):
-        actions = spread * rng.standard_normal(shape)
-        obs, *_ = env.step(actions.astype(np.float32))
+        noise = kept * noise + (1.0 - kept**2) ** 0.5 * rng.standard_normal(shape)
+        obs, *_ = env.step(np.clip(spread * noise, -1.0, 1.0).astype(np.float32))
         if step >= round(_WARM_UP / period):
             seen.append(obs)
     samples = np.concatenate(seen).astype(np.float64)
@@ -97,7 +107,9 @@ def measured(
     if not varies.any():
         raise ValueError(f"nothing of what the network reads varies within {_LONG:g} s")
     scale = np.where(varies, 1.0 / np.where(varies, deviation, 1.0), 0.0)
-    return samples.mean(axis=0).tolist(), scale.tolist(), CLIP
+    mean = samples.mean(axis=0)
+    standard = np.clip((samples - mean) * scale, -CLIP, CLIP)
+    return mean.tolist(), scale.tolist(), CLIP, whitening(standard, _LEAST).tolist()
 
 
 class PerSecond(VecEnvWrapper):

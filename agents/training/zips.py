@@ -97,15 +97,16 @@ def start_of(path: str | Path, width: int, trust: bool = False) -> Start:
     own = {
         name.rpartition(".")[2]: x for name, x in policy.items() if "features_extractor." in name
     }
-    if own.keys() == {"mean", "scale", "clip"}:  # every network of the policy has the same
+    if own.keys() >= {"mean", "scale", "clip"}:  # every network of the policy has the same
         bound = float(own["clip"])
-        ours = own["mean"].tolist(), own["scale"].tolist(), bound if bound < math.inf else None
-        return Start(file, parameters, variables or {}, ours)
+        mixing = own["mixing"].tolist() if "mixing" in own else None
+        numbers = own["mean"].tolist(), own["scale"].tolist(), bound if bound < math.inf else None
+        return Start(file, parameters, variables or {}, (*numbers, mixing))
     beside = normaliser_of(file)
     if beside is not None and not trust:
         raise PermissionError(f"{beside} is a pickle, which may run code: say --trust to read it")
     mean, scale, clip = normalisation(_unpickled(beside) if beside else None, width, 1)
-    return Start(file, parameters, variables or {}, (mean.tolist(), scale.tolist(), clip))
+    return Start(file, parameters, variables or {}, (mean.tolist(), scale.tolist(), clip, None))
 
 
 def give(start: Start, model: Any) -> None:

@@ -89,9 +89,9 @@ def _cars(case: Case, count: int) -> Any:
 def _imitated(case: Case) -> tuple[Any, int]:
     """(a memory that acts, steps that it saw)."""
     from ...agents.training.distill import Lesson
+    from ...agents.training.memory.imitation import imitated
     from ...agents.training.memory.inputs import Prepared
     from ...agents.training.memory.networks import MEMORIES
-    from ...agents.training.memory.imitation import imitated
     from ...agents.training.student import Course
 
     budget = case.budget

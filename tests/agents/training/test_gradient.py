@@ -86,16 +86,6 @@ def test_where_an_episode_ends_the_memory_does_too() -> None:
     assert (paid_by(policy, cars, ones, 15)[2] == 0.0).all()
 
 
-def test_whitened_inputs_have_no_correlation() -> None:
-    cars = cars_of(1)
-    policy = policy_of(cars).float()
-    k = len(cars.layout)
-    x = np.random.default_rng(0).standard_normal((4000, k)) @ (np.eye(k) + 0.5)
-    policy.whiten(x)
-    seen = policy.features_extractor(torch.as_tensor(x, dtype=torch.float32)) @ policy.mixing
-    assert np.allclose(np.cov(seen.numpy(), rowvar=False), np.eye(k), atol=1e-3)
-
-
 class Torn:
     """Cars whose rewards have no finite slope."""
 
@@ -133,12 +123,9 @@ def test_a_slope_that_is_not_finite_stops_it_at_its_step() -> None:
         return Source(Cars(), [0, 1], np.ones(2))
 
     model = made(torn, n_steps=3)
-    model.policy.mixing *= 2.0  # as one that was measured before
-    mixing = model.policy.mixing.clone()
     before = [each.clone() for each in model.policy.parameters()]
     with pytest.raises(FloatingPointError, match="slope is not finite after step 6"):
         model.learn(12)
-    assert torch.equal(model.policy.mixing, mixing)
     assert all(torch.equal(a, b) for a, b in zip(before, model.policy.parameters(), strict=True))
 
 

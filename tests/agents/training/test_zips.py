@@ -245,7 +245,7 @@ REFUSED: dict[str, tuple[Any, Any, Any, dict[str, Any], str]] = {
         "MlpLstmPolicy",
         bridged,
         {"policy_kwargs": LSTM | {"lstm_kwargs": {"batch_first": True}}},
-        "an LSTM with further arguments",
+        "recurrent layers with further arguments",
     ),
     "another env": (
         sb3.PPO,
