@@ -7,17 +7,23 @@ what an action does, and the critic, learned beside it, cost more than it gave (
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from ...envs.task.observation import Entry
+from ...estimators.learned.memory import PARTS
+from ..learned.files import Policy
 from .normalise import Standardised
+from .zips import Start
 
 import torch  # isort: skip  # after ours, which say which extra is missing
 from stable_baselines3.common.base_class import BaseAlgorithm  # isort: skip
 from stable_baselines3.common.policies import BasePolicy  # isort: skip
 from torch import nn  # isort: skip
 
+_GRU = [f"cell.{part}_l0" for part in ("weight_ih", "weight_hh", "bias_ih", "bias_hh")]
 _LARGEST = 1.0  # norm of a step's gradient
 
 
@@ -213,6 +219,30 @@ class Gradient(BaseAlgorithm):
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "policy.optimizer"], []
+
+
+def started_by(policy: Policy, layout: Sequence[Entry]) -> Start:
+    """What a training begins with of a distilled policy, whose form a `GruPolicy` has.
+
+    layout: of the observation. Raises ValueError for a policy of another form or observation.
+    """
+    network, seen = policy.network, [name for name, _ in policy.card.observation]
+    names = [entry.name for entry in layout]
+    if seen != names:
+        raise ValueError(f"{policy.name} reads {', '.join(seen)}; here there is {', '.join(names)}")
+    kinds = [cell.kind for cell in network.cells]
+    form = network.activation, network.output, network.history, kinds
+    if form != ("silu", "linear", 1, ["gru"]):
+        raise ValueError(
+            f"{policy.name} is no GRU with dense layers of silu behind it, as one of "
+            f"`sideslip distill --cells` is: {form}"
+        )
+    arrays = dict(zip(_GRU, (getattr(network.cells[0], part) for part in PARTS), strict=True))
+    for i, (W, b) in enumerate(zip(network.weights, network.biases, strict=True)):
+        arrays |= {f"layers.{2 * i}.weight": W, f"layers.{2 * i}.bias": b}
+    tensors = {name: torch.tensor(x, dtype=torch.float32) for name, x in arrays.items()}
+    scaling = network.mean.tolist(), network.scale.tolist(), network.clip, None
+    return Start(Path(policy.name), {"policy": tensors}, {}, scaling)
 
 
 def driven(

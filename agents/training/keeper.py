@@ -13,8 +13,9 @@ import numpy as np
 from ... import __version__
 from ...envs.backend.files import whole, write_whole
 from ...envs.record import Array
+from ..env_facts import layout_of
 from ..learned.card import Card
-from ..learned.files import save_policy
+from ..learned.files import Policy, is_policy, load_policy, save_policy
 from ..rollout import costs_of, steps_of
 from ..vec_env.env import make_native_env, make_vec_env
 from .algorithms import algorithm_of, make_model, options_of, spread_of
@@ -22,7 +23,7 @@ from .checkpoint import load_parameters, save_checkpoint
 from .export import network_from_sb3
 from .normalise import PerSecond, measured
 from .task import Task
-from .zips import give, start_of
+from .zips import Start, give, start_of
 
 from stable_baselines3.common.base_class import BaseAlgorithm  # isort: skip  # after ours, which
 from stable_baselines3.common.callbacks import BaseCallback  # isort: skip  # name a missing extra
@@ -171,7 +172,10 @@ class Keeper(BaseCallback):
         start = None
         if trained_agent is not None:
             width = (self.tested.single_observation_space.shape or (0,))[0]
-            start = start_of(trained_agent, width, trust)
+            if is_policy(str(trained_agent)):
+                start = self._started_by(load_policy(trained_agent))
+            else:
+                start = start_of(trained_agent, width, trust)
             self.scaling = start.scaling
         if self.scaling is None:
             spread, seed = spread_of(task.settings), _SCALING + task.seed
@@ -202,6 +206,13 @@ class Keeper(BaseCallback):
         env.seed(first)
         self.init_callback(model)
         return model
+
+    def _started_by(self, policy: Policy) -> Start:
+        from .gradient import started_by
+
+        if not algorithm_of(self.task.algo).on_tensors:
+            raise ValueError(f"{self.task.algo} begins with a zip, not with policy {policy.name}")
+        return started_by(policy, layout_of(self.tested))
 
     def _costs(self, agent: Any) -> Array:
         """Mean over the evaluation's drives of each scenario, (k,); agent: None for no control."""

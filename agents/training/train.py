@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 from ... import __version__
 from ...envs.documents import made_of
 from ..learned.card import check_names_no_code
+from ..learned.files import is_policy
 from .checkpoint import read_state
 from .keeper import BEST, CHECKPOINT, CURVE, POLICY, Aim, Evaluation, Keeper, Means, Progress
 from .task import Task
@@ -56,8 +57,8 @@ def train(
     resume: go on from the folder's checkpoint: weights, optimisers, step size, steps and
     evaluations are those of the checkpoint, episodes are new; a replay buffer begins empty and is
     filled as at the start, by `learning_starts` steps of random actions, before weights change.
-    trained_agent: a zip of stable-baselines3 whose weights a new training begins with; trust: of
-    `zips.start_of`.
+    trained_agent: a zip of stable-baselines3 whose weights a new training begins with, or for
+    `gradient` a distilled policy's file; trust: of `zips.start_of`.
 
     Raises ValueError where the folder holds another training, FileNotFoundError where there is
     none to go on with, FloatingPointError, with the step, where weights are not finite any more
@@ -71,7 +72,8 @@ def train(
             raise ValueError("a training goes on from its checkpoint or from a zip, not from both")
         if task.reads:
             raise ValueError("a zip's network reads what it was trained on: give reads or a zip")
-        check_zip(Path(trained_agent), trust=True)
+        if not is_policy(str(trained_agent)):
+            check_zip(Path(trained_agent), trust=True)
     if how.tensorboard_log is not None and find_spec("tensorboard") is None:
         raise ModuleNotFoundError("a log for TensorBoard needs it: pip install tensorboard")
     tracked = _Tracked(how.track, Path(folder).name, asdict(task)) if how.track else None

@@ -118,7 +118,9 @@ def give(start: Start, model: Any) -> None:
     }
     policy = scaling | start.parameters["policy"]
     try:
-        model.set_parameters({**start.parameters, "policy": policy}, device=model.device)
+        model.set_parameters(
+            {**model.get_parameters(), **start.parameters, "policy": policy}, device=model.device
+        )
         for name, tensor in start.variables.items():
             getattr(model, name).data.copy_(tensor)
     except (AttributeError, KeyError, RuntimeError, ValueError) as error:

@@ -76,7 +76,11 @@ def train_command(
     ] = True,
     trained_agent: Annotated[
         Path | None,
-        typer.Option("--trained-agent", "-i", help="Begin with the weights of an sb3 zip."),
+        typer.Option(
+            "--trained-agent",
+            "-i",
+            help="Begin with an sb3 zip; gradient: or a distilled policy.",
+        ),
     ] = None,
     trust: Trust = False,
     out: Annotated[

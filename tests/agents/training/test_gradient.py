@@ -1,5 +1,7 @@
 """`gradient`: its slope is the cost's own, episodes keep apart, faults are named."""
 
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -8,12 +10,16 @@ import pytest
 pytest.importorskip("stable_baselines3")
 import torch
 
-from sideslip.agents.training.gradient import Gradient, GruPolicy, Source, driven
+from sideslip.agents.env_facts import layout_of
+from sideslip.agents.learned.files import load_policy
+from sideslip.agents.learned.policy import Learned
+from sideslip.agents.training.gradient import Gradient, GruPolicy, Source, driven, started_by
+from sideslip.agents.training.keeper import Keeper, Means
 from sideslip.agents.training.task import Task
 from sideslip.agents.vec_env.env import make_vec_env
 from sideslip.envs.device import DeviceVectorEnv
 
-VISION = "sideslip/YawVision-v0"
+VISION, FUSION = "sideslip/YawVision-v0", "sideslip/YawFusion-v0"
 SHORT = {"scenario": {"base": "sine-with-dwell", "duration": 0.03}, "control_period": 2}
 
 
@@ -84,6 +90,51 @@ def test_where_an_episode_ends_the_memory_does_too() -> None:
     policy, ones = policy_of(cars), torch.ones(1, dtype=torch.float64)
     assert paid_by(policy, cars, ones, 14)[2].abs().min() > 0.0
     assert (paid_by(policy, cars, ones, 15)[2] == 0.0).all()
+
+
+CAR = {"vehicle": "passenger-car", "nominal": "passenger-car", "reference": "lagged"}
+
+
+def tuned_task(**more: Any) -> Task:
+    """Of the form and the observation of `raw-car-yaw`."""
+    settings = {"policy": "GruPolicy", "n_timesteps": 9, "n_envs": 2}
+    settings |= {"policy_kwargs": {"cells": 96, "net_arch": [64, 64]}, **more}
+    options = {"scenario": "car-step", **CAR}
+    return Task(FUSION, "gradient", "", options, settings=settings, n_eval_envs=4)
+
+
+def test_what_begins_with_a_distilled_policy_acts_as_it_does(tmp_path: Path) -> None:
+    task = tuned_task()
+    model = Keeper(task, tmp_path, None, Means()).build(None, "raw-car-yaw")
+    env = task.vector_env(4)
+    ours = Learned(env, "raw-car-yaw")
+    obs, _ = env.reset(seed=0)
+    mine, theirs, start = None, None, np.ones(4, np.bool_)
+    for _ in range(100):
+        a, mine = ours.predict(obs, mine, start)
+        b, theirs = model.predict(obs, theirs, start)
+        assert np.abs(a - b).max() < 1e-5
+        obs, _, terminated, truncated, _ = env.step(a)
+        start = terminated | truncated
+
+
+def test_what_cannot_be_begun_with_is_named(tmp_path: Path) -> None:
+    keeper = Keeper(tuned_task(), tmp_path, None, Means())
+    smaller = Keeper(tuned_task(policy_kwargs={"cells": 8}), tmp_path, None, Means())
+    cases = [
+        (keeper, "distill-car-yaw", "distill-car-yaw reads .*beta_hat.*; here there is gyro, "),
+        (smaller, "raw-car-yaw", "holds other networks than this training's Gradient"),
+    ]
+    for each, name, said in cases:
+        with pytest.raises(ValueError, match=said):
+            each.build(None, name)
+    policy = load_policy("raw-car-yaw")
+    squashed = replace(policy, network=replace(policy.network, output="tanh"))
+    layout = layout_of(tuned_task().vector_env(1))
+    with pytest.raises(ValueError, match=r"no GRU with dense layers .* \('silu', 'tanh', 1,"):
+        started_by(squashed, layout)
+    with pytest.raises(ValueError, match="ppo begins with a zip, not with policy raw-car-yaw"):
+        Keeper(Task(FUSION, env_options=CAR), tmp_path, None, Means()).build(None, "raw-car-yaw")
 
 
 class Torn:
