@@ -179,7 +179,8 @@ class Keeper(BaseCallback):
             self.scaling = start.scaling
         if self.scaling is None:
             spread, seed = spread_of(task.settings), _SCALING + task.seed
-            self.scaling = measured(task.vector_env(_MEASURED), spread, seed, task.reads)
+            mixed = algorithm_of(task.algo).on_tensors
+            self.scaling = measured(task.vector_env(_MEASURED), spread, seed, task.reads, mixed)
         env = make_vec_env(
             task.env_id,
             task.num_envs,

@@ -12,7 +12,8 @@ from sideslip.agents.training.train import Task
 
 def test_observations_are_standardised_by_the_network() -> None:
     env = Task(env_options={"scenario": "sine-with-dwell"}, seed=3).vector_env(16)
-    mean, scale, clip, _ = measured(env, 0.4, 5)
+    mean, scale, clip, mixing = measured(env, 0.4, 5)
+    assert mixing is None  # nobody asked for it
     names = [entry.name for entry in env.unwrapped.layout]  # type: ignore[attr-defined]
     assert scale[names.index("gamma_ref")] == 0.0  # zero-slip: it never varies
     layer = Standardised(env.single_observation_space, mean, scale, clip)
@@ -29,7 +30,7 @@ def test_observations_are_standardised_by_the_network() -> None:
 def test_what_is_read_has_no_correlation() -> None:
     """On other cars than it was measured on, too: nearly all mixtures vary by about one."""
     env = Task().vector_env(64)
-    mean, scale, clip, mixing = measured(env, 0.4, 5)
+    mean, scale, clip, mixing = measured(env, 0.4, 5, mixed=True)
     rng, noise, seen = np.random.default_rng(6), np.zeros((64, 1)), []
     env.reset(seed=6)
     for step in range(400):
