@@ -104,7 +104,7 @@ class GruPolicy(BasePolicy):
         shared: dict[str, Any] = super()._get_constructor_parameters()
         kind: dict[str, Any] = {"features_extractor_class": self.features_extractor_class}
         kind |= {"features_extractor_kwargs": self.features_extractor_kwargs}
-        return shared | own | kind | {"lr_schedule": lambda _: 0.0}
+        return shared | own | kind | {"lr_schedule": self._dummy_schedule}
 
 
 class Gradient(BaseAlgorithm):
