@@ -28,7 +28,7 @@ _Text = str | None
 
 def train_command(
     algo: Annotated[
-        _Text, typer.Option(help="ppo (default), sac, tqc, recurrent-ppo or gradient.")
+        _Text, typer.Option(help="ppo, sac, tqc, recurrent-ppo, gradient (ppo).")
     ] = None,
     env: Annotated[_Text, typer.Option(help="An environment's id (sideslip/YawVision-v0).")] = None,
     estimator: Annotated[_Text, typer.Option(help="An estimator's name (none).")] = None,
@@ -76,11 +76,7 @@ def train_command(
     ] = True,
     trained_agent: Annotated[
         Path | None,
-        typer.Option(
-            "--trained-agent",
-            "-i",
-            help="Begin with an sb3 zip; gradient: or a distilled policy.",
-        ),
+        typer.Option("--trained-agent", "-i", help="Begin with an sb3 zip, or a distilled policy."),
     ] = None,
     trust: Trust = False,
     out: Annotated[
