@@ -2,8 +2,8 @@
 
 Many cars on tensors are driven for a window of control periods, and the mean cost rate is led back
 through all of it to the weights: truncated back-propagation through time. It is the short-horizon
-actor-critic (Xu et al., ICLR 2022) without its critic: a window of 0.16 s is longer than most of
-what an action does, and the critic, learned beside it, cost more than it gave (docs/training.md).
+actor-critic (Xu et al., ICLR 2022) without its critic, which was no help in a first look, at other
+windows and step sizes than these (docs/training.md).
 """
 
 from collections.abc import Callable, Mapping, Sequence
