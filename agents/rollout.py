@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame
 
+FLOOR = 0.001  # of an episode's cost, in logarithms and ratios: what differs by less is alike
+
 
 class Step(NamedTuple):
     """The outcome of an env-step, as the env returns it; of a vector env a row a car.

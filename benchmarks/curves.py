@@ -18,12 +18,11 @@ from rich.table import Table
 
 from ..agents.learned.files import load_policy
 from ..agents.learned.policy import Learned
-from ..agents.rollout import costs_of
+from ..agents.rollout import FLOOR, costs_of
 from ..agents.rungs import NOMINAL, make_rung
 from ..agents.training.keeper import CURVE, POLICY, evaluation_seeds
 from ..agents.training.train import Task, task_in
 from ..envs.record import Array
-from .control.scores import FLOOR
 from .harness.stats import geometric_mean, interval, ratio_of_means, won
 
 EPISODES = 4096

@@ -1,8 +1,8 @@
-"""What `sideslip distill` learns from, the contests of a class with their teacher, and what came
-of it in each of them."""
+"""What `sideslip distill` learns from, the contests of a class with their teacher, what goes on
+from it, and what came of it in each of them."""
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,7 +11,7 @@ import gymnasium as gym
 import numpy as np
 
 from ..agents.learned.card import Card, JsonMap
-from ..agents.learned.files import is_policy, load_policy, save_policy
+from ..agents.learned.files import Policy, is_policy, load_policy, save_policy
 from ..envs.arguments import check_choice
 from ..estimators.vector.estimate import EstimateObservation
 from .control.build import estimate_options, make_cars
@@ -25,6 +25,7 @@ from .policies import enjoy, evaluation
 
 if TYPE_CHECKING:
     from ..agents.training.distill import Lesson
+    from ..agents.training.task import Task
 
 JOINT, RIVAL = "joint, friction", "adaptive-nmpc"
 OUTPUTS = ("beta", "gamma", "phi", "phi_rate", "F_d", "N_d", "bias", "front_tyres", "rear_tyres",
@@ -103,6 +104,28 @@ def lessons_of(
                 env = EstimateObservation(env, estimator, **_options(contest, teacher))
             found.append(Lesson(env, twins, agent))
     return found
+
+
+def begun_with(agent: Path | None) -> "tuple[Path | Policy | None, Callable[..., Task]]":
+    """What `sideslip train -i` goes on from, and what makes its task of the fields that were said.
+
+    agent: a zip's path stays what it is; a distilled policy goes on in all contests of its class.
+    """
+    from ..agents.training.starts import task_from
+    from ..agents.training.task import Task
+
+    if agent is None or not is_policy(str(agent)):
+        return agent, Task
+    policy = load_policy(agent)
+
+    def going_on(**fields: Any) -> Task:
+        kind = policy.card.algorithm_options.get("class")
+        alone = "scenario" in fields.get("env_options", {})
+        if kind is not None and "scenarios" not in fields and not alone:
+            fields["scenarios"] = [each.scenario for each in contests_of(kind)]
+        return task_from(policy, **fields)
+
+    return policy, going_on
 
 
 def judge(path: Path, kind: str, episodes: int) -> JsonMap:

@@ -14,12 +14,13 @@ import numpy as np
 from rich.console import Console
 
 from .. import __version__
+from ..agents.rollout import FLOOR
 from ..envs.record import Array
 from .control.cells import ADAPTIVE, CONTROLLERS, LEARNED, REFERENCE_FILTER, Cell
 from .control.contests import NOMINAL, PARAMETERS, Contest, changed, contests
 from .control.episodes import Driven
 from .control.run import Results, measure
-from .control.scores import FAILED, FLOOR, Yardstick, score
+from .control.scores import FAILED, Yardstick, score
 from .control.seeds import salt_of, seeds_of_contests
 from .harness.results import Row, Suite, Table
 from .harness.stats import Estimate, geometric_mean, profile, share, won, worst

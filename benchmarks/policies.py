@@ -14,10 +14,10 @@ import numpy as np
 from .. import __version__
 from ..agents.learned.card import JsonMap
 from ..agents.learned.files import Policy, load_policy, save_policy
+from ..agents.rollout import FLOOR
 from .control.cells import Cell
 from .control.contests import Contest
 from .control.episodes import Array, Chunk, Driven, drive
-from .control.scores import FLOOR
 from .control.seeds import salted_seeds
 from .control.tables import spec_of
 from .harness.results import Row, Suite, Table

@@ -27,7 +27,9 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from ...envs.arguments import check_choice
 from ...envs.backend.extras import extra
+from .export import activations
 from .normalise import Scaling, Standardised  # first: it says which extra is missing
 
 from stable_baselines3.common.base_class import BaseAlgorithm  # isort: skip
@@ -39,6 +41,7 @@ Settings = dict[str, Any]
 
 HYPERPARAMS = Path(__file__).parent / "hyperparams"
 PERIOD = 0.01  # s, of control: of the environments whose discount stands in the files
+BEGUN = "begun"  # the entry of a training that goes on from a policy
 EVENLY = -0.55  # log of the deviation of actions drawn evenly
 
 _OF_TRAINING = ("n_timesteps", "n_envs", "policy", "normalize")
@@ -119,6 +122,8 @@ def check_settings(algo: str, settings: Any) -> None:
             raise ValueError(f"{name} is {{name: value}}, which is no code to run, got {value!r}")
         if name in _SCHEDULED:
             _schedule(name, value)
+    bend = settings.get("policy_kwargs", {}).get("activation_fn", "tanh")
+    check_choice("activation_fn", bend, tuple(activations()))
     missing = [each for each in ("n_envs", "n_timesteps", "policy") if each not in settings]
     if missing:
         raise ValueError(f"no {', '.join(missing)}")
@@ -158,8 +163,11 @@ def make_model(
     options = options_of(algo, settings, seconds, env.num_envs)
     options |= {name: _schedule(name, options[name]) for name in _SCHEDULED if name in options}
     mean, scale, clip, mixing = scaling
+    form = dict(options.get("policy_kwargs", {}))
+    if "activation_fn" in form:
+        form["activation_fn"] = activations()[form["activation_fn"]]
     options["policy_kwargs"] = {
-        **options.get("policy_kwargs", {}),
+        **form,
         "features_extractor_class": Standardised,
         "features_extractor_kwargs": {"mean": mean, "scale": scale, "clip": clip, "mixing": mixing},
     }

@@ -19,6 +19,7 @@ from ..controllers.lqr import Lqr
 from ..learned.card import Card
 from ..learned.files import Policy, save_policy
 from ..learned.policy import Learned
+from ..rollout import FLOOR
 from .student import (
     LONGER,
     Course,
@@ -35,7 +36,6 @@ import torch  # isort: skip  # after ours, which say which extra is missing
 
 DISTILLING = 2**69  # no other seeds are as large
 _SEEDS = 2**40  # of a training
-FLOOR = 0.001  # of an episode's cost, as in the score
 _MEMORY = 0.95  # share of the noise left after a step
 
 

@@ -137,17 +137,19 @@ def _array(parameter: Any) -> Any:
     return parameter.detach().cpu().numpy().copy()
 
 
+def activations() -> dict[str, type]:
+    """Torch's classes of what bends between layers, by their names in a `Network`."""
+    from torch import nn
+
+    kinds = nn.Tanh, nn.ReLU, nn.ELU, nn.LeakyReLU, nn.SiLU
+    return dict(zip(("tanh", "relu", "elu", "leaky-relu", "silu"), kinds, strict=True))
+
+
 def _dense(layers: list[Any]) -> tuple[list[Any], list[Any], list[str], str]:
     """(weights, biases, activations between, output) of a stack of linear layers."""
     from torch import nn
 
-    names: dict[Any, str] = {
-        nn.Tanh: "tanh",
-        nn.ReLU: "relu",
-        nn.ELU: "elu",
-        nn.LeakyReLU: "leaky-relu",
-        nn.SiLU: "silu",
-    }
+    names = {kind: name for name, kind in activations().items()}
     weights: list[Any] = []
     biases: list[Any] = []
     bends: list[str] = []

@@ -7,33 +7,38 @@ windows and step sizes than these (docs/training.md).
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...envs.task.observation import Entry
-from ...estimators.learned.memory import PARTS
-from ..learned.files import Policy
+from ...envs.device.env import DeviceVectorEnv
 from .normalise import Standardised
-from .zips import Start
+from .rewards import Rates
+from .task import Task
 
 import torch  # isort: skip  # after ours, which say which extra is missing
 from stable_baselines3.common.base_class import BaseAlgorithm  # isort: skip
 from stable_baselines3.common.policies import BasePolicy  # isort: skip
 from torch import nn  # isort: skip
 
-_GRU = [f"cell.{part}_l0" for part in ("weight_ih", "weight_hh", "bias_ih", "bias_hh")]
 _LARGEST = 1.0  # norm of a step's gradient
 
 
 class Source(NamedTuple):
     """What a training drives: a `DeviceVectorEnv` with gradients that resets itself in the same
-    step; the seeds of its cars; (N,) what a car's reward is multiplied by."""
+    step; the seeds of its cars; what a car's reward is multiplied by."""
 
     cars: Any
     seeds: list[int]
-    rate: Any
+    rates: Rates
+
+
+def source_of(task: Task, first: int, rates: Rates, device: Any, compile: bool) -> Source:
+    """A task's environments on tensors; first: seed of row 0."""
+    how: dict[str, Any] = {"device": device, "dtype": "float32", "grad": True, "compile": compile}
+    how |= {"autoreset_mode": "SameStep", **task.options(task.num_envs)}
+    cars = DeviceVectorEnv.make(task.env_id, task.num_envs, **how)
+    return Source(cars, [first + i for i in range(task.num_envs)], rates)
 
 
 class GruPolicy(BasePolicy):
@@ -179,15 +184,15 @@ class Gradient(BaseAlgorithm):
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
         policy: Any = self.policy
-        cars, seeds, rate = self.source(device=self.device, compile=self.compile)
-        weights = torch.as_tensor(rate, dtype=cars.dtype, device=self.device)
+        cars, seeds, rates = self.source(device=self.device, compile=self.compile)
+        rates.begin()
         obs, _ = cars.reset(seed=seeds)
         state = policy.begin(cars.num_envs)
         callback.on_training_start(locals(), globals())
         going, windows = True, 0
         while going and self.num_timesteps < total:
             callback.on_rollout_start()
-            paid, obs, state = driven(policy, cars, obs, state, weights, self.n_steps)
+            paid, obs, state = driven(policy, cars, obs, state, rates, self.n_steps)
             self.num_timesteps += self.n_steps * cars.num_envs
             self._update_current_progress_remaining(self.num_timesteps, total)
             self._descend(paid)
@@ -221,42 +226,21 @@ class Gradient(BaseAlgorithm):
         return ["policy", "policy.optimizer"], []
 
 
-def started_by(policy: Policy, layout: Sequence[Entry]) -> Start:
-    """What a training begins with of a distilled policy, whose form a `GruPolicy` has.
-
-    layout: of the observation. Raises ValueError for a policy of another form or observation.
-    """
-    network, seen = policy.network, [name for name, _ in policy.card.observation]
-    names = [entry.name for entry in layout]
-    if seen != names:
-        raise ValueError(f"{policy.name} reads {', '.join(seen)}; here there is {', '.join(names)}")
-    kinds = [cell.kind for cell in network.cells]
-    form = network.activation, network.output, network.history, kinds
-    if form != ("silu", "linear", 1, ["gru"]):
-        raise ValueError(
-            f"{policy.name} is no GRU with dense layers of silu behind it, as one of "
-            f"`sideslip distill --cells` is: {form}"
-        )
-    arrays = dict(zip(_GRU, (getattr(network.cells[0], part) for part in PARTS), strict=True))
-    for i, (W, b) in enumerate(zip(network.weights, network.biases, strict=True)):
-        arrays |= {f"layers.{2 * i}.weight": W, f"layers.{2 * i}.bias": b}
-    tensors = {name: torch.tensor(x, dtype=torch.float32) for name, x in arrays.items()}
-    scaling = network.mean.tolist(), network.scale.tolist(), network.clip, None
-    return Start(Path(policy.name), {"policy": tensors}, {}, scaling)
-
-
 def driven(
-    policy: Any, cars: Any, obs: Any, state: Any, weights: Any, steps: int
+    policy: Any, cars: Any, obs: Any, state: Any, rates: Rates, steps: int
 ) -> tuple[Any, Any, Any]:
     """(mean of the weighted costs of so many steps, with its graph, last observations and state).
 
-    policy: a `GruPolicy`. cars: of a `Source`. obs: (N, k). state: (N, cells), zero where an
-    episode begins. weights: (N,).
+    policy: a `GruPolicy`. cars, rates: of a `Source`. obs: (N, k). state: (N, cells), zero where an
+    episode begins.
     """
     paid = torch.zeros((), dtype=cars.dtype, device=cars.device)
     for _ in range(steps):
         actions, state = policy(obs, state)
         obs, rewards, terminated, truncated, _ = cars.step(actions)
+        weights = torch.tensor(rates.now, dtype=cars.dtype, device=cars.device)
         paid = paid - (rewards * weights).mean() / steps
-        state = torch.where((terminated | truncated)[:, None], 0.0, state)
+        over = terminated | truncated
+        rates.ended(over.cpu().numpy())
+        state = torch.where(over[:, None], 0.0, state)
     return paid, obs, state

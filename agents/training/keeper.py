@@ -15,24 +15,25 @@ from ...envs.backend.files import whole, write_whole
 from ...envs.record import Array
 from ..env_facts import layout_of
 from ..learned.card import Card
-from ..learned.files import Policy, is_policy, load_policy, save_policy
-from ..rollout import costs_of, steps_of
+from ..learned.files import Policy, save_policy
+from ..rollout import FLOOR, costs_of
 from ..vec_env.env import make_native_env, make_vec_env
 from .algorithms import algorithm_of, make_model, options_of, spread_of
 from .checkpoint import load_parameters, save_checkpoint
 from .export import network_from_sb3
-from .normalise import PerSecond, measured
+from .normalise import measured
+from .rewards import Rated, Rates, alike, cost_rates, paid_by
+from .starts import Driver, give, start_of, started_by
 from .task import Task
-from .zips import Start, give, start_of
 
 from stable_baselines3.common.base_class import BaseAlgorithm  # isort: skip  # after ours, which
 from stable_baselines3.common.callbacks import BaseCallback  # isort: skip  # name a missing extra
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm  # isort: skip
+from stable_baselines3.common.vec_env import VecEnv  # isort: skip
 
 CHECKPOINT, CURVE = "checkpoint.safetensors", "curve.jsonl"
-POLICY, BEST = "policy.safetensors", "best_model.zip"
+POLICY, BEST, BEGUN_WITH = "policy.safetensors", "best_model.zip", "begun_with.safetensors"
 
-_LEAST = 0.05  # of the mean: a scenario that costs less uncontrolled weighs no more
 _ALONE = 32  # uncontrolled drives by which a scenario is weighed
 _MEASURED = 64  # environments whose observations make the scaling
 
@@ -41,31 +42,14 @@ _WEIGHING, _EVALUATION, _SCALING, _TRAINING = 2**63, 2**64, 2**65, 2**66
 _ROOM = 2**40  # seeds of a training: it takes those from its steps on when it starts or goes on
 
 
-def _alike(costs: Array) -> Array:
-    """Weights with which scenarios' costs (k,) are the same: dear ones would outweigh others."""
-    return np.asarray(costs.mean() / np.maximum(costs, _LEAST * costs.mean()))
-
-
-def _cost_rates(task: Task) -> Array:
-    """What the uncontrolled car pays in a control period of each scenario of a mixture, (k,)."""
-    k, rows = len(task.scenarios), _ALONE * len(task.scenarios)
+def weights_of(task: Task) -> Array:
+    """Of each scenario's costs in the rewards, (k,)."""
+    k = len(task.scenarios)
+    if not k:
+        return np.ones(1)
+    rows = _ALONE * k
     env = make_native_env(task.env_id, rows, None, task.options(rows))
-    costs, steps = np.zeros(rows), -np.ones(rows)  # the first one is the reset
-    for step in steps_of(env, None, [_WEIGHING + i for i in range(rows)]):
-        costs -= np.where(step.running, step.reward, 0.0)
-        steps += step.running
-    return np.array([costs[i::k].sum() / steps[i::k].sum() for i in range(k)])
-
-
-def _source(task: Task, first: int, rate: Any, device: Any, compile: bool) -> Any:
-    """What `Gradient` drives: the task's environments on tensors, from this seed on."""
-    from ...envs.device.env import DeviceVectorEnv
-    from .gradient import Source
-
-    how: dict[str, Any] = {"device": device, "dtype": "float32", "grad": True, "compile": compile}
-    how |= {"autoreset_mode": "SameStep", **task.options(task.num_envs)}
-    cars = DeviceVectorEnv.make(task.env_id, task.num_envs, **how)
-    return Source(cars, [first + i for i in range(task.num_envs)], rate)
+    return alike(cost_rates(env, k, _WEIGHING))
 
 
 def evaluation_seeds(episodes: int) -> list[int]:
@@ -78,12 +62,19 @@ class Evaluation(NamedTuple):
 
     Of a mixture the share is the mean of its scenarios' shares, and the cost the same share of
     their mean uncontrolled one. cpu_seconds: of the training up to here, evaluations apart.
+    of_start: geometric mean of the costs over those of the policy that the training began with.
     """
 
     steps: int
     cpu_seconds: float
     cost: float
     of_none: float
+    of_start: float | None = None
+
+    @property
+    def judged(self) -> float:
+        """By which the best one is chosen."""
+        return self.cost if self.of_start is None else self.of_start
 
 
 class Progress(NamedTuple):
@@ -132,6 +123,7 @@ class Keeper(BaseCallback):
     """Builds the model; evaluates it between rollouts and keeps what is needed to go on.
 
     checkpoint: the state of one, None for a new training. steps: as many as it is to have.
+    begun_with: the policy that the training began with: each drive weighs by what it pays there.
     """
 
     def __init__(
@@ -141,6 +133,7 @@ class Keeper(BaseCallback):
         checkpoint: Mapping[str, Any] | None,
         means: Means,
         steps: int = 0,
+        begun_with: Policy | None = None,
     ) -> None:
         super().__init__()
         self.task, self.folder, self.means = task, folder, means
@@ -151,12 +144,15 @@ class Keeper(BaseCallback):
         self.period: float = base.control_period * base.dt  # s
         saved = {} if checkpoint is None else checkpoint
         self.evaluations = [Evaluation(*each) for each in saved.get("evaluations", [])]
-        none = self._costs(None)
+        none = self._means(costs_of(self.tested, None, self.seeds))
         if none.mean() == 0.0:
             raise ValueError("the uncontrolled car costs nothing there: there is nothing to learn")
-        self.alike = _alike(none)
+        self.alike = alike(none)
         self.none = float(np.mean(none * self.alike))
-        self.weights = _alike(_cost_rates(task)) if task.scenarios else np.ones(1)
+        self.weights = weights_of(task)
+        self.begun_with = begun_with
+        driver = None if begun_with is None else Driver(begun_with.network)
+        self.start = None if driver is None else costs_of(self.tested, driver, self.seeds)
         self.scaling: Any = saved.get("scaling")
         self.spent = self.evaluations[-1].cpu_seconds if self.evaluations else 0.0
         self.since = time.process_time()
@@ -167,15 +163,16 @@ class Keeper(BaseCallback):
         trained_agent: str | Path | None = None,
         trust: bool = False,
     ) -> BaseAlgorithm:
-        """The model, new, of the checkpoint or of a zip, with the environments it is trained on."""
+        """The model, new, of the checkpoint, a zip or a policy, with the environments it is
+        trained on."""
         task, means = self.task, self.means
         start = None
         if trained_agent is not None:
             width = (self.tested.single_observation_space.shape or (0,))[0]
-            if is_policy(str(trained_agent)):
-                start = self._started_by(load_policy(trained_agent))
-            else:
-                start = start_of(trained_agent, width, trust)
+            start = start_of(trained_agent, width, trust)
+        elif self.begun_with is not None and checkpoint is None:
+            start = started_by(self.begun_with, task, layout_of(self.tested))
+        if start is not None:
             self.scaling = start.scaling
         if self.scaling is None:
             spread, seed = spread_of(task.settings), _SCALING + task.seed
@@ -189,11 +186,13 @@ class Keeper(BaseCallback):
         )
         steps = 0 if checkpoint is None else int(checkpoint["steps"])
         seed = (task.seed + steps) % 2**32
-        rated = PerSecond(env, self.period, np.resize(self.weights, task.num_envs))
         first = _TRAINING + task.seed * _ROOM + steps
+        rated = Rated(env, self._rates(env, first, steps))
         further: dict[str, Any] = {"device": means.device, "tensorboard_log": means.tensorboard_log}
         if algorithm_of(task.algo).on_tensors:
-            further["source"] = partial(_source, task, first, rated.rate)
+            from .gradient import source_of
+
+            further["source"] = partial(source_of, task, first, rated.rates)
         model = make_model(
             task.algo, task.settings, rated, self.period, self.scaling, seed, **further
         )
@@ -208,16 +207,17 @@ class Keeper(BaseCallback):
         self.init_callback(model)
         return model
 
-    def _started_by(self, policy: Policy) -> Start:
-        from .gradient import started_by
+    def _rates(self, env: VecEnv, first: int, steps: int) -> Rates:
+        """What is paid for the cars' costs, from this seed and step on."""
+        if self.begun_with is None:
+            rate = np.resize(self.weights, env.num_envs) / self.period
+            return Rates(rate[:, None].tolist())
+        each = -(-(self.aim.steps - steps) // env.num_envs)
+        return Rates(paid_by(Driver(self.begun_with.network), env, first, each))
 
-        if not algorithm_of(self.task.algo).on_tensors:
-            raise ValueError(f"{self.task.algo} begins with a zip, not with policy {policy.name}")
-        return started_by(policy, layout_of(self.tested))
-
-    def _costs(self, agent: Any) -> Array:
-        """Mean over the evaluation's drives of each scenario, (k,); agent: None for no control."""
-        costs, k = costs_of(self.tested, agent, self.seeds), max(len(self.task.scenarios), 1)
+    def _means(self, costs: Array) -> Array:
+        """Of the evaluation's drives of each scenario, (k,)."""
+        k = max(len(self.task.scenarios), 1)
         return np.array([costs[i::k].mean() for i in range(k)])
 
     def _on_step(self) -> bool:
@@ -248,9 +248,14 @@ class Keeper(BaseCallback):
         """Cost of the policy as it is; the best one so far and the checkpoint are written."""
         self.check()
         self.spent += time.process_time() - self.since
-        cost = float(np.mean(self._costs(self.model) * self.alike))
-        now = Evaluation(self.model.num_timesteps, round(self.spent, 3), cost, cost / self.none)
-        if all(cost < each.cost for each in self.evaluations):
+        costs = costs_of(self.tested, self.model, self.seeds)
+        cost, start = float(np.mean(self._means(costs) * self.alike)), self.start
+        ratio = None
+        if start is not None:
+            ratio = float(np.exp(np.mean(np.log((costs + FLOOR) / (start + FLOOR)))))
+        spent = round(self.spent, 3)
+        now = Evaluation(self.model.num_timesteps, spent, cost, cost / self.none, ratio)
+        if all(now.judged < each.judged for each in self.evaluations):
             self._keep_best(now)
         self.evaluations.append(now)
         self.logger.record("eval/mean_reward", -cost)

@@ -1,4 +1,4 @@
-"""What a network reads instead of SI units: standardised observations, rewards per second.
+"""What a network reads instead of SI units: standardised observations.
 
 Scales and mixing are measured once, before the training, and stay: they are part of the network,
 which reads plain observations. What varies little while its parts vary much, as course less
@@ -18,13 +18,11 @@ from gymnasium.vector import VectorEnv
 
 from ...envs.backend.extras import extra
 from ..env_facts import layout_of
-from ..vec_env.env import Observations
 from .student import whitening
 
 with extra("train", "training needs {}"):
     import torch
     from stable_baselines3.common.torch_layers import FlattenExtractor
-    from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
 Array = npt.NDArray[np.float64]
 Scaling = tuple[list[float], list[float], float | None, list[list[float]] | None]
@@ -125,24 +123,3 @@ def _driven(
         if step >= round(_WARM_UP / period):
             seen.append(obs)
     return np.concatenate(seen).astype(np.float64)
-
-
-class PerSecond(VecEnvWrapper):
-    """Rewards as minus the cost rate: of the order of one, whatever the control period.
-
-    seconds: of a control period. weights: (N,), of each environment's cost; `rate` is what rewards
-    are multiplied by. It stands outside of the monitor, which counts costs.
-    """
-
-    def __init__(self, venv: VecEnv, seconds: float, weights: Array) -> None:
-        super().__init__(venv)
-        self.rate = (weights / seconds).astype(np.float32)
-
-    def reset(self) -> Observations:
-        """The inner env's."""
-        return np.asarray(self.venv.reset())
-
-    def step_wait(self) -> Any:
-        """The inner env's, with the rewards divided by the time they are for."""
-        obs, rewards, dones, infos = self.venv.step_wait()
-        return obs, rewards * self.rate, dones, infos

@@ -14,9 +14,20 @@ from typing import Any, NamedTuple
 from ... import __version__
 from ...envs.documents import made_of
 from ..learned.card import check_names_no_code
-from ..learned.files import is_policy
+from ..learned.files import Policy, load_policy, save_policy
 from .checkpoint import read_state
-from .keeper import BEST, CHECKPOINT, CURVE, POLICY, Aim, Evaluation, Keeper, Means, Progress
+from .keeper import (
+    BEGUN_WITH,
+    BEST,
+    CHECKPOINT,
+    CURVE,
+    POLICY,
+    Aim,
+    Evaluation,
+    Keeper,
+    Means,
+    Progress,
+)
 from .task import Task
 from .zips import check_zip
 
@@ -40,7 +51,7 @@ class Trained(NamedTuple):
     @property
     def best(self) -> Evaluation:
         """The evaluation whose model is kept."""
-        return min(self.evaluations, key=lambda each: each.cost)
+        return min(self.evaluations, key=lambda each: each.judged)
 
 
 def train(
@@ -49,7 +60,7 @@ def train(
     folder: str | Path,
     resume: bool = False,
     means: Means | None = None,
-    trained_agent: str | Path | None = None,
+    trained_agent: str | Path | Policy | None = None,
     trust: bool = False,
 ) -> Trained:
     """Train up to a number of steps (rounded up to whole rollouts), in a folder.
@@ -57,8 +68,10 @@ def train(
     resume: go on from the folder's checkpoint: weights, optimisers, step size, steps and
     evaluations are those of the checkpoint, episodes are new; a replay buffer begins empty and is
     filled as at the start, by `learning_starts` steps of random actions, before weights change.
-    trained_agent: a zip of stable-baselines3 whose weights a new training begins with, or for
-    `gradient` a distilled policy's file; trust: of `zips.start_of`.
+    trained_agent: a zip of stable-baselines3 whose weights a new training begins with; or, for
+    `ppo` and `gradient`, a `Policy` (`task_from` makes its task). Each drive then weighs by what
+    the policy pays in it, and the best evaluation is that of the least geometric mean over the
+    policy's costs. trust: of `starts.start_of`.
 
     Raises ValueError where the folder holds another training, FileNotFoundError where there is
     none to go on with, FloatingPointError, with the step, where weights are not finite any more
@@ -71,8 +84,8 @@ def train(
         if resume:
             raise ValueError("a training goes on from its checkpoint or from a zip, not from both")
         if task.reads:
-            raise ValueError("a zip's network reads what it was trained on: give reads or a zip")
-        if not is_policy(str(trained_agent)):
+            raise ValueError("a network reads what it was trained on: give reads or a network")
+        if not isinstance(trained_agent, Policy):
             check_zip(Path(trained_agent), trust=True)
     if how.tensorboard_log is not None and find_spec("tensorboard") is None:
         raise ModuleNotFoundError("a log for TensorBoard needs it: pip install tensorboard")
@@ -80,9 +93,11 @@ def train(
     torch.set_num_threads(1)  # on small matrices threads only wait for each other
     place = Path(folder)
     checkpoint = _start(task, place, resume)
-    keeper = Keeper(task, place, checkpoint, how, steps)
+    begun_with = _begun_with(place, resume, trained_agent)
+    zipped = None if isinstance(trained_agent, Policy) else trained_agent
+    keeper = Keeper(task, place, checkpoint, how, steps, begun_with)
     watchers: list[BaseCallback] = [keeper] if tracked is None else [tracked, keeper]
-    model = keeper.build(checkpoint, trained_agent, trust)
+    model = keeper.build(checkpoint, zipped, trust)
     done = model.num_timesteps
     if done < steps:
         try:
@@ -98,6 +113,18 @@ def train(
             if tracked is not None:
                 tracked.finish()
     return Trained(model, tuple(keeper.evaluations))
+
+
+def _begun_with(folder: Path, resume: bool, agent: Any) -> Policy | None:
+    """The policy that a training began with; a copy of it stays in the folder."""
+    file = folder / BEGUN_WITH
+    if resume:
+        return load_policy(file) if file.is_file() else None
+    file.unlink(missing_ok=True)  # of a training that never came to its first evaluation
+    if isinstance(agent, Policy):
+        save_policy(file, agent.network, agent.card)
+        return agent
+    return None
 
 
 def aim_in(folder: str | Path) -> Aim:

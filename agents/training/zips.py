@@ -5,13 +5,12 @@ without `trust`, and `export_zip` writes a file that anybody can read without it
 """
 
 import json
-import math
 import pickle
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any
 from zipfile import BadZipFile, ZipFile
 
 import gymnasium as gym
@@ -21,10 +20,7 @@ from ...estimators.wrappers.estimate import EstimateObservation
 from ..env_facts import AnyEnv, facts_of
 from ..learned.card import Card
 from ..learned.files import ENDING, Policy, save_policy
-from .export import known_policy, network_from_sb3, normalisation
-
-if TYPE_CHECKING:
-    from .normalise import Scaling
+from .export import known_policy, network_from_sb3
 
 _NEEDED = ("policy_class", "policy_kwargs", "observation_space", "action_space")
 _MEMBERS = {"data", "policy.pth"}
@@ -57,77 +53,13 @@ def policy_from_zip(
     policy = _built(file, content, weights)
     frames = _frames(file, policy.observation_space, facts_of(env).layout)
     found = normaliser_of(file, normalise)
-    normaliser = None if found is None else _unpickled(found)
+    normaliser = None if found is None else unpickled(found)
     network = network_from_sb3(policy, normaliser, frames)
     described = {
         "algorithm": f"stable-baselines3's {type(policy).__name__}",
         "steps": int(content.get("num_timesteps", 0)),
     }
     return Policy(file.stem, network, Card.seen(env, **{"env_id": "", **described, **about}))
-
-
-class Start(NamedTuple):
-    """What a training begins with: a zip's weights and optimisers, by their names in
-    `get_parameters`, its further tensors, and the scaling of what they read."""
-
-    path: Path
-    parameters: dict[str, Any]
-    variables: dict[str, Any]
-    scaling: "Scaling"
-
-
-def start_of(path: str | Path, width: int, trust: bool = False) -> Start:
-    """The tensors of a zip, which are read without running code of its maker's.
-
-    width: of the observation. trust: whether a pickle of VecNormalize beside the zip may be read.
-    Raises what `check_zip` raises; PermissionError for such a pickle without trust.
-    """
-    from .normalise import Scaling  # noqa: F401  first: it says which extra is missing
-
-    from stable_baselines3.common.save_util import load_from_zip_file  # isort: skip
-
-    file = Path(path)
-    check_zip(file, trust=True)
-    try:
-        _, found, variables = load_from_zip_file(file, load_data=False, device="cpu")
-        parameters: dict[str, Any] = found
-        policy = parameters["policy"]
-    except Exception as error:  # torch raises many for one that is cut short
-        raise ValueError(f"{file} cannot be read: {' '.join(str(error).split())}") from error
-    own = {
-        name.rpartition(".")[2]: x for name, x in policy.items() if "features_extractor." in name
-    }
-    if own.keys() >= {"mean", "scale", "clip"}:  # every network of the policy has the same
-        bound = float(own["clip"])
-        mixing = own["mixing"].tolist() if "mixing" in own else None
-        numbers = own["mean"].tolist(), own["scale"].tolist(), bound if bound < math.inf else None
-        return Start(file, parameters, variables or {}, (*numbers, mixing))
-    beside = normaliser_of(file)
-    if beside is not None and not trust:
-        raise PermissionError(f"{beside} is a pickle, which may run code: say --trust to read it")
-    mean, scale, clip = normalisation(_unpickled(beside) if beside else None, width, 1)
-    return Start(file, parameters, variables or {}, (mean.tolist(), scale.tolist(), clip, None))
-
-
-def give(start: Start, model: Any) -> None:
-    """Give a model what it starts with; ValueError where that is of another network."""
-    scaling = {
-        name: x
-        for name, x in model.get_parameters()["policy"].items()
-        if "features_extractor." in name  # what a zip from elsewhere has outside of its policy
-    }
-    policy = scaling | start.parameters["policy"]
-    try:
-        model.set_parameters(
-            {**model.get_parameters(), **start.parameters, "policy": policy}, device=model.device
-        )
-        for name, tensor in start.variables.items():
-            getattr(model, name).data.copy_(tensor)
-    except (AttributeError, KeyError, RuntimeError, ValueError) as error:
-        raise ValueError(
-            f"{start.path} holds other networks than this training's {type(model).__name__} (its "
-            f"settings say which): {' '.join(str(error).split())[:300]}"
-        ) from error
 
 
 def export_zip(
@@ -244,7 +176,7 @@ def _built(file: Path, content: dict[str, Any], weights: Any) -> Any:
     return policy
 
 
-def _unpickled(file: Path) -> Any:
+def unpickled(file: Path) -> Any:
     """A VecNormalize."""
     from stable_baselines3.common.vec_env import VecNormalize
 

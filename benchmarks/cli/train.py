@@ -2,7 +2,6 @@
 `sideslip distill`: one learns from a teacher that sees more, over a class of contests.
 `sideslip train-estimator`: a network learns to correct a filter's sideslip angle."""
 
-import json
 import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -76,7 +75,7 @@ def train_command(
     ] = True,
     trained_agent: Annotated[
         Path | None,
-        typer.Option("--trained-agent", "-i", help="Begin with an sb3 zip, or a distilled policy."),
+        typer.Option("--trained-agent", "-i", help="Begin with an sb3 zip or a policy."),
     ] = None,
     trust: Trust = False,
     out: Annotated[
@@ -91,7 +90,8 @@ def train_command(
     With --resume the options left out are those of the training in the folder.
     """
     from ...agents.training.algorithms import settings_of
-    from ...agents.training.train import CURVE, POLICY, Aim, Means, Task, aim_in, task_in, train
+    from ...agents.training.train import CURVE, POLICY, Aim, Means, aim_in, task_in, train
+    from ..distillation import begun_with
     from ..policies import evaluate, evaluation
 
     options: dict[str, Any] = {
@@ -109,25 +109,24 @@ def train_command(
     options = {name: value for name, value in options.items() if value is not None}
     if env is not None:
         check_env(env)
-    folder = out or Path(_name_of(Task(**options)))
-    task = task_in(folder) if resume else Task(**options)
+    agent, new = begun_with(trained_agent)
+    task = task_in(out) if resume and out else new(**options)
     if conf_file is not None:
         options["settings"] = settings_of(task.algo, task.env_id, conf_file)
-    task = task_in(folder, **options) if resume else Task(**options)
+    folder = out or Path(_name_of(task))
+    task = task_in(folder, **options) if resume else new(**options)
     aim = aim_in(folder) if resume else Aim(int(task.settings["n_timesteps"]), Means.eval_freq, "")
     steps = aim.steps if steps is None else steps
     eval_freq = aim.eval_freq if eval_freq is None else eval_freq
-    words = [*_words(task, steps), "--eval-freq", str(eval_freq)]
-    words += ["--conf-file", str(conf_file)] if conf_file else []
-    words += ["--trained-agent", str(trained_agent)] if trained_agent else []
-    command = shlex.join(words)
-    if resume:
-        command = f"{aim.command}; sideslip train --resume --steps {steps}"
+    more = {"--eval-freq": eval_freq, "--conf-file": conf_file, "--trained-agent": trained_agent}
+    given = [str(word) for pair in more.items() if pair[1] for word in pair]
+    command = shlex.join([*task.words(steps), *given])
+    command = f"{aim.command}; sideslip train --resume --steps {steps}" if resume else command
     console = Console()
     with _Bar(console, steps, disable=not progress) as bar:
         project = wandb_project_name if track else ""
         means = Means(eval_freq, device, tensorboard_log, bar.show, command, project)
-        trained = train(task, steps, folder, resume, means, trained_agent, trust)
+        trained = train(task, steps, folder, resume, means, agent, trust)
     console.print(_table(trained))
     costs = evaluation(evaluate(folder / POLICY, EPISODES))["cost"]
     shown = ", ".join(f"{name} {each['mean']:.4g}" for name, each in costs.items())
@@ -143,21 +142,6 @@ def _name_of(task: "Task") -> str:
     options += ["mixture"] if task.scenarios else []
     words = [task.env_id.rpartition("/")[2], task.algo, task.estimator, *options]
     return "-".join(["train", *filter(None, words), str(task.seed)])
-
-
-def _words(task: "Task", steps: int) -> list[str]:
-    """The command that trains this from the start."""
-    words = ["sideslip", "train", "--algo", task.algo, "--env", task.env_id]
-    words += ["--estimator", task.estimator] if task.estimator else []
-    given = {"--estimator-option": task.estimator_options, "--option": task.env_options}
-    for option, values in given.items():
-        for name, value in values.items():
-            words += [option, f"{name}={value if isinstance(value, str) else json.dumps(value)}"]
-    words += [word for each in task.scenarios for word in ("--scenarios", str(each))]
-    words += [word for each in task.reads for word in ("--reads", each)]
-    numbers = {"--steps": steps, "--seed": task.seed, "--num-envs": task.num_envs}
-    numbers |= {"--n-eval-envs": task.n_eval_envs}
-    return words + [word for name, value in numbers.items() for word in (name, str(value))]
 
 
 class _Bar(Progress):
@@ -177,17 +161,19 @@ class _Bar(Progress):
     def show(self, now: "Now") -> None:
         """Show where the training stands."""
         text = "" if now.cost is None else f"cost {now.cost:.3g} exploring, "
-        last, best = now.evaluations[-1], min(now.evaluations, key=lambda each: each.cost)
+        last, best = now.evaluations[-1], min(now.evaluations, key=lambda each: each.judged)
         text += f"of none's {last.of_none:.3f}, best {best.of_none:.3f}"
+        text += "" if last.of_start is None else f", of its start's {last.of_start:.3f}"
         self.update(self._task, completed=now.steps, description=text)
 
 
 def _table(trained: "Trained") -> Table:
-    table = Table("steps", "CPU-s", "cost", "of none's")
+    table = Table("steps", "CPU-s", "cost", "of none's", "of its start's")
     for each in trained.evaluations:
         mark = " best" if each is trained.best else ""
         numbers = f"{each.steps:,}", f"{each.cpu_seconds:.1f}", f"{each.cost:.4g}"
-        table.add_row(*numbers, f"{each.of_none:.3f}{mark}")
+        start = "" if each.of_start is None else f"{each.of_start:.3f}"
+        table.add_row(*numbers, f"{each.of_none:.3f}{mark}", start)
     return table
 
 

@@ -12,12 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from ...agents.rollout import FLOOR
 from ..harness.stats import Estimate, ratio_of_sums
 from .episodes import Array, Driven
 
 NOTHING = 0.05
 """A mean gap below which there is nothing to win."""
-FLOOR, _CLIP = 0.001, 3.0
+_CLIP = 3.0
 FAILED = 20.0  # times nominal's cost, of an episode that ends by a failure
 
 

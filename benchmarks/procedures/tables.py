@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 
 from ... import __version__
+from ...agents.rollout import FLOOR
 from ...envs.vehicle.vehicle import GRAVITY
-from ..control.scores import FLOOR
 from ..harness.results import Row, Suite, Table
 from ..harness.stats import geometric_mean, interval
 from . import fmvss126, iso3888, iso4138, iso7401, outside

@@ -18,6 +18,7 @@ from sideslip.agents.learned.policy import Learned
 from sideslip.agents.training import keeper, train
 from sideslip.agents.training.algorithms import (
     ALGORITHMS,
+    BEGUN,
     HYPERPARAMS,
     algorithm_of,
     check_settings,
@@ -151,7 +152,7 @@ def test_the_packages_settings_are_of_ids_there_are() -> None:
 
     for name, algorithm in ALGORITHMS.items():
         entries = yaml.safe_load((HYPERPARAMS / f"{algorithm.zoo}.yml").read_text())
-        assert "default" in entries and set(entries) - {"default"} <= set(gym.registry)
+        assert "default" in entries and set(entries) - {"default", BEGUN} <= set(gym.registry)
         for key in entries:
             check_settings(name, entries[key])
             assert settings_of(name, key) == entries[key]

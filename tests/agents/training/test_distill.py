@@ -13,9 +13,10 @@ import torch
 
 from sideslip.agents.learned.card import Card
 from sideslip.agents.learned.files import load_policy
+from sideslip.agents.rollout import FLOOR
 from sideslip.agents.rungs import make_rung
 from sideslip.agents.training import distill as training
-from sideslip.agents.training.distill import FLOOR, Lesson, distill, drive
+from sideslip.agents.training.distill import Lesson, distill, drive
 from sideslip.agents.training.student import (
     UNREAD,
     Course,

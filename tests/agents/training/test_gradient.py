@@ -1,6 +1,5 @@
 """`gradient`: its slope is the cost's own, episodes keep apart, faults are named."""
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +9,11 @@ import pytest
 pytest.importorskip("stable_baselines3")
 import torch
 
-from sideslip.agents.env_facts import layout_of
 from sideslip.agents.learned.files import load_policy
 from sideslip.agents.learned.policy import Learned
-from sideslip.agents.training.gradient import Gradient, GruPolicy, Source, driven, started_by
+from sideslip.agents.training.gradient import Gradient, GruPolicy, Source, driven
 from sideslip.agents.training.keeper import Keeper, Means
+from sideslip.agents.training.rewards import Rates
 from sideslip.agents.training.task import Task
 from sideslip.agents.vec_env.env import make_vec_env
 from sideslip.envs.device import DeviceVectorEnv
@@ -48,7 +47,8 @@ def policy_of(cars: Any) -> Any:
 
 def paid_by(policy: Any, cars: Any, weights: Any, steps: int) -> Any:
     obs, _ = cars.reset(seed=list(range(cars.num_envs)))
-    return driven(policy, cars, obs, policy.begin(cars.num_envs).double(), weights, steps)
+    rates = Rates([[each] for each in weights.tolist()])
+    return driven(policy, cars, obs, policy.begin(cars.num_envs).double(), rates, steps)
 
 
 def test_the_slope_is_that_of_the_cost() -> None:
@@ -80,7 +80,7 @@ def test_a_car_of_weight_zero_teaches_nothing() -> None:
     paid, *_ = paid_by(policy, cars, torch.tensor([0.0, 1.0], dtype=torch.float64), 4)
     alone = cars_of(1)
     obs, _ = alone.reset(seed=[1])
-    one, *_ = driven(policy, alone, obs, policy.begin(1).double(), torch.ones(1), 4)
+    one, *_ = driven(policy, alone, obs, policy.begin(1).double(), Rates([[1.0]]), 4)
     assert paid.item() == pytest.approx(0.5 * one.item(), rel=1e-12) and one.item() > 0.0
 
 
@@ -102,10 +102,25 @@ def tuned_task(**more: Any) -> Task:
     return Task(FUSION, "gradient", "", options, settings=settings, n_eval_envs=4)
 
 
+def test_a_drive_has_a_weight_of_its_own() -> None:
+    """In a window over an episode's end, each part counts by its own drive's weight."""
+    cars = cars_of(1)
+    policy, parts = policy_of(cars), []
+    for rates in ([2.0, 0.0], [0.0, 3.0], [2.0, 3.0]):
+        obs, _ = cars.reset(seed=[0])
+        start = policy.begin(1).double()
+        paid, *_ = driven(policy, cars, obs, start, Rates([rates]), 20)  # an episode has 15
+        parts.append(paid.item())
+    assert min(parts) > 0.0 and parts[2] == pytest.approx(parts[0] + parts[1], rel=1e-6)
+
+
+def begun(task: Task, folder: Path) -> Any:
+    return Keeper(task, folder, None, Means(), 1, load_policy("raw-car-yaw")).build(None)
+
+
 def test_what_begins_with_a_distilled_policy_acts_as_it_does(tmp_path: Path) -> None:
     task = tuned_task()
-    model = Keeper(task, tmp_path, None, Means()).build(None, "raw-car-yaw")
-    env = task.vector_env(4)
+    model, env = begun(task, tmp_path), task.vector_env(4)
     ours = Learned(env, "raw-car-yaw")
     obs, _ = env.reset(seed=0)
     mine, theirs, start = None, None, np.ones(4, np.bool_)
@@ -117,23 +132,10 @@ def test_what_begins_with_a_distilled_policy_acts_as_it_does(tmp_path: Path) -> 
         start = terminated | truncated
 
 
-def test_what_cannot_be_begun_with_is_named(tmp_path: Path) -> None:
-    keeper = Keeper(tuned_task(), tmp_path, None, Means())
-    smaller = Keeper(tuned_task(policy_kwargs={"cells": 8}), tmp_path, None, Means())
-    cases = [
-        (keeper, "distill-car-yaw", "distill-car-yaw reads .*beta_hat.*; here there is gyro, "),
-        (smaller, "raw-car-yaw", "holds other networks than this training's Gradient"),
-    ]
-    for each, name, said in cases:
-        with pytest.raises(ValueError, match=said):
-            each.build(None, name)
-    policy = load_policy("raw-car-yaw")
-    squashed = replace(policy, network=replace(policy.network, output="tanh"))
-    layout = layout_of(tuned_task().vector_env(1))
-    with pytest.raises(ValueError, match=r"no GRU with dense layers .* \('silu', 'tanh', 1,"):
-        started_by(squashed, layout)
-    with pytest.raises(ValueError, match="ppo begins with a zip, not with policy raw-car-yaw"):
-        Keeper(Task(FUSION, env_options=CAR), tmp_path, None, Means()).build(None, "raw-car-yaw")
+def test_another_form_than_the_policys_is_named(tmp_path: Path) -> None:
+    smaller = tuned_task(policy_kwargs={"cells": 8, "net_arch": [64, 64]})
+    with pytest.raises(ValueError, match=r"network of {.*'cells': 96}, and the .* {'cells': 8,"):
+        begun(smaller, tmp_path)
 
 
 class Torn:
@@ -166,7 +168,7 @@ def test_a_slope_that_is_not_finite_stops_it_at_its_step() -> None:
     width = made(None).observation_space.shape[0]
 
     def torn(device: Any, compile: bool) -> Source:
-        return Source(Torn(width), [0, 1], np.ones(2))
+        return Source(Torn(width), [0, 1], Rates([[1.0], [1.0]]))
 
     model = made(torn, n_steps=3)
     before = [each.clone() for each in model.policy.parameters()]

@@ -13,6 +13,7 @@ from sideslip.agents.learned.files import load_policy
 from sideslip.agents.learned.policy import Learned
 from sideslip.agents.rollout import costs_of
 from sideslip.agents.training import keeper, train
+from sideslip.agents.training.rewards import alike
 from sideslip.agents.training.task import Task
 from sideslip.agents.training.train import POLICY, Means, task_in
 
@@ -91,10 +92,11 @@ def test_the_scenarios_of_a_mixture_weigh_alike(
 
 
 def test_weights_do_not_depend_on_the_evaluation_and_are_bounded() -> None:
-    rates = keeper._cost_rates(dataclasses.replace(TINY, scenarios=MIXTURE, n_eval_envs=2))
-    assert np.array_equal(rates, keeper._cost_rates(dataclasses.replace(TINY, scenarios=MIXTURE)))
-    assert keeper._alike(np.array([1e-9, 10.0]))[0] == pytest.approx(20.0)
-    assert keeper._alike(np.array([4.0, 2.0])).tolist() == [0.75, 1.5]
+    found = keeper.weights_of(dataclasses.replace(TINY, scenarios=MIXTURE, n_eval_envs=2))
+    same = keeper.weights_of(dataclasses.replace(TINY, scenarios=MIXTURE))
+    assert np.array_equal(found, same) and found[0] != found[1]
+    assert alike(np.array([1e-9, 10.0]))[0] == pytest.approx(20.0)
+    assert alike(np.array([4.0, 2.0])).tolist() == [0.75, 1.5]
 
 
 def test_where_the_uncontrolled_car_costs_nothing_there_is_nothing_to_learn(tmp_path: Path) -> None:

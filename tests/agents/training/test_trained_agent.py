@@ -97,7 +97,7 @@ def test_what_no_training_can_begin_with_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="from its checkpoint or from a zip, not from both"):
         train.train(TASK, 128, tmp_path / "new", resume=True, trained_agent=zipped)
     reading = dataclasses.replace(TASK, reads=["gyro"])  # of which the zip's network knows nothing
-    with pytest.raises(ValueError, match="give reads or a zip"):
+    with pytest.raises(ValueError, match="give reads or a network"):
         train.train(reading, 128, tmp_path / "new", trained_agent=zipped)
     (tmp_path / "vecnormalize.pkl").unlink()
     foreign(zipped, False, policy_kwargs={"net_arch": [8]})

@@ -14,6 +14,7 @@ from sideslip.agents.training import keeper, train
 from sideslip.benchmarks import policies as enjoy
 from sideslip.benchmarks.cli import train as train_command
 from sideslip.benchmarks.cli.output import options_of
+from sideslip.benchmarks.distillation import contests_of
 from tests.benchmarks.conftest import Run
 
 TINY = ("--num-envs", 8, "--option", "scenario=sine-with-dwell", "--n-eval-envs", 4)
@@ -119,7 +120,7 @@ def test_without_the_extra_the_command_names_it(
 def test_the_command_of_a_card_says_what_the_filter_was(run: Run) -> None:
     told = {"outputs": ["beta", "F_d"], "options": {"fast": ["gyro", "accel_y"]}}
     task = train.Task(estimator="exact-kf", estimator_options=told)
-    words = train_command._words(task, 10)
+    words = task.words(10)
     found = [words[i + 1] for i, word in enumerate(words) if word == "--estimator-option"]
     assert options_of(found) == told
     status, _, err = run("--estimator-option", found[0])
@@ -129,3 +130,23 @@ def test_the_command_of_a_card_says_what_the_filter_was(run: Run) -> None:
 def test_the_folder_is_named_by_what_is_trained() -> None:
     task = train.Task("sideslip/YawGps-v0", "ppo", "dakf", {"scenario": "gust"}, 7)
     assert train_command._name_of(task) == "train-YawGps-v0-ppo-dakf-gust-7"
+
+
+def test_it_goes_on_from_a_distilled_policy_in_all_contests_of_its_class(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(enjoy, "evaluate", lambda *_: None)
+    monkeypatch.setattr(enjoy, "evaluation", lambda _: {"cost": {}})
+    small = ("--num-envs", 7, "--n-eval-envs", 7, "--steps", 448, "--out", "on")
+    status, out, err = run("-i", "distill-coms-yaw", *small)
+    assert status == 0, err
+    assert "of its start's" in out and " 1.000" in out
+    task = train.task_in("on")
+    known = [each.scenario for each in contests_of("coms-zero-slip")]
+    assert (task.scenarios, task.estimator) == (known, "joint")
+    words = shlex.split(load_policy(f"on/{train.POLICY}").card.command)[2:]
+    assert words[-2:] == ["--trained-agent", "distill-coms-yaw"]
+    status, _, err = run("-i", "distill-coms-yaw", "--algo", "sac", "--out", "off")
+    assert status == 2 and "sac begins with a zip, not with policy distill-coms-yaw" in err
+    status, _, err = run("-i", "distill-coms", "--out", "off")
+    assert status == 2 and "distill-coms" in err and not Path("off").exists()

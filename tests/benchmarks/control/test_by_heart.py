@@ -10,9 +10,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from sideslip.agents.rollout import costs_of
+from sideslip.agents.rollout import FLOOR, costs_of
 from sideslip.benchmarks.control.contests import YAW, Contest
-from sideslip.benchmarks.control.scores import FLOOR
 from sideslip.benchmarks.control.seeds import salt_of, seeds_of_contests
 
 CONTEST = Contest("1", YAW, "coms", "zero-slip", "coms-random")

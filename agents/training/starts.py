@@ -1,0 +1,172 @@
+"""What a training begins with: a zip of stable-baselines3, or a policy's file."""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from ...envs.task.observation import Entry
+from ...estimators.learned.memory import PARTS
+from ...estimators.learned.network import Network
+from ..learned.files import Policy
+from .algorithms import BEGUN, algorithm_of, settings_of
+from .export import normalisation
+from .normalise import Scaling
+from .task import Task
+from .zips import check_zip, normaliser_of, unpickled
+
+import torch  # isort: skip  # after ours, which say which extra is missing
+from stable_baselines3.common.save_util import load_from_zip_file  # isort: skip
+
+_GRU = [f"cell.{part}_l0" for part in ("weight_ih", "weight_hh", "bias_ih", "bias_hh")]
+
+
+class Start(NamedTuple):
+    """Weights and optimisers, by their names in `get_parameters`, a zip's further tensors, the
+    scaling of what they read, and whether the rest of the model stays as it is."""
+
+    path: Path
+    parameters: dict[str, Any]
+    variables: dict[str, Any]
+    scaling: Scaling
+    partial: bool = False
+
+
+def start_of(path: str | Path, width: int, trust: bool = False) -> Start:
+    """The tensors of a zip, which are read without running code of its maker's.
+
+    width: of the observation. trust: whether a pickle of VecNormalize beside the zip may be read.
+    Raises what `check_zip` raises; PermissionError for such a pickle without trust.
+    """
+    file = Path(path)
+    check_zip(file, trust=True)
+    try:
+        _, found, variables = load_from_zip_file(file, load_data=False, device="cpu")
+        parameters: dict[str, Any] = found
+        policy = parameters["policy"]
+    except Exception as error:  # torch raises many for one that is cut short
+        raise ValueError(f"{file} cannot be read: {' '.join(str(error).split())}") from error
+    own = {
+        name.rpartition(".")[2]: x for name, x in policy.items() if "features_extractor." in name
+    }
+    if own.keys() >= {"mean", "scale", "clip"}:  # every network of the policy has the same
+        bound = float(own["clip"])
+        mixing = own["mixing"].tolist() if "mixing" in own else None
+        numbers = own["mean"].tolist(), own["scale"].tolist(), bound if bound < math.inf else None
+        return Start(file, parameters, variables or {}, (*numbers, mixing))
+    beside = normaliser_of(file)
+    if beside is not None and not trust:
+        raise PermissionError(f"{beside} is a pickle, which may run code: say --trust to read it")
+    mean, scale, clip = normalisation(unpickled(beside) if beside else None, width, 1)
+    return Start(file, parameters, variables or {}, (mean.tolist(), scale.tolist(), clip, None))
+
+
+def task_from(policy: Policy, **fields: Any) -> Task:
+    """The task of going on from a policy: its card's environment, filter and mixture, and settings
+    with its network's form. fields: of `Task`, in place of the card's.
+
+    Raises ValueError for an algorithm that begins with no policy, or one of another form.
+    """
+    card = policy.card
+    algo = fields.get("algo", "ppo")
+    scenarios = fields.get("scenarios", card.algorithm_options.get("scenarios", []))
+    known = {name: x for name, x in card.env_options.items() if not scenarios or name != "scenario"}
+    own = {"env_id": card.env_id, "env_options": known, "scenarios": scenarios}
+    own |= {"estimator": card.estimator, "estimator_options": dict(card.estimator_options)}
+    settings = fields.get("settings") or settings_of(algo, BEGUN)
+    form = _form_of(policy, algo)
+    settings = settings | {"policy_kwargs": settings.get("policy_kwargs", {}) | form}
+    return Task(**own | fields | {"settings": settings})
+
+
+def _form_of(policy: Policy, algo: str) -> dict[str, Any]:
+    """The `policy_kwargs` of a model whose actor is a policy's network."""
+    network, on_tensors = policy.network, algorithm_of(algo).on_tensors
+    kinds = [cell.kind for cell in network.cells]
+    if algo != "ppo" and not on_tensors:
+        raise ValueError(f"{algo} begins with a zip, not with policy {policy.name}")
+    form = network.output, network.history, kinds
+    if form != ("linear", 1, ["gru"] if on_tensors else []):
+        wanted = "a GRU" if on_tensors else "no cells"
+        raise ValueError(
+            f"{algo} goes on from dense layers without tanh at their end, {wanted} before them and "
+            f"no older frames; (output, history, cells) of {policy.name} are {form}"
+        )
+    if on_tensors and network.activation != "silu":
+        raise ValueError(f"{algo} goes on from layers of silu, not of {network.activation}")
+    sizes = {"net_arch": list(network.hidden)}
+    return sizes | (
+        {"cells": network.cells[0].size} if on_tensors else {"activation_fn": network.activation}
+    )
+
+
+def started_by(policy: Policy, task: Task, layout: Sequence[Entry]) -> Start:
+    """What the actor of a task's model begins with; its critic, if it has one, stays as it is.
+
+    layout: of the task's observation.
+    Raises ValueError for a policy of another form than the settings', or another observation.
+    """
+    network, seen = policy.network, [name for name, _ in policy.card.observation]
+    names = [entry.name for entry in layout]
+    if seen != names:
+        raise ValueError(f"{policy.name} reads {', '.join(seen)}; here there is {', '.join(names)}")
+    form, told = _form_of(policy, task.algo), task.settings.get("policy_kwargs", {})
+    if told != told | form:
+        raise ValueError(f"{policy.name} is a network of {form}, and the settings say {told}")
+    if network.cells:
+        cell = network.cells[0]
+        arrays = dict(zip(_GRU, (getattr(cell, part) for part in PARTS), strict=True))
+        layers = [f"layers.{2 * i}" for i in range(len(network.weights))]
+    else:
+        arrays, hidden = {}, range(len(network.hidden))
+        layers = [*(f"mlp_extractor.policy_net.{2 * i}" for i in hidden), "action_net"]
+    for layer, W, b in zip(layers, network.weights, network.biases, strict=True):
+        arrays |= {f"{layer}.weight": W, f"{layer}.bias": b}
+    tensors = {name: torch.tensor(x, dtype=torch.float32) for name, x in arrays.items()}
+    scaling = network.mean.tolist(), network.scale.tolist(), network.clip, None
+    return Start(Path(policy.name), {"policy": tensors}, {}, scaling, partial=True)
+
+
+def give(start: Start, model: Any) -> None:
+    """Give a model what it starts with; ValueError where that is of another network."""
+    kept = {
+        name: x
+        for name, x in model.get_parameters()["policy"].items()
+        if start.partial or "features_extractor." in name  # a zip from elsewhere has it outside
+    }
+    policy = kept | start.parameters["policy"]
+    try:
+        model.set_parameters(
+            {**model.get_parameters(), **start.parameters, "policy": policy}, device=model.device
+        )
+        for name, tensor in start.variables.items():
+            getattr(model, name).data.copy_(tensor)
+    except (AttributeError, KeyError, RuntimeError, ValueError) as error:
+        raise ValueError(
+            f"{start.path} holds other networks than this training's {type(model).__name__} (its "
+            f"settings say which): {' '.join(str(error).split())[:300]}"
+        ) from error
+
+
+class Driver:
+    """A network at the wheel, which reads its observation as it is: rows may be of any cars."""
+
+    def __init__(self, network: Network) -> None:
+        self.network = network
+
+    def predict(
+        self, obs: Any, state: Any = None, start: Any = None, deterministic: bool = True
+    ) -> tuple[Any, Any]:
+        """As stable-baselines3's: actions (N, m) within [-1, 1], and the next state."""
+        memory = np.zeros((len(obs), self.network.memory)) if state is None else state.copy()
+        if start is not None:
+            memory[np.asarray(start, np.bool_)] = 0.0
+        actions = self.network(np.asarray(obs, np.float64), memory)
+        return _bounded(actions), memory
+
+
+def _bounded(actions: npt.NDArray[np.float64]) -> npt.NDArray[np.float32]:
+    return np.clip(actions, -1.0, 1.0).astype(np.float32)

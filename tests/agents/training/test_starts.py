@@ -1,0 +1,160 @@
+"""A training goes on from a policy: it acts alike at first, and each drive weighs by its cost."""
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("stable_baselines3")
+import torch
+
+from sideslip.agents.learned.files import Policy, load_policy
+from sideslip.agents.rollout import FLOOR, costs_of
+from sideslip.agents.training.keeper import (
+    BEGUN_WITH,
+    CHECKPOINT,
+    Evaluation,
+    Keeper,
+    Means,
+    evaluation_seeds,
+)
+from sideslip.agents.training.rewards import Rated, Rates, paid_by
+from sideslip.agents.training.starts import Driver, started_by, task_from
+from sideslip.agents.training.task import Task
+from sideslip.agents.training.train import task_in, train
+from sideslip.agents.vec_env.env import make_vec_env
+from sideslip.envs.device import DeviceVectorEnv
+
+POLICY = load_policy("distill-coms-yaw")
+SHORT = {"scenario": {"base": "coms-slalom", "duration": 0.3}}
+COMS = {"vehicle": "coms", "nominal": "coms", "reference": "zero-slip"}
+FEW = {"num_envs": 4, "n_eval_envs": 4, "env_options": COMS | SHORT}
+
+
+def started(task: Task, folder: Path, policy: Policy = POLICY) -> Any:
+    return Keeper(task, folder, None, Means(), 16, policy).build(None)
+
+
+def test_the_task_is_that_of_the_card(tmp_path: Path) -> None:
+    card = POLICY.card
+    task = task_from(POLICY)
+    assert (task.env_id, task.estimator) == (card.env_id, card.estimator) and not task.scenarios
+    assert task.env_options == card.env_options and task.settings["n_steps"] == 64
+    assert task.settings["policy_kwargs"]["activation_fn"] == "silu"
+    mixed = task_from(POLICY, scenarios=["coms-slalom", "coms-step"], seed=3)
+    assert "scenario" not in mixed.env_options and mixed.seed == 3
+    with pytest.raises(ValueError, match="sac begins with a zip, not with policy distill-coms-yaw"):
+        task_from(POLICY, algo="sac")
+    with pytest.raises(ValueError, match=r"ppo goes on from .* of raw-car-yaw are .*'gru'"):
+        task_from(load_policy("raw-car-yaw"))
+    with pytest.raises(ValueError, match=r"gradient goes on from .* of distill-coms-yaw are .*"):
+        task_from(POLICY, algo="gradient")
+    tanh = dataclasses.replace(load_policy("raw-car-yaw").network, activation="tanh")
+    with pytest.raises(ValueError, match="gradient goes on from layers of silu, not of tanh"):
+        task_from(dataclasses.replace(POLICY, network=tanh), algo="gradient")
+
+
+def test_a_model_acts_as_the_policy_that_it_begins_with(tmp_path: Path) -> None:
+    task = task_from(POLICY, **FEW)
+    model, env = started(task, tmp_path), task.vector_env(4)
+    obs, _ = env.reset(seed=0)
+    for _ in range(20):
+        actions, _ = Driver(POLICY.network).predict(obs)
+        assert np.abs(model.predict(obs, deterministic=True)[0] - actions).max() < 1e-5
+        obs, *_ = env.step(actions)
+    assert np.ptp(actions) > 1e-4
+    assert model.policy.log_std.item() == pytest.approx(-1.2)
+
+
+def test_what_does_not_fit_is_named(tmp_path: Path) -> None:
+    task = task_from(POLICY, **FEW)
+    plain = dataclasses.replace(task, settings=Task().settings)
+    with pytest.raises(ValueError, match="'activation_fn': 'silu'}, and the settings say"):
+        started(plain, tmp_path)
+    raw = dataclasses.replace(task, estimator="", estimator_options={})
+    with pytest.raises(ValueError, match=r"distill-coms-yaw reads gyro, .*beta_hat.*; here there"):
+        started_by(POLICY, raw, raw.vector_env(1).unwrapped.layout)  # type: ignore[attr-defined]
+    kwargs = {"policy_kwargs": {"activation_fn": "nn.SiLU"}}
+    with pytest.raises(ValueError, match=r"unknown activation_fn 'nn\.SiLU'"):
+        Task(settings=Task().settings | kwargs)
+
+
+def test_each_drive_weighs_by_what_the_policy_pays_in_it() -> None:
+    """Driven by the policy itself, each whole drive is paid -1 a step in the mean, but for the
+    floor."""
+    task = task_from(POLICY, **FEW)
+    driver = Driver(POLICY.network)
+
+    def cars() -> Any:
+        options = task.options(4)
+        return make_vec_env(task.env_id, 4, estimator=task.around, env_kwargs=options)
+
+    table = paid_by(driver, cars(), 7, 100)  # an episode has 30
+    assert all(len(each) == 4 for each in table) and len({x for row in table for x in row}) == 12
+    rated, state = Rated(cars(), Rates(table)), None
+    rated.seed(7)
+    obs: Any = rated.reset()
+    start = np.ones(4, np.bool_)
+    paid, costs = np.zeros((4, 3)), np.zeros((4, 3))
+    for step in range(90):
+        actions, state = driver.predict(obs, state, start)
+        obs, rewards, start, infos = rated.step(actions)
+        paid[:, step // 30] -= rewards
+        if start.all():
+            costs[:, step // 30] = [-info["episode"]["r"] for info in infos]
+    assert start.all() and np.ptp(costs) > 0.5 * costs.mean()
+    assert paid == pytest.approx(30.0 * costs / (costs + FLOOR), rel=1e-4)
+
+
+def test_what_cars_meet_does_not_depend_on_who_drives_them_nor_on_what() -> None:
+    """Else a drive would have another drive's weight: episode after episode, on tensors too."""
+    task = task_from(POLICY, **FEW | {"estimator": "", "estimator_options": {}})
+    firsts = []
+    for action in (0.0, 1.0):
+        env: Any = task.vector_env(2)
+        obs, _ = env.reset(seed=[5, 6])
+        for _ in range(60):
+            obs, *_ = env.step(np.full((2, 1), action, np.float32))
+        firsts.append(obs)
+    assert np.array_equal(*firsts)
+    how = {"autoreset_mode": "SameStep", "dtype": "float32", **task.env_options}
+    cars: Any = DeviceVectorEnv.make(task.env_id, 2, **how)
+    seen, _ = cars.reset(seed=[5, 6])
+    for _ in range(60):
+        seen, *_ = cars.step(torch.zeros(2, 1))
+    assert np.abs(seen.numpy() - firsts[0]).max() < 1e-5
+
+
+def test_a_training_from_a_policy_goes_on_after_a_stop(tmp_path: Path) -> None:
+    settings = task_from(POLICY).settings | {"n_steps": 8, "batch_size": 16, "n_epochs": 1}
+    task = task_from(POLICY, settings=settings, **FEW)
+    found = train(task, 64, tmp_path, means=Means(eval_freq=32), trained_agent=POLICY)
+    first = found.evaluations[0]
+    assert first.of_start == pytest.approx(1.0, abs=1e-6) and found.best.of_start == min(
+        each.of_start or np.inf for each in found.evaluations
+    )
+    assert np.array_equal(load_policy(tmp_path / BEGUN_WITH).network.scale, POLICY.network.scale)
+    env, seeds = task.vector_env(4), evaluation_seeds(4)
+    start, now = (costs_of(env, each, seeds) for each in (Driver(POLICY.network), found.model))
+    ratio = np.exp(np.log((now + FLOOR) / (start + FLOOR)).mean())
+    assert found.evaluations[-1].of_start == pytest.approx(ratio, rel=1e-12)
+    assert ratio != 1.0 and task_in(tmp_path) == task
+    again = train(task, 96, tmp_path, resume=True)
+    assert again.evaluations[: len(found.evaluations)] == found.evaluations
+    assert again.evaluations[-1].of_start is not None
+    lines = (tmp_path / "curve.jsonl").read_text().splitlines()
+    assert json.loads(lines[0])["of_start"] == first.of_start
+    (tmp_path / CHECKPOINT).unlink()  # stopped before it had one: the folder begins anew
+    train(dataclasses.replace(task, settings=Task().settings), 1, tmp_path)
+    assert not (tmp_path / BEGUN_WITH).exists()
+
+
+def test_the_best_is_that_of_the_score_not_of_the_mean() -> None:
+    """A policy that saves much in the one dear drive and pays more in all others is no better."""
+    dearer = Evaluation(1, 1.0, cost=1.0, of_none=0.5, of_start=0.9)
+    cheaper = Evaluation(2, 1.0, cost=0.5, of_none=0.25, of_start=1.1)
+    assert min(dearer, cheaper, key=lambda each: each.judged) is dearer
+    assert Evaluation(1, 1.0, 1.0, 0.5).judged == 1.0
