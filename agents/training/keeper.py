@@ -17,12 +17,12 @@ from ..env_facts import layout_of
 from ..learned.card import Card
 from ..learned.files import Policy, save_policy
 from ..rollout import FLOOR, costs_of
-from ..vec_env.env import make_native_env, make_vec_env
+from ..vec_env.env import make_vec_env
 from .algorithms import algorithm_of, make_model, options_of, spread_of
 from .checkpoint import load_parameters, save_checkpoint
 from .export import network_from_sb3
 from .normalise import measured
-from .rewards import Rated, Rates, alike, cost_rates, paid_by
+from .rewards import Rated, Rates, alike, paid_by, weights_of
 from .starts import Driver, give, start_of, started_by
 from .task import Task
 
@@ -34,22 +34,11 @@ from stable_baselines3.common.vec_env import VecEnv  # isort: skip
 CHECKPOINT, CURVE = "checkpoint.safetensors", "curve.jsonl"
 POLICY, BEST, BEGUN_WITH = "policy.safetensors", "best_model.zip", "begun_with.safetensors"
 
-_ALONE = 32  # uncontrolled drives by which a scenario is weighed
 _MEASURED = 64  # environments whose observations make the scaling
 
 # No other seeds are as large: those of tests and of the calibration are below 2^63.
 _WEIGHING, _EVALUATION, _SCALING, _TRAINING = 2**63, 2**64, 2**65, 2**66
 _ROOM = 2**40  # seeds of a training: it takes those from its steps on when it starts or goes on
-
-
-def weights_of(task: Task) -> Array:
-    """Of each scenario's costs in the rewards, (k,)."""
-    k = len(task.scenarios)
-    if not k:
-        return np.ones(1)
-    rows = _ALONE * k
-    env = make_native_env(task.env_id, rows, None, task.options(rows))
-    return alike(cost_rates(env, k, _WEIGHING))
 
 
 def evaluation_seeds(episodes: int) -> list[int]:
@@ -149,7 +138,7 @@ class Keeper(BaseCallback):
             raise ValueError("the uncontrolled car costs nothing there: there is nothing to learn")
         self.alike = alike(none)
         self.none = float(np.mean(none * self.alike))
-        self.weights = weights_of(task)
+        self.weights = weights_of(task, _WEIGHING)
         self.begun_with = begun_with
         driver = None if begun_with is None else Driver(begun_with.network)
         self.start = None if driver is None else costs_of(self.tested, driver, self.seeds)
@@ -278,6 +267,10 @@ class Keeper(BaseCallback):
         described = options_of(task.algo, task.settings, self.period, task.num_envs)
         described |= {"num_envs": task.num_envs, "policy": task.settings["policy"]}
         described |= {"reads": task.reads} if task.reads else {}
+        if self.begun_with is not None:
+            before = self.begun_with.card.algorithm_options
+            described |= {"begun_with": self.begun_with.name}
+            described |= {"class": before["class"]} if "class" in before else {}
         mixture: dict[str, Any] = {}
         if task.scenarios:
             mixture = {"scenarios": task.scenarios, "weights": self.weights.round(3).tolist()}

@@ -10,17 +10,18 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from gymnasium.vector import VectorEnv
 
 from ...envs.backend.extras import extra
 from ..rollout import FLOOR, steps_of
-from ..vec_env.env import Observations
+from ..vec_env.env import Observations, make_native_env
+from .task import Task
 
 with extra("train", "training needs {}"):
     from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
 Array = npt.NDArray[np.float64]
 
+_ALONE = 32  # uncontrolled drives by which a scenario is weighed
 _LEAST = 0.05  # of the mean: a scenario that costs less uncontrolled weighs no more
 
 
@@ -29,17 +30,19 @@ def alike(costs: Array) -> Array:
     return np.asarray(costs.mean() / np.maximum(costs, _LEAST * costs.mean()))
 
 
-def cost_rates(env: VectorEnv[Any, Any, Any], scenarios: int, first: int) -> Array:
-    """What the uncontrolled car pays in a control period of each scenario, (k,).
-
-    env: its rows have the scenarios in turn. first: seed of row 0.
-    """
-    rows, k = env.num_envs, scenarios
+def weights_of(task: Task, first: int) -> Array:
+    """Of each scenario's costs, (k,), by what the uncontrolled car pays there in a control period;
+    one of a task without a mixture. first: of the seeds of those drives."""
+    k = len(task.scenarios)
+    if not k:
+        return np.ones(1)
+    rows = _ALONE * k
+    env = make_native_env(task.env_id, rows, None, task.options(rows))
     costs, steps = np.zeros(rows), -np.ones(rows)  # the first one is the reset
     for step in steps_of(env, None, [first + i for i in range(rows)]):
         costs -= np.where(step.running, step.reward, 0.0)
         steps += step.running
-    return np.array([costs[i::k].sum() / steps[i::k].sum() for i in range(k)])
+    return alike(np.array([costs[i::k].sum() / steps[i::k].sum() for i in range(k)]))
 
 
 class Rates:

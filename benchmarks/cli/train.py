@@ -12,6 +12,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 from rich.table import Table
 
 from ... import __version__
+from ...agents.learned.files import load_policy
 from ...envs.sensors.slow import SENSOR_SETS
 from .export import Trust
 from .names import check_env, complete
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from ...agents.training.train import Progress as Now
     from ...agents.training.train import Task, Trained
 
-EPISODES = 256  # of the policy's test
+EPISODES, CONTESTS = 256, 32  # of the policy's test, and of each contest of its class
 _Text = str | None
 
 
@@ -132,6 +133,9 @@ def train_command(
     shown = ", ".join(f"{name} {each['mean']:.4g}" for name, each in costs.items())
     where = f" of {task.scenarios[0]}, the mixture's first" if task.scenarios else ""
     console.print(f"mean cost on test seeds{where}: {shown}", highlight=False, soft_wrap=True)
+    kind = load_policy(folder / POLICY).card.algorithm_options.get("class")
+    if kind is not None:
+        console.print(_judged(folder / POLICY, kind, CONTESTS))
     wrote(console, folder / POLICY)
     wrote(console, folder / CURVE)
 
@@ -177,6 +181,19 @@ def _table(trained: "Trained") -> Table:
     return table
 
 
+def _judged(file: Path, kind: str, episodes: int) -> Table:
+    """What a policy costs in each contest of its class; its card has it too."""
+    from ..distillation import judge
+
+    table = Table("contest", "in % of nominal", "adaptive-nmpc", "better", "fails")
+    for contest, found in judge(file, kind, episodes)["cost in % of nominal"].items():
+        own, rival = found["policy"], found["adaptive-nmpc"]
+        better, fails = found["better than adaptive-nmpc"][0], found["fails"]
+        numbers = f"{own[0]:.0f} [{own[1]:.0f}, {own[2]:.0f}]", f"{rival[0]:.0f}"
+        table.add_row(contest, *numbers, f"{100.0 * better:.0f} %", f"{100.0 * fails:.0f} %")
+    return table
+
+
 def distill_command(
     name: Annotated[str, typer.Argument(help="Of the file NAME.safetensors.")],
     kind: Annotated[str, typer.Option("--class", help="Of contests, as coms-model.")],
@@ -211,7 +228,7 @@ def distill_command(
     """Distil a policy by DAgger; its card says what it costs in each contest, on unseen seeds."""
     from ...agents.training.distill import Round, distill
     from ...agents.training.student import Course
-    from ..distillation import card_of, judge, lessons_of
+    from ..distillation import card_of, lessons_of
 
     target, console = out or Path(f"{name}.safetensors"), Console()
     check_files(policy=target)
@@ -229,13 +246,7 @@ def distill_command(
         console.print(text, highlight=False)
 
     distill(card, lessons, course, target, show)
-    table = Table("contest", "in % of nominal", "adaptive-nmpc", "better", "fails")
-    for contest, found in judge(target, kind, episodes)["cost in % of nominal"].items():
-        own, rival = found["policy"], found["adaptive-nmpc"]
-        better, fails = found["better than adaptive-nmpc"][0], found["fails"]
-        numbers = f"{own[0]:.0f} [{own[1]:.0f}, {own[2]:.0f}]", f"{rival[0]:.0f}"
-        table.add_row(contest, *numbers, f"{100.0 * better:.0f} %", f"{100.0 * fails:.0f} %")
-    console.print(table)
+    console.print(_judged(target, kind, episodes))
     wrote(console, target)
 
 

@@ -13,7 +13,7 @@ from sideslip.agents.learned.files import load_policy
 from sideslip.agents.learned.policy import Learned
 from sideslip.agents.rollout import costs_of
 from sideslip.agents.training import keeper, train
-from sideslip.agents.training.rewards import alike
+from sideslip.agents.training.rewards import alike, weights_of
 from sideslip.agents.training.task import Task
 from sideslip.agents.training.train import POLICY, Means, task_in
 
@@ -92,8 +92,8 @@ def test_the_scenarios_of_a_mixture_weigh_alike(
 
 
 def test_weights_do_not_depend_on_the_evaluation_and_are_bounded() -> None:
-    found = keeper.weights_of(dataclasses.replace(TINY, scenarios=MIXTURE, n_eval_envs=2))
-    same = keeper.weights_of(dataclasses.replace(TINY, scenarios=MIXTURE))
+    found = weights_of(dataclasses.replace(TINY, scenarios=MIXTURE, n_eval_envs=2), 5)
+    same = weights_of(dataclasses.replace(TINY, scenarios=MIXTURE), 5)
     assert np.array_equal(found, same) and found[0] != found[1]
     assert alike(np.array([1e-9, 10.0]))[0] == pytest.approx(20.0)
     assert alike(np.array([4.0, 2.0])).tolist() == [0.75, 1.5]

@@ -4,6 +4,7 @@ import shlex
 import sys
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -137,10 +138,18 @@ def test_it_goes_on_from_a_distilled_policy_in_all_contests_of_its_class(
 ) -> None:
     monkeypatch.setattr(enjoy, "evaluate", lambda *_: None)
     monkeypatch.setattr(enjoy, "evaluation", lambda _: {"cost": {}})
+    asked: list[Any] = []
+
+    def judged(*about: Any) -> str:
+        asked.append(about)
+        return "judged"
+
+    monkeypatch.setattr(train_command, "_judged", judged)
     small = ("--num-envs", 7, "--n-eval-envs", 7, "--steps", 448, "--out", "on")
     status, out, err = run("-i", "distill-coms-yaw", *small)
     assert status == 0, err
-    assert "of its start's" in out and " 1.000" in out
+    assert "of its start's" in out and " 1.000" in out and "judged" in out
+    assert asked == [(Path("on") / train.POLICY, "coms-zero-slip", 32)]
     task = train.task_in("on")
     known = [each.scenario for each in contests_of("coms-zero-slip")]
     assert (task.scenarios, task.estimator) == (known, "joint")
