@@ -30,6 +30,8 @@ SHOWN: Mapping[str, tuple[str, str]] = {
     "`sliding-mode` on `exact-kf`": ("sliding-mode", REFERENCE_FILTER),
     "policy `distill-car-steering` on `joint`": ("distill-car-steering", "joint"),
     "policy `distill-car-yaw` on `joint`": ("distill-car-yaw", "joint"),
+    "policy `ppo-coms-yaw` on `joint`": ("ppo-coms-yaw", "joint"),
+    "policy `ppo-coms-steering` on `joint`": ("ppo-coms-steering", "joint"),
     "policy `distill-coms-yaw` on `joint`": ("distill-coms-yaw", "joint"),
     "policy `distill-coms-steering` on `joint`": ("distill-coms-steering", "joint"),
     "policy `raw-car-steering`, no filter": ("raw-car-steering", ""),

@@ -138,7 +138,7 @@ class Keeper(BaseCallback):
             raise ValueError("the uncontrolled car costs nothing there: there is nothing to learn")
         self.alike = alike(none)
         self.none = float(np.mean(none * self.alike))
-        self.weights = weights_of(task, _WEIGHING)
+        self.weights = np.ones(1) if begun_with else weights_of(task, _WEIGHING)
         self.begun_with = begun_with
         driver = None if begun_with is None else Driver(begun_with.network)
         self.start = None if driver is None else costs_of(self.tested, driver, self.seeds)
@@ -198,11 +198,11 @@ class Keeper(BaseCallback):
 
     def _rates(self, env: VecEnv, first: int, steps: int) -> Rates:
         """What is paid for the cars' costs, from this seed and step on."""
-        if self.begun_with is None:
-            rate = np.resize(self.weights, env.num_envs) / self.period
-            return Rates(rate[:, None].tolist())
-        each = -(-(self.aim.steps - steps) // env.num_envs)
-        return Rates(paid_by(Driver(self.begun_with.network), env, first, each))
+        if self.begun_with is not None:
+            each = -(-(self.aim.steps - steps) // env.num_envs)
+            return Rates(paid_by(Driver(self.begun_with.network), env, first, each))
+        rate = np.resize(self.weights, env.num_envs) / self.period
+        return Rates(rate[:, None].tolist())
 
     def _means(self, costs: Array) -> Array:
         """Of the evaluation's drives of each scenario, (k,)."""
@@ -273,7 +273,9 @@ class Keeper(BaseCallback):
             described |= {"class": before["class"]} if "class" in before else {}
         mixture: dict[str, Any] = {}
         if task.scenarios:
-            mixture = {"scenarios": task.scenarios, "weights": self.weights.round(3).tolist()}
+            mixture = {"scenarios": task.scenarios}
+        if task.scenarios and self.begun_with is None:
+            mixture["weights"] = self.weights.round(3).tolist()
         first = {"scenario": task.scenarios[0]} if task.scenarios else {}
         card = Card.of(
             task.env_id,

@@ -166,8 +166,10 @@ class _Bar(Progress):
         """Show where the training stands."""
         text = "" if now.cost is None else f"cost {now.cost:.3g} exploring, "
         last, best = now.evaluations[-1], min(now.evaluations, key=lambda each: each.judged)
-        text += f"of none's {last.of_none:.3f}, best {best.of_none:.3f}"
-        text += "" if last.of_start is None else f", of its start's {last.of_start:.3f}"
+        if last.of_start is None:
+            text += f"of none's {last.of_none:.3f}, best {best.of_none:.3f}"
+        else:
+            text += f"of its start's {last.of_start:.3f}, best {best.of_start:.3f}"
         self.update(self._task, completed=now.steps, description=text)
 
 

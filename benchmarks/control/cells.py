@@ -49,11 +49,11 @@ _CANDIDATES = tuple(name for those in ORACLES.values() for name in those)
 LEARNED: dict[str, tuple[tuple[str, str], ...]] = {
     "car-steering": (("joint", "distill-car-steering"), ("", "raw-car-steering")),
     "car-yaw": (("joint", "distill-car-yaw"), ("", "raw-car-yaw")),
-    "coms-model": (("joint", "distill-coms-steering"),),
-    "coms-zero-slip": (("joint", "distill-coms-yaw"),),
+    "coms-model": (("joint", "ppo-coms-steering"), ("joint", "distill-coms-steering")),
+    "coms-zero-slip": (("joint", "ppo-coms-yaw"), ("joint", "distill-coms-yaw")),
 }
-"""(estimator, policy) by the class of contests that the policy was trained on, by its shipped name
-or path."""
+"""(estimator, policy), the best one first, by the class of contests that the policy was trained on,
+by its shipped name or path."""
 SHARED = {
     ORACLES[PARAMETERS][0]: ("adaptive-lqr", {"grip", "steer_weight"}),
     ORACLES[PARAMETERS][1]: ("adaptive-nmpc", {"horizon", "grip", "steer_weight"}),

@@ -54,6 +54,8 @@ CONTROLLERS = {
     "learned": "#D8636C",
     "ppo-yaw-vision": "#AB6387",
     "ppo-exact-kf": "#8A4FBF",
+    "ppo-coms-steering": "#C2571A",
+    "ppo-coms-yaw": "#7A5FD0",
     "distill-coms-steering": "#8C6D1F",
     "distill-coms-yaw": "#2E8B9E",
     "distill-car-steering": "#B0603A",
