@@ -13,6 +13,7 @@ import numpy as np
 from ..agents.learned.card import Card, JsonMap
 from ..agents.learned.files import Policy, is_policy, load_policy, save_policy
 from ..envs.arguments import check_choice
+from ..envs.scenarios.manoeuvres import scenario_from
 from ..estimators.vector.estimate import EstimateObservation
 from .control.build import estimate_options, make_cars
 from .control.cells import ADAPTIVE, REFERENCE_FILTER, RUNGS, Cell
@@ -106,11 +107,13 @@ def lessons_of(
     return found
 
 
-def begun_with(agent: Path | None) -> "tuple[Path | Policy | None, Callable[..., Task]]":
-    """What `sideslip train -i` goes on from, and what makes its task of the fields that were said.
+def start_and_task(agent: Path | None) -> "tuple[Path | Policy | None, Callable[..., Task]]":
+    """What `sideslip train -i` begins with, and what makes its task of the fields that were said.
 
-    agent: a zip's path stays what it is; a distilled policy goes on in all contests of its class.
+    agent: a zip's path stays what it is; a distilled policy goes on in all contests of its class,
+    but for those with a driver where cars are driven on tensors: rows are of one kind there.
     """
+    from ..agents.training.algorithms import algorithm_of
     from ..agents.training.starts import task_from
     from ..agents.training.task import Task
 
@@ -122,7 +125,10 @@ def begun_with(agent: Path | None) -> "tuple[Path | Policy | None, Callable[...,
         kind = policy.card.algorithm_options.get("class")
         alone = "scenario" in fields.get("env_options", {})
         if kind is not None and "scenarios" not in fields and not alone:
-            fields["scenarios"] = [each.scenario for each in contests_of(kind)]
+            names = [each.scenario for each in contests_of(kind)]
+            if algorithm_of(fields.get("algo", "ppo")).on_tensors:
+                names = [each for each in names if scenario_from(each).steering != "driver"]
+            fields["scenarios"] = names
         return task_from(policy, **fields)
 
     return policy, going_on

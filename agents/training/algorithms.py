@@ -122,8 +122,10 @@ def check_settings(algo: str, settings: Any) -> None:
             raise ValueError(f"{name} is {{name: value}}, which is no code to run, got {value!r}")
         if name in _SCHEDULED:
             _schedule(name, value)
-    bend = settings.get("policy_kwargs", {}).get("activation_fn", "tanh")
-    check_choice("activation_fn", bend, tuple(activations()))
+    kwargs = settings.get("policy_kwargs", {})
+    if "activation_fn" in kwargs and algorithm_of(algo).on_tensors:
+        raise ValueError(f"the layers of {algo} are of silu: it has no activation_fn")
+    check_choice("activation_fn", kwargs.get("activation_fn", "tanh"), tuple(activations()))
     missing = [each for each in ("n_envs", "n_timesteps", "policy") if each not in settings]
     if missing:
         raise ValueError(f"no {', '.join(missing)}")

@@ -101,11 +101,12 @@ class Means:
 @dataclass(frozen=True)
 class Aim:
     """What a training was told besides its task: steps, those between two evaluations, the command
-    for the policy's card."""
+    for the policy's card, the name of the policy that it began with."""
 
     steps: int
     eval_freq: int
     command: str = ""
+    begun_with: str = ""
 
 
 class Keeper(BaseCallback):
@@ -126,9 +127,13 @@ class Keeper(BaseCallback):
     ) -> None:
         super().__init__()
         self.task, self.folder, self.means = task, folder, means
-        self.aim = Aim(steps, means.eval_freq, means.command)
+        name = "" if begun_with is None else begun_with.name
+        self.aim = Aim(steps, means.eval_freq, means.command, name)
         self.seeds = evaluation_seeds(task.n_eval_envs)
         self.tested = task.vector_env(task.n_eval_envs)
+        self.begun_with, self.first = begun_with, None
+        if begun_with is not None:
+            self.first = started_by(begun_with, task, layout_of(self.tested))
         base: Any = self.tested.unwrapped
         self.period: float = base.control_period * base.dt  # s
         saved = {} if checkpoint is None else checkpoint
@@ -139,7 +144,6 @@ class Keeper(BaseCallback):
         self.alike = alike(none)
         self.none = float(np.mean(none * self.alike))
         self.weights = np.ones(1) if begun_with else weights_of(task, _WEIGHING)
-        self.begun_with = begun_with
         driver = None if begun_with is None else Driver(begun_with.network)
         self.start = None if driver is None else costs_of(self.tested, driver, self.seeds)
         self.scaling: Any = saved.get("scaling")
@@ -159,8 +163,8 @@ class Keeper(BaseCallback):
         if trained_agent is not None:
             width = (self.tested.single_observation_space.shape or (0,))[0]
             start = start_of(trained_agent, width, trust)
-        elif self.begun_with is not None and checkpoint is None:
-            start = started_by(self.begun_with, task, layout_of(self.tested))
+        elif checkpoint is None:
+            start = self.first
         if start is not None:
             self.scaling = start.scaling
         if self.scaling is None:
@@ -270,7 +274,7 @@ class Keeper(BaseCallback):
         if self.begun_with is not None:
             before = self.begun_with.card.algorithm_options
             described |= {"begun_with": self.begun_with.name}
-            described |= {"class": before["class"]} if "class" in before else {}
+            described |= {"class": before["class"]} if "class" in before and task.scenarios else {}
         mixture: dict[str, Any] = {}
         if task.scenarios:
             mixture = {"scenarios": task.scenarios}

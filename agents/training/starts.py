@@ -6,13 +6,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from ...envs.task.observation import Entry
 from ...estimators.learned.memory import PARTS
 from ...estimators.learned.network import Network
 from ..learned.files import Policy
-from .algorithms import BEGUN, algorithm_of, settings_of
+from .algorithms import BEGUN, Settings, algorithm_of, settings_of
 from .export import normalisation
 from .normalise import Scaling
 from .task import Task
@@ -25,10 +24,11 @@ _GRU = [f"cell.{part}_l0" for part in ("weight_ih", "weight_hh", "bias_ih", "bia
 
 
 class Start(NamedTuple):
-    """Weights and optimisers, by their names in `get_parameters`, a zip's further tensors, the
-    scaling of what they read, and whether the rest of the model stays as it is."""
+    """A zip or policy by its name: weights and optimisers, by their names in `get_parameters`, a
+    zip's further tensors, the scaling of what they read, and whether the rest of the model stays
+    as it is."""
 
-    path: Path
+    name: str
     parameters: dict[str, Any]
     variables: dict[str, Any]
     scaling: Scaling
@@ -56,30 +56,50 @@ def start_of(path: str | Path, width: int, trust: bool = False) -> Start:
         bound = float(own["clip"])
         mixing = own["mixing"].tolist() if "mixing" in own else None
         numbers = own["mean"].tolist(), own["scale"].tolist(), bound if bound < math.inf else None
-        return Start(file, parameters, variables or {}, (*numbers, mixing))
+        return Start(str(file), parameters, variables or {}, (*numbers, mixing))
     beside = normaliser_of(file)
     if beside is not None and not trust:
         raise PermissionError(f"{beside} is a pickle, which may run code: say --trust to read it")
     mean, scale, clip = normalisation(unpickled(beside) if beside else None, width, 1)
-    return Start(file, parameters, variables or {}, (mean.tolist(), scale.tolist(), clip, None))
+    return Start(
+        str(file), parameters, variables or {}, (mean.tolist(), scale.tolist(), clip, None)
+    )
 
 
 def task_from(policy: Policy, **fields: Any) -> Task:
-    """The task of going on from a policy: its card's environment, filter and mixture, and settings
-    with its network's form. fields: of `Task`, in place of the card's.
+    """The task of going on from a policy: its card's environment, filter, reads and mixture, and
+    settings with its network's form.
+
+    fields: of `Task`, in place of the card's; but `env_options` come to the card's, with a scenario
+    instead of its mixture, and another estimator has no options of the card's.
 
     Raises ValueError for an algorithm that begins with no policy, or one of another form.
     """
-    card = policy.card
-    algo = fields.get("algo", "ppo")
-    scenarios = fields.get("scenarios", card.algorithm_options.get("scenarios", []))
-    known = {name: x for name, x in card.env_options.items() if not scenarios or name != "scenario"}
-    own = {"env_id": card.env_id, "env_options": known, "scenarios": scenarios}
-    own |= {"estimator": card.estimator, "estimator_options": dict(card.estimator_options)}
-    settings = fields.get("settings") or settings_of(algo, BEGUN)
+    card, algo = policy.card, fields.get("algo", "ppo")
+    options = dict(card.env_options) | fields.pop("env_options", {})
+    mixture = [] if options != card.env_options else card.algorithm_options.get("scenarios", [])
+    scenarios = fields.pop("scenarios", mixture)
+    if scenarios:
+        options.pop("scenario", None)
+    own: dict[str, Any] = {"env_id": card.env_id, "env_options": options, "scenarios": scenarios}
+    if fields.get("estimator", card.estimator) == card.estimator:
+        own |= {"estimator": card.estimator, "estimator_options": dict(card.estimator_options)}
+    settings = fields.pop("settings", None) or settings_of(algo, BEGUN)
+    own["settings"] = _formed(settings, policy, algo)
+    return Task(**own | fields)
+
+
+def settings_in(file: str | Path | None, algo: str, env_id: str, start: Any) -> Settings:
+    """Settings from a file, None for the package's own: of an environment, or, where start is a
+    policy, of going on from it, with its form. Raises as `settings_of` and `task_from`."""
+    if not isinstance(start, Policy):
+        return settings_of(algo, env_id, file)
+    return _formed(settings_of(algo, BEGUN, file), start, algo)
+
+
+def _formed(settings: Settings, policy: Policy, algo: str) -> Settings:
     form = _form_of(policy, algo)
-    settings = settings | {"policy_kwargs": settings.get("policy_kwargs", {}) | form}
-    return Task(**own | fields | {"settings": settings})
+    return settings | {"policy_kwargs": settings.get("policy_kwargs", {}) | form}
 
 
 def _form_of(policy: Policy, algo: str) -> dict[str, Any]:
@@ -127,7 +147,7 @@ def started_by(policy: Policy, task: Task, layout: Sequence[Entry]) -> Start:
         arrays |= {f"{layer}.weight": W, f"{layer}.bias": b}
     tensors = {name: torch.tensor(x, dtype=torch.float32) for name, x in arrays.items()}
     scaling = network.mean.tolist(), network.scale.tolist(), network.clip, None
-    return Start(Path(policy.name), {"policy": tensors}, {}, scaling, partial=True)
+    return Start(policy.name, {"policy": tensors}, {}, scaling, partial=True)
 
 
 def give(start: Start, model: Any) -> None:
@@ -146,7 +166,7 @@ def give(start: Start, model: Any) -> None:
             getattr(model, name).data.copy_(tensor)
     except (AttributeError, KeyError, RuntimeError, ValueError) as error:
         raise ValueError(
-            f"{start.path} holds other networks than this training's {type(model).__name__} (its "
+            f"{start.name} holds other networks than this training's {type(model).__name__} (its "
             f"settings say which): {' '.join(str(error).split())[:300]}"
         ) from error
 
@@ -165,8 +185,4 @@ class Driver:
         if start is not None:
             memory[np.asarray(start, np.bool_)] = 0.0
         actions = self.network(np.asarray(obs, np.float64), memory)
-        return _bounded(actions), memory
-
-
-def _bounded(actions: npt.NDArray[np.float64]) -> npt.NDArray[np.float32]:
-    return np.clip(actions, -1.0, 1.0).astype(np.float32)
+        return np.clip(actions, -1.0, 1.0).astype(np.float32), memory

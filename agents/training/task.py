@@ -99,3 +99,11 @@ class Task:
         numbers = {"--steps": steps, "--seed": self.seed, "--num-envs": self.num_envs}
         numbers |= {"--n-eval-envs": self.n_eval_envs}
         return words + [word for name, value in numbers.items() for word in (name, str(value))]
+
+    def named(self, start: str = "") -> str:
+        """A name for its folder, and of what it begins with."""
+        given = self.env_options.items()
+        options = [each if isinstance(each, str) else name for name, each in given]
+        options += ["mixture"] if self.scenarios else []
+        words = [self.env_id.rpartition("/")[2], self.algo, self.estimator, *options, start]
+        return "-".join(["train", *filter(None, words), str(self.seed)])

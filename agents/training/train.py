@@ -2,10 +2,11 @@
 
 A training's folder holds `checkpoint.safetensors` (what `resume` needs), `policy.safetensors` (the
 network of the best evaluation, with its card), `best_model.zip` (the same model in
-stable-baselines3's format) and `curve.jsonl` (the evaluations).
+stable-baselines3's format), `curve.jsonl` (the evaluations), and `begun_with.safetensors` where it
+began with a policy.
 """
 
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -14,7 +15,7 @@ from typing import Any, NamedTuple
 from ... import __version__
 from ...envs.documents import made_of
 from ..learned.card import check_names_no_code
-from ..learned.files import Policy, load_policy, save_policy
+from ..learned.files import Policy, is_policy, load_policy, save_policy
 from .checkpoint import read_state
 from .keeper import (
     BEGUN_WITH,
@@ -69,9 +70,9 @@ def train(
     evaluations are those of the checkpoint, episodes are new; a replay buffer begins empty and is
     filled as at the start, by `learning_starts` steps of random actions, before weights change.
     trained_agent: a zip of stable-baselines3 whose weights a new training begins with; or, for
-    `ppo` and `gradient`, a `Policy` (`task_from` makes its task). Each drive then weighs by what
-    the policy pays in it, and the best evaluation is that of the least geometric mean over the
-    policy's costs. trust: of `starts.start_of`.
+    `ppo` and `gradient`, a `Policy` or its name (`task_from` makes its task). Each drive then
+    weighs by what the policy pays in it, and the best evaluation is that of the least geometric
+    mean over the policy's costs. trust: of `starts.start_of`.
 
     Raises ValueError where the folder holds another training, FileNotFoundError where there is
     none to go on with, FloatingPointError, with the step, where weights are not finite any more
@@ -82,9 +83,11 @@ def train(
         raise ValueError(f"steps is at least 1, got {steps}")
     if trained_agent is not None:
         if resume:
-            raise ValueError("a training goes on from its checkpoint or from a zip, not from both")
+            raise ValueError("a training that goes on from its checkpoint begins with nothing else")
         if task.reads:
             raise ValueError("a network reads what it was trained on: give reads or a network")
+        if isinstance(trained_agent, str) and is_policy(trained_agent):
+            trained_agent = load_policy(trained_agent)
         if not isinstance(trained_agent, Policy):
             check_zip(Path(trained_agent), trust=True)
     if how.tensorboard_log is not None and find_spec("tensorboard") is None:
@@ -115,16 +118,28 @@ def train(
     return Trained(model, tuple(keeper.evaluations))
 
 
+def start_in(folder: str | Path) -> Policy | None:
+    """The policy that a folder's training began with, None for another training.
+
+    Raises as `task_in`, and FileNotFoundError where its copy is not in the folder any more.
+    """
+    name, file = aim_in(folder).begun_with, Path(folder) / BEGUN_WITH
+    if not name:
+        return None
+    if not file.is_file():
+        raise FileNotFoundError(f"{file}: the training began with policy {name}, and needs it")
+    return replace(load_policy(file), name=name)
+
+
 def _begun_with(folder: Path, resume: bool, agent: Any) -> Policy | None:
     """The policy that a training began with; a copy of it stays in the folder."""
-    file = folder / BEGUN_WITH
     if resume:
-        return load_policy(file) if file.is_file() else None
-    file.unlink(missing_ok=True)  # of a training that never came to its first evaluation
-    if isinstance(agent, Policy):
-        save_policy(file, agent.network, agent.card)
-        return agent
-    return None
+        return start_in(folder)
+    if not isinstance(agent, Policy):
+        (folder / BEGUN_WITH).unlink(missing_ok=True)  # of one that had no evaluation yet
+        return None
+    save_policy(folder / BEGUN_WITH, agent.network, agent.card)
+    return agent
 
 
 def aim_in(folder: str | Path) -> Aim:

@@ -20,7 +20,7 @@ from .output import check_files, command_line, options_of, wrote
 
 if TYPE_CHECKING:
     from ...agents.training.train import Progress as Now
-    from ...agents.training.train import Task, Trained
+    from ...agents.training.train import Trained
 
 EPISODES, CONTESTS = 256, 32  # of the policy's test, and of each contest of its class
 _Text = str | None
@@ -90,9 +90,9 @@ def train_command(
 
     With --resume the options left out are those of the training in the folder.
     """
-    from ...agents.training.algorithms import settings_of
-    from ...agents.training.train import CURVE, POLICY, Aim, Means, aim_in, task_in, train
-    from ..distillation import begun_with
+    from ...agents.training.starts import settings_in
+    from ...agents.training.train import CURVE, POLICY, Aim, Means, aim_in, start_in, task_in, train
+    from ..distillation import start_and_task
     from ..policies import evaluate, evaluation
 
     options: dict[str, Any] = {
@@ -110,11 +110,12 @@ def train_command(
     options = {name: value for name, value in options.items() if value is not None}
     if env is not None:
         check_env(env)
-    agent, new = begun_with(trained_agent)
+    agent, new = start_and_task(trained_agent)
     task = task_in(out) if resume and out else new(**options)
+    folder = out or Path(task.named("" if trained_agent is None else trained_agent.stem))
     if conf_file is not None:
-        options["settings"] = settings_of(task.algo, task.env_id, conf_file)
-    folder = out or Path(_name_of(task))
+        start = start_in(folder) if resume else agent
+        options["settings"] = settings_in(conf_file, task.algo, task.env_id, start)
     task = task_in(folder, **options) if resume else new(**options)
     aim = aim_in(folder) if resume else Aim(int(task.settings["n_timesteps"]), Means.eval_freq, "")
     steps = aim.steps if steps is None else steps
@@ -129,23 +130,16 @@ def train_command(
         means = Means(eval_freq, device, tensorboard_log, bar.show, command, project)
         trained = train(task, steps, folder, resume, means, agent, trust)
     console.print(_table(trained))
-    costs = evaluation(evaluate(folder / POLICY, EPISODES))["cost"]
-    shown = ", ".join(f"{name} {each['mean']:.4g}" for name, each in costs.items())
-    where = f" of {task.scenarios[0]}, the mixture's first" if task.scenarios else ""
-    console.print(f"mean cost on test seeds{where}: {shown}", highlight=False, soft_wrap=True)
     kind = load_policy(folder / POLICY).card.algorithm_options.get("class")
     if kind is not None:
         console.print(_judged(folder / POLICY, kind, CONTESTS))
+    else:
+        costs = evaluation(evaluate(folder / POLICY, EPISODES))["cost"]
+        shown = ", ".join(f"{name} {each['mean']:.4g}" for name, each in costs.items())
+        where = f" of {task.scenarios[0]}, the mixture's first" if task.scenarios else ""
+        console.print(f"mean cost on test seeds{where}: {shown}", highlight=False, soft_wrap=True)
     wrote(console, folder / POLICY)
     wrote(console, folder / CURVE)
-
-
-def _name_of(task: "Task") -> str:
-    """The folder of a task without --out."""
-    options = [each if isinstance(each, str) else name for name, each in task.env_options.items()]
-    options += ["mixture"] if task.scenarios else []
-    words = [task.env_id.rpartition("/")[2], task.algo, task.estimator, *options]
-    return "-".join(["train", *filter(None, words), str(task.seed)])
 
 
 class _Bar(Progress):

@@ -7,10 +7,19 @@ import numpy as np
 import pytest
 
 pytest.importorskip("torch")
+from sideslip.agents.learned.files import Policy
+from sideslip.agents.training.task import Task
 from sideslip.benchmarks import distillation
 from sideslip.benchmarks.control.cells import ADAPTIVE
 from sideslip.benchmarks.control.contests import contests
-from sideslip.benchmarks.distillation import FILTERS, VARIED, card_of, contests_of, lessons_of
+from sideslip.benchmarks.distillation import (
+    FILTERS,
+    VARIED,
+    card_of,
+    contests_of,
+    lessons_of,
+    start_and_task,
+)
 from sideslip.envs.vehicle.vehicles import VEHICLES
 from tests.benchmarks.conftest import Run
 
@@ -111,3 +120,20 @@ def test_a_distillation_that_cannot_be_is_one_line(
     monkeypatch.chdir(tmp_path)
     status, _, err = run("distill", "mine", *arguments)
     assert status == 2 and said in err and not list(tmp_path.iterdir())
+
+
+def test_a_policy_goes_on_in_the_contests_that_its_algorithm_can_drive() -> None:
+    """All of its class, but on tensors those of one kind of plant."""
+    policy, task = start_and_task(Path("raw-car-yaw"))
+    assert isinstance(policy, Policy)
+    names = [each.scenario for each in contests_of("car-yaw")]
+    driven = task(algo="gradient").scenarios
+    assert len(driven) == 8 and set(names) - set(driven) == {
+        "car-iso-3888-1",
+        "any-friction-iso-3888-1",
+    }
+    alone = task(algo="gradient", env_options={"scenario": "car-step"})
+    assert not alone.scenarios and alone.env_options["vehicle"] == "passenger-car"
+    assert start_and_task(Path("distill-car-yaw"))[1]().scenarios == names
+    assert start_and_task(None) == (None, Task)
+    assert start_and_task(Path("here/best_model.zip")) == (Path("here/best_model.zip"), Task)

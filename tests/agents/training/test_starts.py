@@ -10,9 +10,12 @@ import pytest
 
 pytest.importorskip("stable_baselines3")
 import torch
+from stable_baselines3.common.logger import configure
 
 from sideslip.agents.learned.files import Policy, load_policy
 from sideslip.agents.rollout import FLOOR, costs_of
+from sideslip.agents.training import keeper
+from sideslip.agents.training.algorithms import HYPERPARAMS
 from sideslip.agents.training.keeper import (
     BEGUN_WITH,
     CHECKPOINT,
@@ -22,9 +25,9 @@ from sideslip.agents.training.keeper import (
     evaluation_seeds,
 )
 from sideslip.agents.training.rewards import Rated, Rates, paid_by
-from sideslip.agents.training.starts import Driver, started_by, task_from
+from sideslip.agents.training.starts import Driver, settings_in, task_from
 from sideslip.agents.training.task import Task
-from sideslip.agents.training.train import task_in, train
+from sideslip.agents.training.train import start_in, task_in, train
 from sideslip.agents.vec_env.env import make_vec_env
 from sideslip.envs.device import DeviceVectorEnv
 
@@ -46,6 +49,12 @@ def test_the_task_is_that_of_the_card(tmp_path: Path) -> None:
     assert task.settings["policy_kwargs"]["activation_fn"] == "silu"
     mixed = task_from(POLICY, scenarios=["coms-slalom", "coms-step"], seed=3)
     assert "scenario" not in mixed.env_options and mixed.seed == 3
+    one = task_from(load_policy("ppo-coms-yaw"), env_options={"scenario": "coms-step"})
+    assert one.env_options == COMS | {"scenario": "coms-step"} and not one.scenarios
+    assert len(task_from(load_policy("ppo-coms-yaw")).scenarios) == 7
+    for other in ("exact-kf", ""):
+        behind = task_from(POLICY, estimator=other)
+        assert (behind.estimator, behind.estimator_options) == (other, {})
     with pytest.raises(ValueError, match="sac begins with a zip, not with policy distill-coms-yaw"):
         task_from(POLICY, algo="sac")
     with pytest.raises(ValueError, match=r"ppo goes on from .* of raw-car-yaw are .*'gru'"):
@@ -70,16 +79,27 @@ def test_a_model_acts_as_the_policy_that_it_begins_with(tmp_path: Path) -> None:
 
 
 def test_what_does_not_fit_is_named(tmp_path: Path) -> None:
+    """Before anybody drives."""
     task = task_from(POLICY, **FEW)
     plain = dataclasses.replace(task, settings=Task().settings)
     with pytest.raises(ValueError, match="'activation_fn': 'silu'}, and the settings say"):
         started(plain, tmp_path)
     raw = dataclasses.replace(task, estimator="", estimator_options={})
     with pytest.raises(ValueError, match=r"distill-coms-yaw reads gyro, .*beta_hat.*; here there"):
-        started_by(POLICY, raw, raw.vector_env(1).unwrapped.layout)  # type: ignore[attr-defined]
+        started(raw, tmp_path)
     kwargs = {"policy_kwargs": {"activation_fn": "nn.SiLU"}}
     with pytest.raises(ValueError, match=r"unknown activation_fn 'nn\.SiLU'"):
         Task(settings=Task().settings | kwargs)
+    kwargs = {"policy_kwargs": {"activation_fn": "silu"}}
+    with pytest.raises(ValueError, match="the layers of gradient are of silu: it has no activ"):
+        Task(algo="gradient", settings=Task(algo="gradient").settings | kwargs)
+
+
+def test_a_file_of_settings_has_an_entry_for_going_on() -> None:
+    file = HYPERPARAMS / "ppo.yml"
+    assert settings_in(file, "ppo", "sideslip/YawVision-v0", POLICY)["n_steps"] == 64
+    assert settings_in(file, "ppo", "sideslip/YawVision-v0", None)["n_steps"] == 32
+    assert settings_in(None, "ppo", "", POLICY) == task_from(POLICY).settings
 
 
 def test_each_drive_weighs_by_what_the_policy_pays_in_it() -> None:
@@ -107,6 +127,49 @@ def test_each_drive_weighs_by_what_the_policy_pays_in_it() -> None:
             costs[:, step // 30] = [-info["episode"]["r"] for info in infos]
     assert start.all() and np.ptp(costs) > 0.5 * costs.mean()
     assert paid == pytest.approx(30.0 * costs / (costs + FLOOR), rel=1e-4)
+
+
+@pytest.mark.parametrize("algo, name", [("ppo", "distill-coms-yaw"), ("gradient", "raw-car-yaw")])
+@pytest.mark.parametrize("steps", [0, 96])
+def test_what_a_training_drives_is_what_the_policy_drove(
+    algo: str, name: str, steps: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Driven by the policy, each drive of the training's own cars is paid -1 a step in the mean."""
+    policy = load_policy(name)
+    car = {name: x for name, x in policy.card.env_options.items() if name != "scenario"}
+    base = "coms-slalom" if algo == "ppo" else "car-step"
+    options = car | {"scenario": {"base": base, "duration": 0.3}}
+    more: dict[str, Any] = {"num_envs": 4, "n_eval_envs": 4, "env_options": options}
+    task = task_from(policy, algo=algo, **more)
+    monkeypatch.setattr(keeper, "load_parameters", lambda *_: None)
+    network, saved = policy.network, None
+    if steps:
+        scaling = network.mean.tolist(), network.scale.tolist(), network.clip, None
+        saved = {"steps": steps, "scaling": scaling, "evaluations": []}
+    model: Any = Keeper(task, tmp_path, saved, Means(), 400, policy).build(saved)
+    driver, cars = Driver(network), model.get_env()
+    paid, costs, state, start = np.zeros(4), np.zeros(4), None, np.ones(4, np.bool_)
+    if algo == "gradient":
+        tensors, seeds, rates = model.source(device="cpu", compile=False)
+        obs, _ = tensors.reset(seed=seeds)
+        rates.begin()
+    else:
+        obs = cars.reset()
+    for step in range(60):  # two drives
+        actions, state = driver.predict(np.asarray(obs), state, start)
+        if algo == "gradient":
+            obs, rewards, start, truncated, _ = tensors.step(torch.from_numpy(actions))
+            start = (start | truncated).numpy()
+            rewards = rewards.numpy()
+            paid, costs = paid - rewards * rates.now, costs - rewards
+            rates.ended(start)
+        else:
+            obs, rewards, start, infos = cars.step(actions)
+            paid -= rewards
+            costs = np.array([-i["episode"]["r"] for i in infos]) if start.all() else costs
+        if step % 30 == 29:
+            assert start.all() and paid == pytest.approx(30.0 * costs / (costs + FLOOR), rel=3e-3)
+            paid, costs = np.zeros(4), np.zeros(4)
 
 
 def test_what_cars_meet_does_not_depend_on_who_drives_them_nor_on_what() -> None:
@@ -143,18 +206,30 @@ def test_a_training_from_a_policy_goes_on_after_a_stop(tmp_path: Path) -> None:
     assert found.evaluations[-1].of_start == pytest.approx(ratio, rel=1e-12)
     assert ratio != 1.0 and task_in(tmp_path) == task
     again = train(task, 96, tmp_path, resume=True)
+    card = load_policy(tmp_path / "policy.safetensors").card
+    assert card.algorithm_options["begun_with"] == "distill-coms-yaw"
+    assert start_in(tmp_path) is not None
     assert again.evaluations[: len(found.evaluations)] == found.evaluations
     assert again.evaluations[-1].of_start is not None
     lines = (tmp_path / "curve.jsonl").read_text().splitlines()
     assert json.loads(lines[0])["of_start"] == first.of_start
+    (tmp_path / BEGUN_WITH).rename(tmp_path / "aside")
+    with pytest.raises(FileNotFoundError, match="began with policy distill-coms-yaw, and needs it"):
+        train(task, 128, tmp_path, resume=True)
+    (tmp_path / "aside").rename(tmp_path / BEGUN_WITH)
     (tmp_path / CHECKPOINT).unlink()  # stopped before it had one: the folder begins anew
     train(dataclasses.replace(task, settings=Task().settings), 1, tmp_path)
     assert not (tmp_path / BEGUN_WITH).exists()
 
 
-def test_the_best_is_that_of_the_score_not_of_the_mean() -> None:
-    """A policy that saves much in the one dear drive and pays more in all others is no better."""
-    dearer = Evaluation(1, 1.0, cost=1.0, of_none=0.5, of_start=0.9)
-    cheaper = Evaluation(2, 1.0, cost=0.5, of_none=0.25, of_start=1.1)
-    assert min(dearer, cheaper, key=lambda each: each.judged) is dearer
-    assert Evaluation(1, 1.0, 1.0, 0.5).judged == 1.0
+@pytest.mark.parametrize("ratio, kept", [(2.0, True), (0.5, False)])
+def test_the_best_is_that_of_the_score_not_of_the_mean(
+    ratio: float, kept: bool, tmp_path: Path
+) -> None:
+    """An older evaluation is beaten by its ratio to the start, whatever its cost was."""
+    other = Keeper(task_from(POLICY, **FEW), tmp_path, None, Means(), 16, POLICY)
+    other.build(None).set_logger(configure(None, []))
+    cost = 0.0 if kept else 1e9
+    other.evaluations.append(Evaluation(0, 0.0, cost=cost, of_none=cost, of_start=ratio))
+    other.evaluate()
+    assert (tmp_path / "policy.safetensors").exists() is kept

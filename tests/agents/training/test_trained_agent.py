@@ -94,7 +94,7 @@ def test_what_no_training_can_begin_with_is_refused(tmp_path: Path) -> None:
         with pytest.raises(kind, match=said):
             train.train(TASK, 128, tmp_path / "new", trained_agent=arguments[0])
     assert not (tmp_path / "new" / train.CHECKPOINT).exists()
-    with pytest.raises(ValueError, match="from its checkpoint or from a zip, not from both"):
+    with pytest.raises(ValueError, match="goes on from its checkpoint begins with nothing else"):
         train.train(TASK, 128, tmp_path / "new", resume=True, trained_agent=zipped)
     reading = dataclasses.replace(TASK, reads=["gyro"])  # of which the zip's network knows nothing
     with pytest.raises(ValueError, match="give reads or a network"):

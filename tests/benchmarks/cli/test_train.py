@@ -39,7 +39,7 @@ def test_the_policys_card_says_how_it_was_made_and_what_it_costs(run: Run) -> No
     assert shlex.split(card.command)[1:] == [
         "train", "--algo", "ppo", "--env", "sideslip/YawVision-v0",
         "--option", "scenario=sine-with-dwell", "--steps", "256", "--seed", "0", "--num-envs", "8",
-        "--n-eval-envs", "256", "--eval-freq", "250000",
+        "--n-eval-envs", "4", "--eval-freq", "250000",
     ]  # fmt: skip
     costs = card.evaluation["cost"]
     assert card.evaluation["salt"] and len(costs) == 3
@@ -130,7 +130,8 @@ def test_the_command_of_a_card_says_what_the_filter_was(run: Run) -> None:
 
 def test_the_folder_is_named_by_what_is_trained() -> None:
     task = train.Task("sideslip/YawGps-v0", "ppo", "dakf", {"scenario": "gust"}, 7)
-    assert train_command._name_of(task) == "train-YawGps-v0-ppo-dakf-gust-7"
+    assert task.named() == "train-YawGps-v0-ppo-dakf-gust-7"
+    assert task.named("mine") == "train-YawGps-v0-ppo-dakf-gust-mine-7"
 
 
 def test_it_goes_on_from_a_distilled_policy_in_all_contests_of_its_class(
