@@ -76,6 +76,13 @@ def costs_of(
     return costs
 
 
+def cost_ratios(
+    costs: npt.NDArray[np.float64], others: npt.NDArray[np.float64]
+) -> npt.NDArray[np.float64]:
+    """Costs over others' on the same seeds, (N,), as every score compares them."""
+    return np.asarray((costs + FLOOR) / (others + FLOOR))
+
+
 _UNITS = {
     "s": "t",
     "rad": "beta psi beta_ref steer phi",

@@ -18,7 +18,7 @@ from rich.table import Table
 
 from ..agents.learned.files import load_policy
 from ..agents.learned.policy import Learned
-from ..agents.rollout import FLOOR, costs_of
+from ..agents.rollout import cost_ratios, costs_of
 from ..agents.rungs import NOMINAL, make_rung
 from ..agents.training.keeper import CURVE, POLICY, evaluation_seeds
 from ..agents.training.train import Task, task_in
@@ -67,7 +67,7 @@ def further(folders: Sequence[str | Path], episodes: int = EPISODES) -> Table:
         env = own.vector_env(min(episodes, _AT_ONCE))
         costs = _driven(env, Learned(env, load_policy(folder / POLICY)), seeds)
         ratio = interval(costs, ratio_of_means, nominal)
-        logs = geometric_mean(np.log((costs + FLOOR) / (nominal + FLOOR)))
+        logs = geometric_mean(np.log(cost_ratios(costs, nominal)))
         level += ratio.low <= 1.0
         spent = json.loads((folder / CURVE).read_text().splitlines()[-1])["cpu_seconds"]
         shown = (f"{each.value:.3f} [{each.low:.3f}, {each.high:.3f}]" for each in (ratio, logs))

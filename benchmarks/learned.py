@@ -14,7 +14,7 @@ import numpy as np
 from rich.console import Console
 
 from .. import __version__
-from ..agents.rollout import FLOOR
+from ..agents.rollout import cost_ratios
 from ..envs.record import Array
 from .control.cells import ADAPTIVE, CONTROLLERS, LEARNED, REFERENCE_FILTER, Cell
 from .control.contests import NOMINAL, PARAMETERS, Contest, changed, contests
@@ -106,7 +106,7 @@ class Found:
     def ratios(self, name: str) -> Array:
         """Cost over nominal's, of each episode in all conditions and contests; infinite where it
         ended by a failure."""
-        ratios = (self.costs(name) + FLOOR) / (self.costs(NOMINAL) + FLOOR)
+        ratios = cost_ratios(self.costs(name), self.costs(NOMINAL))
         return np.where(self.failed(name), np.inf, ratios)
 
     def costs(self, name: str) -> Array:
@@ -198,7 +198,7 @@ def _tabled(suite: Suite, found: Found) -> None:
         mine = {condition: found.shared(who, condition) for condition in found.driven}
         shares.append([who, *map(_shown, mine.values())])
         costs = found.costs(who)
-        ratio = worst((costs + FLOOR) / (found.costs(NOMINAL) + FLOOR)).value
+        ratio = worst(cost_ratios(costs, found.costs(NOMINAL))).value
         beaten = [
             "" if who == rival else f"{100.0 * won(costs, found.costs(rival)).value:.0f} %"
             for rival in rivals

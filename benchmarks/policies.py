@@ -14,7 +14,7 @@ import numpy as np
 from .. import __version__
 from ..agents.learned.card import JsonMap
 from ..agents.learned.files import Policy, load_policy, save_policy
-from ..agents.rollout import FLOOR
+from ..agents.rollout import cost_ratios
 from .control.cells import Cell
 from .control.contests import Contest
 from .control.episodes import Array, Chunk, Driven, drive
@@ -145,7 +145,7 @@ def _verdict(found: Enjoyed) -> str:
     fails = 100.0 * np.mean(found.driven[name]["failure"] != 0.0)
     lines = []
     for other in others:
-        logs = np.log((found.costs(name) + FLOOR) / (found.costs(other) + FLOOR))
+        logs = np.log(cost_ratios(found.costs(name), found.costs(other)))
         lines.append(f"{name} costs {percent(geometric_mean(logs))} of {other}, seed by seed.")
     limits = f"Not said: other cars, scenarios and seeds than these {len(found.seeds)}."
     return verdict(*lines, f"It fails in {fails:.0f} % of the episodes. {limits}")

@@ -8,7 +8,7 @@ import numpy as np
 
 from ...envs.backend.extras import extra
 from ...estimators.learned.memory import Cell
-from ...estimators.learned.network import Network
+from ...estimators.learned.network import ACTIVATIONS, Network
 
 _PRIOR = 1e-4  # samples that a VecNormalize starts with, of mean 0 and variance 1
 
@@ -142,7 +142,7 @@ def activations() -> dict[str, type]:
     from torch import nn
 
     kinds = nn.Tanh, nn.ReLU, nn.ELU, nn.LeakyReLU, nn.SiLU
-    return dict(zip(("tanh", "relu", "elu", "leaky-relu", "silu"), kinds, strict=True))
+    return dict(zip(ACTIVATIONS, kinds, strict=True))
 
 
 def _dense(layers: list[Any]) -> tuple[list[Any], list[Any], list[str], str]:

@@ -16,7 +16,7 @@ from ...envs.record import Array
 from ..env_facts import layout_of
 from ..learned.card import Card
 from ..learned.files import Policy, save_policy
-from ..rollout import FLOOR, costs_of
+from ..rollout import cost_ratios, costs_of
 from ..vec_env.env import make_vec_env
 from .algorithms import algorithm_of, make_model, options_of, spread_of
 from .checkpoint import load_parameters, save_checkpoint
@@ -131,9 +131,9 @@ class Keeper(BaseCallback):
         self.aim = Aim(steps, means.eval_freq, means.command, name)
         self.seeds = evaluation_seeds(task.n_eval_envs)
         self.tested = task.vector_env(task.n_eval_envs)
-        self.begun_with, self.first = begun_with, None
+        self.begun_with, self.start = begun_with, None
         if begun_with is not None:
-            self.first = started_by(begun_with, task, layout_of(self.tested))
+            self.start = started_by(begun_with, task, layout_of(self.tested))
         base: Any = self.tested.unwrapped
         self.period: float = base.control_period * base.dt  # s
         saved = {} if checkpoint is None else checkpoint
@@ -145,7 +145,7 @@ class Keeper(BaseCallback):
         self.none = float(np.mean(none * self.alike))
         self.weights = np.ones(1) if begun_with else weights_of(task, _WEIGHING)
         driver = None if begun_with is None else Driver(begun_with.network)
-        self.start = None if driver is None else costs_of(self.tested, driver, self.seeds)
+        self.to_beat = None if driver is None else costs_of(self.tested, driver, self.seeds)
         self.scaling: Any = saved.get("scaling")
         self.spent = self.evaluations[-1].cpu_seconds if self.evaluations else 0.0
         self.since = time.process_time()
@@ -164,7 +164,7 @@ class Keeper(BaseCallback):
             width = (self.tested.single_observation_space.shape or (0,))[0]
             start = start_of(trained_agent, width, trust)
         elif checkpoint is None:
-            start = self.first
+            start = self.start
         if start is not None:
             self.scaling = start.scaling
         if self.scaling is None:
@@ -242,10 +242,9 @@ class Keeper(BaseCallback):
         self.check()
         self.spent += time.process_time() - self.since
         costs = costs_of(self.tested, self.model, self.seeds)
-        cost, start = float(np.mean(self._means(costs) * self.alike)), self.start
-        ratio = None
-        if start is not None:
-            ratio = float(np.exp(np.mean(np.log((costs + FLOOR) / (start + FLOOR)))))
+        cost, ratio = float(np.mean(self._means(costs) * self.alike)), None
+        if self.to_beat is not None:
+            ratio = float(np.exp(np.log(cost_ratios(costs, self.to_beat)).mean()))
         spent = round(self.spent, 3)
         now = Evaluation(self.model.num_timesteps, spent, cost, cost / self.none, ratio)
         if all(now.judged < each.judged for each in self.evaluations):

@@ -67,8 +67,8 @@ def start_of(path: str | Path, width: int, trust: bool = False) -> Start:
 
 
 def task_from(policy: Policy, **fields: Any) -> Task:
-    """The task of going on from a policy: its card's environment, filter, reads and mixture, and
-    settings with its network's form.
+    """The task of going on from a policy: its card's environment, filter and mixture, and settings
+    with its network's form.
 
     fields: of `Task`, in place of the card's; but `env_options` come to the card's, with a scenario
     instead of its mixture, and another estimator has no options of the card's.

@@ -1,7 +1,6 @@
 """What a training is of: it stays the same when it goes on."""
 
 import itertools
-import json
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -82,28 +81,3 @@ class Task:
         """Another vector env of the task, not the one that is trained on."""
         options = self.options(num_envs)
         return make_native_env(self.env_id, num_envs, self.around, options)
-
-    def words(self, steps: int) -> list[str]:
-        """The command that trains this from the start."""
-        words = ["sideslip", "train", "--algo", self.algo, "--env", self.env_id]
-        words += ["--estimator", self.estimator] if self.estimator else []
-        given = {"--estimator-option": self.estimator_options, "--option": self.env_options}
-        for option, values in given.items():
-            for name, value in values.items():
-                words += [
-                    option,
-                    f"{name}={value if isinstance(value, str) else json.dumps(value)}",
-                ]
-        words += [word for each in self.scenarios for word in ("--scenarios", str(each))]
-        words += [word for each in self.reads for word in ("--reads", each)]
-        numbers = {"--steps": steps, "--seed": self.seed, "--num-envs": self.num_envs}
-        numbers |= {"--n-eval-envs": self.n_eval_envs}
-        return words + [word for name, value in numbers.items() for word in (name, str(value))]
-
-    def named(self, start: str = "") -> str:
-        """A name for its folder, and of what it begins with."""
-        given = self.env_options.items()
-        options = [each if isinstance(each, str) else name for name, each in given]
-        options += ["mixture"] if self.scenarios else []
-        words = [self.env_id.rpartition("/")[2], self.algo, self.estimator, *options, start]
-        return "-".join(["train", *filter(None, words), str(self.seed)])

@@ -86,10 +86,11 @@ def train(
             raise ValueError("a training that goes on from its checkpoint begins with nothing else")
         if task.reads:
             raise ValueError("a network reads what it was trained on: give reads or a network")
-        if isinstance(trained_agent, str) and is_policy(trained_agent):
-            trained_agent = load_policy(trained_agent)
         if not isinstance(trained_agent, Policy):
-            check_zip(Path(trained_agent), trust=True)
+            if is_policy(str(trained_agent)):
+                trained_agent = load_policy(trained_agent)
+            else:
+                check_zip(Path(trained_agent), trust=True)
     if how.tensorboard_log is not None and find_spec("tensorboard") is None:
         raise ModuleNotFoundError("a log for TensorBoard needs it: pip install tensorboard")
     tracked = _Tracked(how.track, Path(folder).name, asdict(task)) if how.track else None

@@ -30,6 +30,7 @@ from ..harness.results import (
 
 if TYPE_CHECKING:
     from ...agents.rollout import Rollout
+    from ...agents.training.task import Task
 
 _ENDINGS = {
     "correction": (".safetensors",),
@@ -138,6 +139,33 @@ def write_output(
 def command_line() -> str:
     """The command line of this process."""
     return shlex.join(["sideslip", *sys.argv[1:]])
+
+
+def words_of(task: "Task", steps: int) -> list[str]:
+    """The command that trains this from the start."""
+    words = ["sideslip", "train", "--algo", task.algo, "--env", task.env_id]
+    words += ["--estimator", task.estimator] if task.estimator else []
+    given = {"--estimator-option": task.estimator_options, "--option": task.env_options}
+    for option, values in given.items():
+        for name, value in values.items():
+            words += [
+                option,
+                f"{name}={value if isinstance(value, str) else json.dumps(value)}",
+            ]
+    words += [word for each in task.scenarios for word in ("--scenarios", str(each))]
+    words += [word for each in task.reads for word in ("--reads", each)]
+    numbers = {"--steps": steps, "--seed": task.seed, "--num-envs": task.num_envs}
+    numbers |= {"--n-eval-envs": task.n_eval_envs}
+    return words + [word for name, value in numbers.items() for word in (name, str(value))]
+
+
+def folder_of(task: "Task", start: str = "") -> str:
+    """A training's folder without --out, by its task and what it begins with."""
+    given = task.env_options.items()
+    options = [each if isinstance(each, str) else name for name, each in given]
+    options += ["mixture"] if task.scenarios else []
+    words = [task.env_id.rpartition("/")[2], task.algo, task.estimator, *options, start]
+    return "-".join(["train", *filter(None, words), str(task.seed)])
 
 
 def environment() -> dict[str, str]:

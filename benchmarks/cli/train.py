@@ -16,7 +16,7 @@ from ...agents.learned.files import load_policy
 from ...envs.sensors.slow import SENSOR_SETS
 from .export import Trust
 from .names import check_env, complete
-from .output import check_files, command_line, options_of, wrote
+from .output import check_files, command_line, folder_of, options_of, words_of, wrote
 
 if TYPE_CHECKING:
     from ...agents.training.train import Progress as Now
@@ -112,7 +112,7 @@ def train_command(
         check_env(env)
     agent, new = start_and_task(trained_agent)
     task = task_in(out) if resume and out else new(**options)
-    folder = out or Path(task.named("" if trained_agent is None else trained_agent.stem))
+    folder = out or Path(folder_of(task, trained_agent.stem if trained_agent else ""))
     if conf_file is not None:
         start = start_in(folder) if resume else agent
         options["settings"] = settings_in(conf_file, task.algo, task.env_id, start)
@@ -122,7 +122,7 @@ def train_command(
     eval_freq = aim.eval_freq if eval_freq is None else eval_freq
     more = {"--eval-freq": eval_freq, "--conf-file": conf_file, "--trained-agent": trained_agent}
     given = [str(word) for pair in more.items() if pair[1] for word in pair]
-    command = shlex.join([*task.words(steps), *given])
+    command = shlex.join([*words_of(task, steps), *given])
     command = f"{aim.command}; sideslip train --resume --steps {steps}" if resume else command
     console = Console()
     with _Bar(console, steps, disable=not progress) as bar:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from ...agents.rollout import FLOOR
+from ...agents.rollout import cost_ratios
 from ..harness.stats import Estimate, ratio_of_sums
 from .episodes import Array, Driven
 
@@ -31,7 +31,7 @@ def gains(nominal: Array, driven: Driven) -> Array:
     """(n,) r of the first n episodes; nominal: (n,) costs of the same seeds."""
     n = len(nominal)
     with np.errstate(invalid="ignore"):
-        r = np.log((nominal + FLOOR) / (driven.costs[:n] + FLOOR))
+        r = np.log(cost_ratios(nominal, driven.costs[:n]))
     return np.where(survived(driven)[:n], np.clip(r, -_CLIP, _CLIP), -math.log(FAILED))
 
 

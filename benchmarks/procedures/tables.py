@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from ... import __version__
-from ...agents.rollout import FLOOR
+from ...agents.rollout import cost_ratios
 from ...envs.vehicle.vehicle import GRAVITY
 from ..harness.results import Row, Suite, Table
 from ..harness.stats import geometric_mean, interval
@@ -119,7 +119,7 @@ def _episodes(suite: Suite, done: dict[Case, list[outside.Episode]]) -> None:
     for case, found in done.items():
         cost, paired = interval(costs[case]), ""
         if case.car in rivals and _who(case)[0] != RIVAL:
-            logs = np.log((costs[case] + FLOOR) / (rivals[case.car] + FLOOR))
+            logs = np.log(cost_ratios(costs[case], rivals[case.car]))
             paired = "{:.0f} [{:.0f}, {:.0f}]".format(*(100.0 * x for x in geometric_mean(logs)))
         spins = float(np.mean([each.failed for each in found]))
         more: dict[str, Any] = {"n": len(found), "salt": "fixed"}

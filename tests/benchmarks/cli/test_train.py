@@ -14,7 +14,7 @@ pytest.importorskip("stable_baselines3")
 from sideslip.agents.training import keeper, train
 from sideslip.benchmarks import policies as enjoy
 from sideslip.benchmarks.cli import train as train_command
-from sideslip.benchmarks.cli.output import options_of
+from sideslip.benchmarks.cli.output import folder_of, options_of, words_of
 from sideslip.benchmarks.distillation import contests_of
 from tests.benchmarks.conftest import Run
 
@@ -121,7 +121,7 @@ def test_without_the_extra_the_command_names_it(
 def test_the_command_of_a_card_says_what_the_filter_was(run: Run) -> None:
     told = {"outputs": ["beta", "F_d"], "options": {"fast": ["gyro", "accel_y"]}}
     task = train.Task(estimator="exact-kf", estimator_options=told)
-    words = task.words(10)
+    words = words_of(task, 10)
     found = [words[i + 1] for i, word in enumerate(words) if word == "--estimator-option"]
     assert options_of(found) == told
     status, _, err = run("--estimator-option", found[0])
@@ -130,8 +130,8 @@ def test_the_command_of_a_card_says_what_the_filter_was(run: Run) -> None:
 
 def test_the_folder_is_named_by_what_is_trained() -> None:
     task = train.Task("sideslip/YawGps-v0", "ppo", "dakf", {"scenario": "gust"}, 7)
-    assert task.named() == "train-YawGps-v0-ppo-dakf-gust-7"
-    assert task.named("mine") == "train-YawGps-v0-ppo-dakf-gust-mine-7"
+    assert folder_of(task) == "train-YawGps-v0-ppo-dakf-gust-7"
+    assert folder_of(task, "mine") == "train-YawGps-v0-ppo-dakf-gust-mine-7"
 
 
 def test_it_goes_on_from_a_distilled_policy_in_all_contests_of_its_class(
