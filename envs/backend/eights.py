@@ -2,9 +2,14 @@
 # mypy: disable-error-code="attr-defined,no-untyped-call,no-untyped-def,misc,untyped-decorator"
 """Eight neighbours of a matrix's row at once, and what goes with them in a filter's matrices.
 
+A matrix whose numbers are lanes, one of each of several filters, has an axis more: there the same
+functions take the lanes of one place, and `span` says that they go on by one column. Of a symmetric
+matrix of lanes only what stands on and above the diagonal counts.
+
 The functions are plain Python on NumPy arrays; below them stands what the compiler makes of each.
 """
 
+import math
 from typing import Any
 
 import numpy as np
@@ -15,13 +20,23 @@ from numba.core.typing.templates import AbstractTemplate, infer_global, signatur
 from numba.np.arrayobj import make_array, populate_array
 
 from .arrays import place, whole
-from .simd import EIGHT
+from .simd import EIGHT, FLOATS, LANES
 
 
 def eight(array: Any, *index: int) -> Any:
     """Eight neighbours of a matrix's row or a vector, the first of them at an index."""
     *row, first = index
     return array[(*row, slice(first, first + 8))].copy()
+
+
+def across(matrix: Any, k: int, j: int) -> Any:
+    """`eight` of a symmetric matrix."""
+    return eight(matrix, k, j)
+
+
+def rows_of(matrix: Any, rows: int, j: int) -> int:
+    """How many of its rows count in the columns from j on."""
+    return rows
 
 
 def put_eight(array: Any, values: Any, *index: int) -> None:
@@ -31,8 +46,8 @@ def put_eight(array: Any, values: Any, *index: int) -> None:
 
 
 def mirror(array: Any, i: int, j: int) -> None:
-    """Make a matrix symmetric: its 8 x 8 block at (i, j) into that at (j, i), i <= j; of one on the
-    diagonal what stands above it."""
+    """Make a matrix of numbers symmetric: its 8 x 8 block at (i, j) into that at (j, i), i <= j; of
+    one on the diagonal what stands above it."""
     block = array[i : i + 8, j : j + 8]
     array[j : j + 8, i : i + 8] = np.where(np.tri(8, k=-1), block.T, block) if i == j else block.T
 
@@ -41,46 +56,98 @@ def prefetch(array: Any, *index: int) -> None:
     """Have the cache line of a number fetched that is soon read; it may lie beyond the array."""
 
 
-def scratch(rows: int, columns: int) -> Any:
+def span(array: Any) -> int:
+    """How many columns of a matrix `eight` takes at once; one where they are lanes."""
+    return 8
+
+
+def scratch(like: Any, rows: int, columns: int) -> Any:
     """A matrix to work in, of constant shape and with any numbers in it, until the function ends.
 
-    Compiled, it lies on the stack.
+    like: a matrix of the same kind, of numbers or of lanes. Compiled, it lies on the stack.
     """
     return np.empty((rows, columns))
 
 
 def _is_row(array, indices):
     """Whether eight neighbours can be read there at once."""
-    plain = isinstance(array, types.Array) and array.dtype == types.float64
-    return plain and array.layout == "C" and array.ndim == indices
+    return _kind_of(array, indices) is EIGHT
+
+
+def _kind_of(array, indices):
+    """What stands at so many indices: eight neighbours, lanes, or None."""
+    if not isinstance(array, types.Array) or array.dtype != types.float64 or array.layout != "C":
+        return None
+    return {0: EIGHT, 1: FLOATS}.get(array.ndim - indices)
+
+
+@infer_global(span)
+class _Span(AbstractTemplate):
+    def generic(self, args, kws):
+        return signature(types.intp, *args)
+
+
+@lower_builtin(span, types.Array)
+def _lower_span(context, builder, sig, args):
+    return context.get_constant(types.intp, 8 if sig.args[0].ndim == 2 else 1)
 
 
 @infer_global(eight)
 class _Eight(AbstractTemplate):
     def generic(self, args, kws):
         array, *index = args
-        return signature(EIGHT, array, *whole(index)) if _is_row(array, len(index)) else None
+        kind = _kind_of(array, len(index))
+        return kind and signature(kind, array, *whole(index))
 
 
 @lower_builtin(eight, types.Array, types.VarArg(types.Any))
 def _lower_eight(context, builder, sig, args):
     where = place(context, builder, sig.args[0], args[0], args[1:])
-    return builder.load(builder.bitcast(where, EIGHT.value.as_pointer()), align=8)
+    return builder.load(builder.bitcast(where, sig.return_type.value.as_pointer()), align=8)
+
+
+@infer_global(across)
+class _Across(_Eight):
+    pass
+
+
+@lower_builtin(across, types.Array, types.Integer, types.Integer)
+def _lower_across(context, builder, sig, args):
+    array, k, j = args
+    if sig.args[0].ndim == 3:
+        above = builder.icmp_signed("<", k, j)
+        k, j = builder.select(above, k, j), builder.select(above, j, k)
+    return _lower_eight(context, builder, sig, [array, k, j])
+
+
+@infer_global(rows_of)
+class _RowsOf(AbstractTemplate):
+    def generic(self, args, kws):
+        return signature(types.intp, args[0], *whole(args[1:]))
+
+
+@lower_builtin(rows_of, types.Array, types.Integer, types.Integer)
+def _lower_rows_of(context, builder, sig, args):
+    _, rows, j = args
+    if sig.args[0].ndim == 2:
+        return rows
+    below = builder.add(j, context.get_constant(types.intp, 1))
+    return builder.select(builder.icmp_signed("<", below, rows), below, rows)
 
 
 @infer_global(put_eight)
 class _PutEight(AbstractTemplate):
     def generic(self, args, kws):
         array, _, *index = args
-        if not _is_row(array, len(index)):
-            return None
-        return signature(types.none, array, EIGHT, *whole(index))
+        kind = _kind_of(array, len(index))
+        return kind and signature(types.none, array, kind, *whole(index))
 
 
 @lower_builtin(put_eight, types.Array, EIGHT, types.VarArg(types.Any))
+@lower_builtin(put_eight, types.Array, FLOATS, types.VarArg(types.Any))
 def _lower_put_eight(context, builder, sig, args):
     where = place(context, builder, sig.args[0], args[0], args[2:])
-    builder.store(args[1], builder.bitcast(where, EIGHT.value.as_pointer()), align=8)
+    builder.store(args[1], builder.bitcast(where, sig.args[1].value.as_pointer()), align=8)
     return context.get_dummy_value()
 
 
@@ -88,12 +155,14 @@ def _lower_put_eight(context, builder, sig, args):
 class _Mirror(AbstractTemplate):
     def generic(self, args, kws):
         array, *index = args
-        return signature(types.none, array, *whole(index)) if _is_row(array, 2) else None
+        return _kind_of(array, 2) and signature(types.none, array, *whole(index))
 
 
 @lower_builtin(mirror, types.Array, types.intp, types.intp)
 def _lower_mirror(context, builder, sig, args):
     array, i, j = args
+    if sig.args[0].ndim == 3:
+        return context.get_dummy_value()
 
     def row(first, k, column):
         at_k = builder.add(first, context.get_constant(types.intp, k))
@@ -141,19 +210,23 @@ class _Scratch(AbstractTemplate):
     prefer_literal = True
 
     def generic(self, args, kws):
-        if not all(isinstance(each, types.IntegerLiteral) for each in args):
+        like, *shape = args
+        if not all(isinstance(each, types.IntegerLiteral) for each in shape):
             return None
-        return signature(types.Array(types.float64, 2, "C"), *args)
+        return signature(types.Array(types.float64, like.ndim, "C"), *args)
 
 
-@lower_builtin(scratch, types.IntegerLiteral, types.IntegerLiteral)
+@lower_builtin(scratch, types.Array, types.IntegerLiteral, types.IntegerLiteral)
 def _lower_scratch(context, builder, sig, args):
-    rows, columns = (each.literal_value for each in sig.args)
-    numbers = ir.ArrayType(ir.DoubleType(), rows * columns)
-    where = cgutils.alloca_once(builder, numbers)
+    rows, columns = (each.literal_value for each in sig.args[1:])
+    shape = [rows, columns] if sig.args[0].ndim == 2 else [rows, columns, LANES]
+    with builder.goto_entry_block():  # numba's own way fills it with zeros first
+        where = builder.alloca(ir.ArrayType(ir.DoubleType(), math.prod(shape)))
     where.align = 64
     made = make_array(sig.return_type)(context, builder)
-    size = [context.get_constant(types.intp, each) for each in (rows, columns, 8 * columns, 8)]
+    strides = [8 * math.prod(shape[axis + 1 :]) for axis in range(len(shape))]
+    size = [context.get_constant(types.intp, each) for each in (*shape, *strides, 8)]
     data = builder.bitcast(where, ir.DoubleType().as_pointer())
-    populate_array(made, data, size[:2], size[2:], size[3], None)
+    axes = len(shape)
+    populate_array(made, data, size[:axes], size[axes:-1], size[-1], None)
     return made._getvalue()

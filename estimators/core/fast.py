@@ -6,7 +6,7 @@ import numpy as np
 
 from ...envs.backend.arrays import at, put
 from ...envs.backend.decorators import jit
-from ...envs.backend.eights import eight, put_eight, scratch
+from ...envs.backend.eights import eight, put_eight, scratch, span
 from ...envs.backend.primitives import absolute, maximum, minimum
 from ...envs.record import FAST
 from .covariance import measure_state, predict_covariance
@@ -27,7 +27,7 @@ from .tyres import linearise
 
 
 @jit
-def _sum(row: Row, column: Row, factor: Row) -> Any:
+def signal(row: Row, column: Row, factor: Row) -> Any:
     """A signal of a fast row (FAST_WIDTH,): the sum of two of its columns times their factors."""
     return at(factor, 0) * at(row, at(column, 0)) + at(factor, 1) * at(row, at(column, 1))
 
@@ -77,7 +77,7 @@ def read(f: Memory, row: Row, now: float) -> None:
     """
     fine = True
     for i in range(f.inputs):
-        f.u_new[i] = _sum(row, f.u_column[i], f.u_factor[i])
+        f.u_new[i] = signal(row, f.u_column[i], f.u_factor[i])
     if f.steer_jump > 0.0:
         _check_steering(f)
     for i in range(f.inputs):
@@ -88,7 +88,7 @@ def read(f: Memory, row: Row, now: float) -> None:
     else:
         f.counts[COUNTERS.invalid] += 1
     for i in range(f.fasts):
-        f.y[i] = _sum(row, f.y_column[i], f.y_factor[i])
+        f.y[i] = signal(row, f.y_column[i], f.y_factor[i])
     if f.r_share > 0.0:
         _measure_noise(f, f.y[f.accel_row])
     turning, f.speed_before = f.turning, f.model_speed
@@ -107,14 +107,31 @@ def read(f: Memory, row: Row, now: float) -> None:
 @jit
 def _predict(f: Memory, v: Row) -> None:
     """v <- F v on the states of a vector (n,) or longer."""
-    n, new = f.n, scratch(1, CORE)
-    for j in range(0, n, 8):
+    n, new, step = f.n, scratch(f.P, 1, CORE), span(f.P)
+    for j in range(0, n, step):
         total = eight(f.keep, j) * eight(v, j)
         for k in range(n):
             total = total + at(v, k) * eight(f.GT, k, j)
         put_eight(new, total, 0, j)
-    for j in range(0, n, 8):
+    for j in range(0, n, step):
         put_eight(v, eight(new, 0, j), j)
+
+
+@jit
+def propagate(f: Memory, u: Row) -> None:
+    """x <- F x + H u for the inputs u (INPUTS,), and P with it."""
+    step = span(f.P)
+    _predict(f, f.x)
+    for j in range(0, f.dense, step):
+        total = eight(f.x, j)
+        for k in range(f.inputs):
+            total = total + at(u, k) * eight(f.HT, k, j)
+        put_eight(f.x, total, j)
+    if f.kind == LINEAR or f.tyres > 0:
+        for j in range(0, f.n, step):
+            put_eight(f.x, eight(f.x, j) + eight(f.drift, j), j)
+    if f.periodic == 0:
+        predict_covariance(f)
 
 
 @jit
@@ -135,7 +152,7 @@ def _change_speed(f: Memory) -> None:
 
 @jit
 def advance_state(f: Memory, u: Row) -> None:
-    """x <- F x + H u for the inputs u (INPUTS,), and P or e with it."""
+    """`propagate` with the model of now, and what else is carried along."""
     if f.stretch != 1.0:
         _change_speed(f)
     if f.tyres > 0 and (f.tick % f.again == 0 or f.late == BUFFER):
@@ -143,34 +160,24 @@ def advance_state(f: Memory, u: Row) -> None:
         build(f, f.model_speed, f.turning)
         if f.scaled > 0:
             _scale(f)
-    _predict(f, f.x)
-    for j in range(0, f.dense, 8):
-        total = eight(f.x, j)
-        for k in range(f.inputs):
-            total = total + at(u, k) * eight(f.HT, k, j)
-        put_eight(f.x, total, j)
-    if f.kind == LINEAR or f.tyres > 0:
-        for j in range(0, f.n, 8):
-            put_eight(f.x, eight(f.x, j) + eight(f.drift, j), j)
+    propagate(f, u)
     if f.between == PSEUDO:
         _predict(f, f.e)
-    if f.periodic == 0:
-        predict_covariance(f)
-        if f.late == LARSEN:
-            for s in range(SLOW):
-                if f.stamp[s, 0] >= 0:
-                    for i in range(f.rows[s]):
-                        _predict(f, f.larsen_gain[s, i])
+    if f.periodic == 0 and f.late == LARSEN:
+        for s in range(SLOW):
+            if f.stamp[s, 0] >= 0:
+                for i in range(f.rows[s]):
+                    _predict(f, f.larsen_gain[s, i])
 
 
 @jit
-def _residual(f: Memory, i: int) -> Any:
+def residual_of(f: Memory, i: int) -> Any:
     """The residual of the fast measurement i."""
     residual = at(f.y, i) - at(f.rest_fast, i)
     for k in range(f.n):
-        residual -= at(f.C_fast, i, k) * at(f.x, k)
+        residual = residual - at(f.C_fast, i, k) * at(f.x, k)
     for j in range(f.inputs):
-        residual -= at(f.D_fast, i, j) * at(f.u, j)
+        residual = residual - at(f.D_fast, i, j) * at(f.u, j)
     return residual
 
 
@@ -193,7 +200,7 @@ def correct_fast(f: Memory, gains: Gains) -> None:
         expect(f, f.first_slow)
     if f.joint == 1:
         for i in range(f.fasts):
-            residual = _residual(f, i)
+            residual = residual_of(f, i)
             f.eps[i] = residual if finite(residual) else 0.0
         if f.between == PSEUDO:
             correct_between(f, gains, f.first_slow)
@@ -201,7 +208,7 @@ def correct_fast(f: Memory, gains: Gains) -> None:
             _correct_joint(f, gains)
         return
     for i in range(f.fasts):
-        residual = _residual(f, i)
+        residual = residual_of(f, i)
         if not finite(residual):
             f.eps[i] = 0.0
             continue
@@ -211,7 +218,7 @@ def correct_fast(f: Memory, gains: Gains) -> None:
                 put(f.x, at(f.x, j) + at(gains, f.cell, step, j) * residual, j)
             continue
         measure_state(f, f.C_fast[i], f.r_fast[i], residual)
-        for j in range(0, f.total, 8):
+        for j in range(0, f.total, 8):  # the design of periodic gains reads them, too
             put_eight(f.share, eight(f.gain, j), i, j)
         if f.between == PSEUDO:
             share_fast(f, i, residual)

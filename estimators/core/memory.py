@@ -268,7 +268,7 @@ _WINDOW = [  # history: of tick k in row k % WINDOW
     ("past_y", _FLOAT, (WINDOW, FASTS)),
     ("past_speed", _FLOAT, (WINDOW,)),  # the model's
     ("past_turning", _FLOAT, (WINDOW,)),
-    ("past_road_turn", _FLOAT, (WINDOW,)),  # of every rule
+    ("past_road_turn", _FLOAT, (WINDOW,)),  # and with `predicted`
     ("snapshot_x", _FLOAT, (SNAPSHOTS + 1, CORE)),  # the last is "now", while the past is redone
     ("snapshot_P", _FLOAT, (SNAPSHOTS + 1, CORE, CORE)),
     ("recent", _FLOAT, (RECENT, PACKET_WIDTH)),
@@ -287,4 +287,5 @@ def _size(field: Any) -> int:
 
 _AHEAD = ("ahead", _FLOAT, (1,))  # where small fields begin, all that a tick reads next to another
 FILTER = np.dtype([_AHEAD, *sorted(_FIELDS, key=_size), *_WINDOW], align=True)
-HEAD = sum(_size(field) for field in _FIELDS if _size(field) <= 64)  # numbers of the small fields
+SMALL, HEAD = (sum(_size(field) for field in _FIELDS if _size(field) <= size) for size in (4, 64))
+"""Numbers of the fields of so many numbers each, which come first."""

@@ -52,6 +52,7 @@ def remember(f: Memory) -> None:
     copied(f.u, f.past_u[slot])
     copied(f.y, f.past_y[slot])
     f.past_speed[slot], f.past_turning[slot] = f.model_speed, f.turning
+    f.past_road_turn[slot] = f.road_turn
     if (f.tick - f.start) % EVERY == 0:
         _snapshot(f, _slot(f, f.tick))
 

@@ -32,7 +32,7 @@ from .memory import (
 from .packets import receive, use_waiting
 from .rewind import forget, remember
 from .speed import next_cell, step_row
-from .transition import CURVATURE, LATERAL, build
+from .transition import CURVATURE, LATERAL, build, road_turned
 from .tyres import linearise
 
 
@@ -107,7 +107,7 @@ def _start(f: Memory) -> None:
 def _turn_road(f: Memory, u: Row) -> None:
     """The road turns beside the car, over a step with the inputs u (INPUTS,)."""
     if f.kind == LATERAL and f.inputs > CURVATURE:
-        f.road_turn += f.model_speed * u[CURVATURE] * f.step
+        f.road_turn += road_turned(f.model_speed, u[CURVATURE], f.step)
 
 
 @jit
@@ -134,8 +134,8 @@ def tick(f: Memory, gains: Gains) -> None:
         f.at = f.at + 1 if f.at + 1 < f.cycle else 0
     else:
         _start(f)
-    f.past_road_turn[f.tick % WINDOW] = f.road_turn
     if f.store_predictions == 1:
+        f.past_road_turn[f.tick % WINDOW] = f.road_turn
         for i in range(f.n):
             f.predicted[f.tick % WINDOW, i] = f.x[i]
     if listens:

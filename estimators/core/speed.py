@@ -23,19 +23,31 @@ def finite(value: float) -> Any:
 
 
 @jit
+def low_passed(speed: Any, now: Any, share: Any) -> Any:
+    """The low-passed speed in m/s after this sample, which counts by a share."""
+    return speed + share * (now - speed)
+
+
+@jit
+def off(speed: Any, model_speed: Any) -> Any:
+    """Whether a speed in m/s is too far from the model's."""
+    return absolute(maximum(speed, SLOWEST) - model_speed) > MOVED * model_speed
+
+
+@jit
 def measured_speed(f: Memory, now: float) -> Any:
     """The low-passed mean of the front wheels' speeds in m/s, with this sample of it."""
     if not finite(now):
         return f.speed
     if f.model_speed == 0.0:
         return now
-    return f.speed + f.smoothing * (now - f.speed)
+    return low_passed(f.speed, now, f.smoothing)
 
 
 @jit
 def moved(f: Memory, speed: float) -> Any:
     """Whether the model has to be built anew for this speed in m/s."""
-    return absolute(maximum(speed, SLOWEST) - f.model_speed) > MOVED * f.model_speed
+    return off(speed, f.model_speed)
 
 
 @jit

@@ -151,8 +151,8 @@ def discretise(f: Memory) -> None:
     ||A h|| <= 1/2 and doubling back; G = I + A Phi. Accurate to rounding (relative 1e-14).
     """
     n, m = f.dense - f.delayed, INPUTS + f.n - f.dense
-    E, Phi, T = scratch(CORE, WIDE), scratch(CORE, WIDE), scratch(CORE, WIDE)
-    one = scratch(CORE, CORE)  # h I
+    E, Phi, T = scratch(f.A, CORE, WIDE), scratch(f.A, CORE, WIDE), scratch(f.A, CORE, WIDE)
+    one = scratch(f.A, CORE, CORE)  # h I
     norm = 0.0
     for i in range(n):
         total = 0.0
@@ -218,6 +218,12 @@ def _lagging(f: Memory) -> None:
             f.G[first + i, j] = 0.0
         f.G[first + i, PSI + i] = f.relax
         f.G[first + i, first + i] = 1.0 - f.relax
+
+
+@jit
+def road_turned(V: Any, curvature: Any, step: Any) -> Any:
+    """The angle in rad by which a road of a curvature in 1/m turns within a step of so many s."""
+    return V * curvature * step
 
 
 @jit

@@ -15,6 +15,7 @@ from ..estimates import Estimates
 from ..wrappers.arguments import Setup
 from .designs import Build, Designs
 from .kernel import batch_entry, nothing_observed
+from .lanes import blocks
 
 Array = npt.NDArray[np.float64]
 Whole = npt.NDArray[np.int64]
@@ -68,6 +69,7 @@ class BatchEstimator:
             self._check_states(i, built.names)
             self._of[i], self.filters[i], changed = design, built.filters, True
         if changed:
+            self._lanes = blocks(len(self))  # empty: they hold models
             self._places = self._designs.place(self._of)
 
     def _check_states(self, i: int, names: tuple[str, ...]) -> None:
@@ -138,7 +140,7 @@ class BatchEstimator:
         observed: what `kernel.observe_batch` takes after `counts`.
         """
         done = np.full(len(self), -1) if mask is None else np.where(mask, -1, rows)
-        memory = self.filters, self._designs.pool, self._places, done
+        memory = self.filters, self._designs.pool, self._places, done, self._lanes
         while batch_entry()(*memory, fast, rows, packets, counts, *observed) > 0:
             self._design_missing(np.flatnonzero(done < rows))
 

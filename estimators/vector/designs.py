@@ -6,11 +6,19 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ...envs.backend.decorators import counted
 from ..estimator import Estimator
 from ..wrappers.arguments import AnyEstimator, Setup
 
 Array = npt.NDArray[np.float64]
 Build = Callable[[Setup], AnyEstimator]
+
+
+@counted
+def gains_of(pool: Any, place: Any) -> Any:
+    """The gains that lie in the pool at a place: (offset, then their shape)."""
+    start, cells, height, width = place[0], place[1], place[2], place[3]
+    return pool[start : start + cells * height * width].reshape((cells, height, width))
 
 
 class Designs:

@@ -8,19 +8,18 @@ from typing import Any
 
 import numpy as np
 
+from ...envs.backend.arrays import lane_count
 from ...envs.backend.decorators import counted, jit
 from ...envs.backend.eights import prefetch
-from ...envs.backend.primitives import maximum
+from ...envs.backend.primitives import maximum, minimum
 from ..core.memory import FILTER, HEAD, Memory
 from ..entry import entry
 from ..wrappers.kernel import observe
+from .designs import gains_of
+from .lanes import Block, blocks, joins
+from .ticks import advance_block
 
-
-@counted
-def gains_of(pool: Any, place: Any) -> Any:
-    """The gains that lie in the pool at a place: (offset, then their shape)."""
-    start, cells, height, width = place[0], place[1], place[2], place[3]
-    return pool[start : start + cells * height * width].reshape((cells, height, width))
+_FEW = 4  # filters that are computed alone in less time than in lanes
 
 
 @jit
@@ -38,12 +37,29 @@ def _fetch(f: Memory, like: Memory) -> None:
             prefetch(f.GT, i, j)
 
 
+@jit
+def _gather(b: Block, first: int, filters: Any, done: Any, rows: Any) -> int:
+    """Which filters from `first` on do their rows in the lanes of a block, equally many, into
+    b.here; returns how many rows."""
+    together, count = 0, 0
+    for lane in range(lane_count()):
+        i = first + lane
+        b.here[lane] = 0.0
+        if i < len(filters) and done[i] == -1 and rows[i] > 0:
+            same = count == 0 or rows[i] == together
+            if same and len(filters[i]) == 1 and joins(b, lane, filters[i, 0]):
+                b.here[lane], together = 1.0, rows[i]
+                count += 1
+    return together if count >= _FEW else 0
+
+
 @counted
 def observe_batch(
     filters: Any,
     pool: Any,
     places: Any,
     done: Any,
+    lanes: Any,
     fast: Any,
     rows: Any,
     packets: Any,
@@ -60,18 +76,28 @@ def observe_batch(
     """`observe` for every filter that has not done its rows; returns how many still have not.
 
     filters: (N, L). places: (N, 4), see `gains_of`. done: (N,) rows done, -1 where a filter has
-    not started. fast: (N, k, FAST_WIDTH). packets: (N, capacity, PACKET_WIDTH). All others but
-    inner, plan and limits have one row for each filter, too.
+    not started. lanes: of `lanes.blocks`. fast: (N, k, FAST_WIDTH). packets: (N, capacity,
+    PACKET_WIDTH). All others but inner, plan and limits have one row for each filter, too.
+
+    Filters of one shape do their rows in lanes, others alone.
     """
     waiting = 0
-    for i in range(len(filters)):
-        if done[i] < rows[i]:
-            f, gains, start = filters[i], gains_of(pool, places[i]), maximum(done[i], 0)
-            own = obs[i], inner, plan, limits, beta[i], gamma[i], out[i], summary[i]
-            for layer in range(len(f) if i + 1 < len(filters) else 0):
-                _fetch(filters[i + 1, layer], f[layer])
-            done[i] = observe(f, gains, fast[i], rows[i], packets[i], counts[i], start, *own)
-            waiting += 1 if done[i] < rows[i] else 0
+    for k in range(len(lanes)):
+        b, first = lanes[k], k * lane_count()
+        together, ahead = _gather(b, first, filters, done, rows), 0
+        if together > 0:
+            ahead = advance_block(b, first, filters, pool, places, fast, together, packets, counts)
+        for lane in range(minimum(lane_count(), len(filters) - first)):
+            i = first + lane
+            if done[i] < rows[i]:
+                f, gains = filters[i], gains_of(pool, places[i])
+                start = ahead if b.here[lane] == 1.0 else maximum(done[i], 0)
+                own = obs[i], inner, plan, limits, beta[i], gamma[i], out[i], summary[i]
+                if ahead == 0 and i + 1 < len(filters):
+                    for layer in range(len(f)):
+                        _fetch(filters[i + 1, layer], f[layer])
+                done[i] = observe(f, gains, fast[i], rows[i], packets[i], counts[i], start, *own)
+                waiting += 1 if done[i] < rows[i] else 0
     return waiting
 
 
@@ -89,5 +115,5 @@ def nothing_observed(count: int) -> tuple[Any, ...]:
 def batch_entry() -> Any:
     """`observe_batch` as a plain call."""
     filters, whole, cube = np.zeros((1, 1), FILTER), np.zeros(1, np.int64), np.zeros((1, 1, 1))
-    memory = filters, np.zeros(1), np.zeros((1, 4), np.int64), whole
+    memory = filters, np.zeros(1), np.zeros((1, 4), np.int64), whole, blocks(1)
     return entry(observe_batch, *memory, cube, whole, cube, whole, *nothing_observed(1))

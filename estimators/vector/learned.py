@@ -16,8 +16,8 @@ from ..protocol import ForeignEstimator
 from ..wrappers.arguments import Setup
 from ..wrappers.kernel import observe
 from .batch import BatchEstimator
-from .designs import Build
-from .kernel import gains_of, nothing_observed
+from .designs import Build, gains_of
+from .kernel import nothing_observed
 
 
 @counted

@@ -11,7 +11,7 @@ from sideslip.envs.backend.eights import eight, mirror, put_eight, scratch
 
 @jit
 def _product(a: Any, b: Any, c: Any) -> None:
-    work = scratch(2, 8)
+    work = scratch(a, 2, 8)
     for i in range(len(a)):
         put_eight(work, 0.0, 1, 0)
         for k in range(len(b)):

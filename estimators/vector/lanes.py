@@ -1,0 +1,226 @@
+"""Sixteen filters of one shape in SIMD lanes: what their ticks read and write, side by side.
+
+The filters' records stay what they are; a block has fields of the same names whose numbers are
+lanes, so the equations of `core` are compiled for it unchanged. Filter i of a batch has lane i mod
+16 of block i // 16. Its model stays there from call to call and is loaded anew where its speed is
+another one; its state is loaded and stored in every call.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from ...envs.backend.decorators import jit
+from ...envs.backend.simd import LANES
+from ...envs.record import FAST, FAST_WIDTH
+from ..core.delay import BUFFER, LARSEN
+from ..core.intersample import NONE
+from ..core.memory import CORE, FASTS, INPUTS, SLOW, WINDOW, Memory
+from ..core.transition import KINEMATIC, VELOCITY_ROLL
+
+Block = Any
+"""One record of the dtype `BLOCK`; `b` in compiled code."""
+
+_MOST = 16  # states and clones
+_ROW = _MOST + 1  # as long as a power of two, rows would share few places of the cache
+_FLOATS = {
+    "x": (_ROW,),
+    "P": (_MOST, _ROW),  # on and above the diagonal
+    "G": (CORE, _ROW),
+    "GT": (CORE, _ROW),
+    "HT": (INPUTS, _ROW),
+    "Q": (CORE, _ROW),  # on and above the diagonal
+    "keep": (_ROW,),
+    "decay": (_ROW,),
+    "drift": (_ROW,),
+    "PC": (_ROW,),
+    "gain": (_ROW,),
+    "K": (FASTS, _ROW),  # periodic gains of this tick
+    "C_fast": (FASTS, _ROW),
+    "D_fast": (FASTS, INPUTS),
+    "rest_fast": (FASTS,),
+    "r_fast": (FASTS,),
+    "u_factor": (INPUTS, 2),
+    "y_factor": (FASTS, 2),
+    "u": (INPUTS,),
+    "u_new": (INPUTS,),
+    "y": (FASTS,),
+    "row": (FAST_WIDTH,),  # of this tick
+    "speed": (),
+    "speed_before": (),
+    "model_speed": (),  # 0: no model was loaded
+    "smoothing": (),
+    "step": (),
+    "road_turn": (),
+    "now": (),  # tick
+    "last": (),  # tick of the last row
+    "due": (),  # tick at which the next packet is taken
+    "next": (),  # tick of the next capture
+    "here": (),  # 1: its filter has a row now; else what the lane holds is of no use
+    "apart": (),  # 1: the tick is computed by the record
+    "wild": (),  # 1: its residual is none
+}
+_INTS = ("shaped", "tick", "at", "cell", "cursor")
+"""Of a lane: 1 where its filter is known to have the block's shape, -1 where it has not, 0 where
+nobody looked; tick, step within the cycle, table of gains and packets done."""
+_SHAPE = (
+    *("n", "dense", "total", "inputs", "fasts", "kind", "periodic", "measured", "cycle"),
+    *("store_predictions", "tyres", "robust"),
+)
+_FIELDS = (
+    [(name, np.float64, (*shape, LANES)) for name, shape in _FLOATS.items()]
+    + [(name, np.int64, (LANES,)) for name in _INTS]
+    + [(name, np.float64 if name == "robust" else np.int64) for name in _SHAPE]
+    + [("u_column", np.int64, (INPUTS, 2)), ("y_column", np.int64, (FASTS, 2))]
+    + [("column", np.int64, (FAST_WIDTH,)), ("columns", np.int64)]  # of a fast row, that are read
+)
+_LINE = 64  # bytes that a cache fetches at once
+BLOCK = np.dtype([*_FIELDS, ("rest", np.int8, _LINE - np.dtype(_FIELDS).itemsize % _LINE)])
+
+
+def blocks(count: int) -> Any:
+    """Blocks for so many filters, nothing in them, each on a cache line."""
+    size = -(-count // LANES) * BLOCK.itemsize
+    room = np.zeros(size + _LINE, np.int8)
+    first = -room.ctypes.data % _LINE
+    return room[first : first + size].view(BLOCK)
+
+
+@jit
+def joins(b: Block, lane: int, f: Memory) -> Any:
+    """Whether a filter's ticks are computed in its lane now; the first that does shapes the block.
+
+    Lanes compute models that change by speed alone, of which every tick predicts and corrects,
+    nothing is done between samples, and nothing of the past is stored but predictions.
+    """
+    if b.shaped[lane] == 0:
+        steady = f.tyres == 0 and f.kind != KINEMATIC and f.kind != VELOCITY_ROLL
+        plain = f.stride == 1 and f.pace == 1 and f.between == NONE and f.joint == 0
+        told = f.r_share == 0.0 and f.steer_jump == 0.0
+        fits = f.late != BUFFER and f.late != LARSEN and f.total <= _MOST
+        fits = fits and steady and plain and told
+        if fits and b.n == 0:
+            _shape(b, f)
+        b.shaped[lane] = 1 if fits and _alike(b, f) else -1
+    return b.shaped[lane] == 1 and f.begun == 1 and f.model_speed > 0.0
+
+
+@jit
+def _alike(b: Block, f: Memory) -> Any:
+    same = f.n == b.n and f.dense == b.dense and f.total == b.total and f.inputs == b.inputs
+    same = same and f.fasts == b.fasts and f.kind == b.kind and f.periodic == b.periodic
+    same = same and f.measured == b.measured and f.cycle == b.cycle and f.robust == b.robust
+    same = same and f.store_predictions == b.store_predictions
+    for k in range(2):
+        for i in range(f.inputs):
+            same = same and f.u_column[i, k] == b.u_column[i, k]
+        for i in range(f.fasts):
+            same = same and f.y_column[i, k] == b.y_column[i, k]
+    return same
+
+
+@jit
+def _shape(b: Block, f: Memory) -> None:
+    """What all filters of a block share."""
+    b.n, b.dense, b.total, b.inputs, b.fasts = f.n, f.dense, f.total, f.inputs, f.fasts
+    b.kind, b.periodic, b.measured, b.cycle = f.kind, f.periodic, f.measured, f.cycle
+    b.store_predictions, b.tyres, b.robust = f.store_predictions, f.tyres, f.robust
+    b.columns = 0
+    if f.measured == 1:
+        _add_column(b, FAST.wheel_left)
+        _add_column(b, FAST.wheel_right)
+    for k in range(2):
+        for i in range(f.inputs):
+            b.u_column[i, k] = f.u_column[i, k]
+            _add_column(b, f.u_column[i, k])
+        for i in range(f.fasts):
+            b.y_column[i, k] = f.y_column[i, k]
+            _add_column(b, f.y_column[i, k])
+
+
+@jit
+def _add_column(b: Block, column: int) -> None:
+    for i in range(b.columns):
+        if b.column[i] == column:
+            return
+    b.column[b.columns] = column
+    b.columns += 1
+
+
+@jit
+def _load_model(b: Block, lane: int, f: Memory) -> None:
+    """What a filter's ticks read and do not write."""
+    n, dense = f.n, f.dense
+    for i in range(n):
+        b.keep[i, lane], b.decay[i, lane], b.drift[i, lane] = f.keep[i], f.decay[i], f.drift[i]
+        for j in range(n):
+            b.GT[i, j, lane] = f.GT[i, j]
+        for j in range(i, n):
+            b.Q[i, j, lane] = f.Q[i, j]
+    for i in range(dense):
+        for j in range(n):
+            b.G[i, j, lane] = f.G[i, j]
+    for i in range(n, f.total):
+        b.keep[i, lane] = f.keep[i]
+    for k in range(f.inputs):
+        b.u_factor[k, 0, lane], b.u_factor[k, 1, lane] = f.u_factor[k, 0], f.u_factor[k, 1]
+        for j in range(dense):
+            b.HT[k, j, lane] = f.HT[k, j]
+    for i in range(f.fasts):
+        b.y_factor[i, 0, lane], b.y_factor[i, 1, lane] = f.y_factor[i, 0], f.y_factor[i, 1]
+        b.rest_fast[i, lane], b.r_fast[i, lane] = f.rest_fast[i], f.r_fast[i]
+        for j in range(n):
+            b.C_fast[i, j, lane] = f.C_fast[i, j]
+        for k in range(f.inputs):
+            b.D_fast[i, k, lane] = f.D_fast[i, k]
+    b.model_speed[lane], b.smoothing[lane], b.step[lane] = f.model_speed, f.smoothing, f.step
+
+
+@jit
+def load(b: Block, lane: int, f: Memory) -> None:
+    """A filter into its lane."""
+    if b.model_speed[lane] != f.model_speed:
+        _load_model(b, lane, f)
+    N = b.total
+    for i in range(N):
+        b.x[i, lane] = f.x[i]
+    if b.periodic == 0:
+        for i in range(N):
+            for j in range(i, N):
+                b.P[i, j, lane] = f.P[i, j]
+    for k in range(b.inputs):
+        b.u[k, lane] = f.u[k]
+    b.speed[lane], b.speed_before[lane], b.road_turn[lane] = f.speed, f.speed_before, f.road_turn
+    b.tick[lane], b.at[lane], b.cell[lane] = f.tick, f.at, f.cell
+    first = np.inf
+    for s in range(SLOW):
+        if f.period[s] > 0:
+            first = min(first, float(f.next[s]))
+    b.next[lane] = first
+
+
+@jit
+def store(b: Block, lane: int, f: Memory) -> None:
+    """The state of a lane into its filter's record."""
+    N = b.total
+    for i in range(N):
+        f.x[i] = b.x[i, lane]
+    if b.periodic == 0:
+        for i in range(N):
+            for j in range(i, N):
+                f.P[i, j] = f.P[j, i] = b.P[i, j, lane]
+    for k in range(b.inputs):
+        f.u[k] = b.u[k, lane]
+    for i in range(b.fasts):
+        f.y[i] = b.y[i, lane]
+    f.speed, f.speed_before, f.road_turn = b.speed[lane], b.speed_before[lane], b.road_turn[lane]
+    f.tick, f.at = b.tick[lane], b.at[lane]
+
+
+@jit
+def remember_prediction(b: Block, lane: int, f: Memory) -> None:
+    """Store a lane's prediction of this tick, before its fast measurements."""
+    slot = b.tick[lane] % WINDOW
+    f.past_road_turn[slot] = b.road_turn[lane]
+    for i in range(b.n):
+        f.predicted[slot, i] = b.x[i, lane]

@@ -1,0 +1,141 @@
+"""Filters in lanes have the bits of each alone, whatever happens to their neighbours."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sideslip.envs import COMS
+from sideslip.envs.record import FAST, PACKET_WIDTH
+from sideslip.estimators import FILTERS, make_estimator
+from sideslip.estimators.vector import kernel
+from sideslip.estimators.vector.lanes import BLOCK, blocks
+from sideslip.estimators.vector.make import make_batch
+from tests.estimators.vector.test_batch import drives, feed, home, same_bits
+
+pytestmark = [
+    pytest.mark.compiled,
+    pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning"),
+]
+COUNT = 19  # a block, and three filters that are alone
+LOOKED_AT = (0, 1, 2, 4, 6, 7, 15, 16, 18)
+
+
+def troubled(name: str) -> list[Any]:
+    """Drives of which some speed up, or lose a row, or have numbers beyond all measure."""
+    logs = drives(COUNT, *home(name), seconds=0.3)
+    for i, log in enumerate(logs):
+        fast = log.record.fast
+        fast[:, [FAST.wheel_left, FAST.wheel_right]] *= (
+            1.0 + 0.01 * i * np.linspace(0, 1, len(fast))[:, None]
+        )
+        fast[50 + i, FAST.gyro] = np.nan if i % 3 == 0 else fast[50 + i, FAST.gyro]
+        fast[120, FAST.steer] = np.inf if i % 5 == 1 else fast[120, FAST.steer]
+        fast[140, FAST.wheel_left] = np.nan if i % 7 == 2 else fast[140, FAST.wheel_left]
+    for tick, size in ((60, 9e14), (61, -9e14), (62, 9e14)):  # residuals that are none
+        logs[4].record.fast[tick, [FAST.gyro, FAST.accel_y]] = size
+    return logs
+
+
+def same_as_alone(name: str, n: int, speed: float | None, **options: Any) -> None:
+    logs = troubled(name)
+    cars = [COMS.scaled(1.0 - 0.1 * (i % 2)) for i in range(COUNT)]
+    told = [log.slow for log in logs]
+    batch = make_batch(name, COUNT, vehicle=cars, sensors=told, speed=speed, **options)
+    feed(batch, logs, n)
+    for i in LOOKED_AT:
+        alone = make_estimator(name, vehicle=cars[i], sensors=told[i], speed=speed, **options)
+        alone.run(logs[i])
+        np.testing.assert_array_equal(batch[i].x, alone.x, strict=True)
+        np.testing.assert_array_equal(batch[i].P, alone.P, strict=True)
+        assert batch[i].counts == alone.counts
+
+
+@pytest.mark.parametrize("name", FILTERS)
+def test_every_lane_is_the_filter_alone(name: Any) -> None:
+    """Own phases, cars, speeds and troubles; gains that are missing are made on the way."""
+    same_as_alone(name, 10, None)
+
+
+@pytest.mark.parametrize(("n", "speed"), [(1, None), (64, 7.0)])
+@pytest.mark.parametrize("name", ["exact-kf", "multirate-kf", "uneven-delay-kf"])
+def test_so_it_is_for_every_step(name: Any, n: Any, speed: Any) -> None:
+    same_as_alone(name, n, speed)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"gains": "covariance", "bias_sd": 0.01, "fast": ["gyro", "accel_y"]},
+        {"gains": "covariance", "robust": 2.0},
+        {"delay": "stored", "gains": "covariance"},
+        {"delay": "buffer"},
+    ],
+)
+def test_so_it_is_with_options(options: Any) -> None:
+    same_as_alone("exact-kf", 10, 7.0, **options)
+
+
+def test_rows_that_stand_still_or_begin_anew_leave_their_block_alone() -> None:
+    logs = drives(COUNT, *home("exact-kf"), seconds=0.1)
+    told = [log.slow for log in logs]
+    batch = make_batch("exact-kf", COUNT, sensors=told, speed=7.0)
+    other = [make_estimator("exact-kf", sensors=slow, speed=7.0) for slow in told]
+    none = np.zeros((0, PACKET_WIDTH))
+    for k in range(0, 100, 10):
+        rows = [(i + k // 10) % 3 * 5 for i in range(COUNT)]  # 0, 5 or 10 of them
+        fast = np.array([log.record.fast[k : k + 10] for log in logs])
+        batch.step(fast, np.zeros((COUNT, 0, PACKET_WIDTH)), rows=rows)
+        for i, each in enumerate(other):
+            each.step(fast[i, : rows[i]], none)
+        if k == 50:
+            batch.reset([i == 7 for i in range(COUNT)])
+            other[7].reset()
+    same_bits(batch, other)
+
+
+def test_a_snapshot_of_another_speed_brings_its_model_along() -> None:
+    """A lane's model is not that of before, though nobody told the block."""
+    logs = drives(COUNT, *home("exact-kf"), seconds=0.2)
+    for i, log in enumerate(logs):
+        log.record.fast[:, [FAST.wheel_left, FAST.wheel_right]] += (
+            0.02 * i * np.arange(len(log.record.fast))[:, None]
+        )
+    batch = make_batch("exact-kf", COUNT, sensors=[log.slow for log in logs])
+    feed(batch, logs, 10, last=60)
+    snapshot = batch.get_state()
+    feed(batch, logs, 10, first=60)
+    once = batch.x
+    batch.set_state(snapshot)
+    feed(batch, logs, 10, first=60)
+    np.testing.assert_array_equal(batch.x, once)
+
+
+def test_which_filters_are_in_lanes() -> None:
+    """All of one shape: a block of five is counted by what it has loaded."""
+    cases: list[tuple[str, dict[str, Any], int]] = [
+        ("exact-kf", {}, 5),
+        ("multirate-kf", {}, 5),
+        ("exact-kf", {"delay": "stored"}, 5),
+        ("joint", {}, 0),
+        ("exact-kf", {"delay": "buffer"}, 0),
+    ]
+    for name, options, there in cases:
+        logs = drives(5, *home(name), seconds=0.05)
+        batch = make_batch(name, 5, sensors=[log.slow for log in logs], speed=7.0, **options)
+        feed(batch, logs, 10)
+        assert (batch._lanes["shaped"][0] == 1).sum() == there
+        assert (batch._lanes["here"][0] == 1.0).sum() == there
+    few = make_batch(
+        "exact-kf", kernel._FEW - 1, sensors={"camera": logs[0].slow["camera"]}, speed=7.0
+    )
+    feed(few, logs[: kernel._FEW - 1], 10)
+    assert (few._lanes["model_speed"] == 0.0).all()
+
+
+def test_blocks_lie_on_cache_lines() -> None:
+    made = blocks(33)
+    assert len(made) == 3 and made.dtype == BLOCK
+    assert BLOCK.itemsize % 64 == 0 and made.ctypes.data % 64 == 0
+    assert BLOCK.fields is not None
+    assert all(BLOCK.fields[name][1] % 64 == 0 for name in ("x", "P", "GT", "row"))
