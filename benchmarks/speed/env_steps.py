@@ -29,7 +29,9 @@ AT_ONCE = f"{FUSION} x {COUNT}"
 ALONE_FILTERED, FILTERED = (f"{who} + exact-kf, full P" for who in (FUSION, AT_ONCE))
 LATE, NONE_LATE = f"{VISION} x {COUNT}", f"{VISION} x {COUNT}, no delay"
 CARTPOLE, LANE = "CartPole-v1", "lane-keeping-v0 (highway-env)"
-CARTPOLES, PENDULUMS = f"{CARTPOLE} x {COUNT}", f"Pendulum-v1 x {COUNT} (EnvPool)"
+MULTIRATE = f"{LATE} + multirate-kf"
+CARTPOLES, PENDULUMS = f"{CARTPOLE} x {COUNT}", f"Pendulum-v1 x {COUNT}"
+ENVPOOL = f"{PENDULUMS} (EnvPool)"
 
 Policy = Callable[[Any], Any]
 
@@ -98,6 +100,11 @@ def _cartpoles() -> Contestant:
 
 
 def _pendulums() -> Contestant:
+    """Gymnasium's own batch; Pendulum has none of arrays."""
+    return batch(gym.make_vec("Pendulum-v1", COUNT, vectorization_mode="sync"), 1)
+
+
+def _envpool() -> Contestant:
     import envpool
 
     env: Any = envpool.make("Pendulum-v1", env_type="gymnasium", num_envs=COUNT, num_threads=1)
@@ -129,11 +136,16 @@ def contestants() -> Field:
     field.add(ALONE_FILTERED, lambda: episode(EstimateObservation(gym.make(FUSION_ID), **FILTER)))
     field.add(FILTERED, lambda: batch(EstimateObservations(_vector(FUSION_ID), **FILTER)))
     field.add(LATE, lambda: batch(_vector(VISION_ID), FRAMES))
+    field.add(
+        MULTIRATE,
+        lambda: batch(EstimateObservations(_vector(VISION_ID), "multirate-kf"), FRAMES),
+    )
     field.add(NONE_LATE, lambda: batch(_vector(VISION_ID, **PROMPT), FRAMES))
     field.add(CARTPOLE, lambda: episode(gym.make(CARTPOLE), upright))
     field.add(LANE, _lane_keeping, "highway-env")
     field.add(CARTPOLES, _cartpoles)
-    field.add(PENDULUMS, _pendulums, "envpool")
+    field.add(PENDULUMS, _pendulums)
+    field.add(ENVPOOL, _envpool, "envpool")
     return field
 
 

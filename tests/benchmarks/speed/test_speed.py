@@ -37,10 +37,10 @@ def test_env_steps_are_measured_and_the_absent_are_named(monkeypatch: pytest.Mon
     measured = Suite("speed", "", "")
     taken, absent = env_steps.add(measured, SHORT)
     assert {env_steps.FUSION, env_steps.AT_ONCE, env_steps.FILTERED} <= set(taken)
-    assert {env_steps.CARTPOLE, env_steps.CARTPOLES} <= set(taken)
+    assert {env_steps.CARTPOLE, env_steps.CARTPOLES, env_steps.PENDULUMS} <= set(taken)
     assert absent == {
         env_steps.LANE: "highway-env is not installed",
-        env_steps.PENDULUMS: "envpool is not installed",
+        env_steps.ENVPOOL: "envpool is not installed",
     }
     rows = {(row.scenario, row.metric) for row in measured.rows}
     assert rows == {(name, "us_per_step") for name in taken}
