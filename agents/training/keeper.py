@@ -23,7 +23,7 @@ from .checkpoint import load_parameters, save_checkpoint
 from .export import network_from_sb3
 from .normalise import measured
 from .rewards import Rated, Rates, alike, paid_by, weights_of
-from .starts import Driver, give, start_of, started_by
+from .starts import Begun, give, start_of
 from .task import Task
 
 from stable_baselines3.common.base_class import BaseAlgorithm  # isort: skip  # after ours, which
@@ -131,9 +131,10 @@ class Keeper(BaseCallback):
         self.aim = Aim(steps, means.eval_freq, means.command, name)
         self.seeds = evaluation_seeds(task.n_eval_envs)
         self.tested = task.vector_env(task.n_eval_envs)
-        self.begun_with, self.start = begun_with, None
+        self.begun_with, self.begun = begun_with, None
         if begun_with is not None:
-            self.start = started_by(begun_with, task, layout_of(self.tested))
+            self.begun = Begun(begun_with, task, layout_of(self.tested))
+            self.tested = self.begun.around(self.tested)
         base: Any = self.tested.unwrapped
         self.period: float = base.control_period * base.dt  # s
         saved = {} if checkpoint is None else checkpoint
@@ -144,8 +145,8 @@ class Keeper(BaseCallback):
         self.alike = alike(none)
         self.none = float(np.mean(none * self.alike))
         self.weights = np.ones(1) if begun_with else weights_of(task, _WEIGHING)
-        driver = None if begun_with is None else Driver(begun_with.network)
-        self.to_beat = None if driver is None else costs_of(self.tested, driver, self.seeds)
+        driver = self.begun.driver if self.begun else None
+        self.to_beat = costs_of(self.tested, driver, self.seeds) if driver else None
         self.scaling: Any = saved.get("scaling")
         self.spent = self.evaluations[-1].cpu_seconds if self.evaluations else 0.0
         self.since = time.process_time()
@@ -164,7 +165,7 @@ class Keeper(BaseCallback):
             width = (self.tested.single_observation_space.shape or (0,))[0]
             start = start_of(trained_agent, width, trust)
         elif checkpoint is None:
-            start = self.start
+            start = self.begun.start if self.begun else None
         if start is not None:
             self.scaling = start.scaling
         if self.scaling is None:
@@ -176,6 +177,7 @@ class Keeper(BaseCallback):
             task.num_envs,
             estimator=task.around,
             env_kwargs=task.options(task.num_envs),
+            wrapper_class=self.begun.around if self.begun else None,
         )
         steps = 0 if checkpoint is None else int(checkpoint["steps"])
         seed = (task.seed + steps) % 2**32
@@ -202,9 +204,9 @@ class Keeper(BaseCallback):
 
     def _rates(self, env: VecEnv, first: int, steps: int) -> Rates:
         """What is paid for the cars' costs, from this seed and step on."""
-        if self.begun_with is not None:
+        if self.begun is not None:
             each = -(-(self.aim.steps - steps) // env.num_envs)
-            return Rates(paid_by(Driver(self.begun_with.network), env, first, each))
+            return Rates(paid_by(self.begun.driver, env, first, each))
         rate = np.resize(self.weights, env.num_envs) / self.period
         return Rates(rate[:, None].tolist())
 
@@ -274,9 +276,7 @@ class Keeper(BaseCallback):
             before = self.begun_with.card.algorithm_options
             described |= {"begun_with": self.begun_with.name}
             described |= {"class": before["class"]} if "class" in before and task.scenarios else {}
-        mixture: dict[str, Any] = {}
-        if task.scenarios:
-            mixture = {"scenarios": task.scenarios}
+        mixture: dict[str, Any] = {"scenarios": task.scenarios} if task.scenarios else {}
         if task.scenarios and self.begun_with is None:
             mixture["weights"] = self.weights.round(3).tolist()
         first = {"scenario": task.scenarios[0]} if task.scenarios else {}
@@ -292,6 +292,8 @@ class Keeper(BaseCallback):
             steps=now.steps,
             cpu_seconds=now.cpu_seconds,
         )
-        save_policy(self.folder / POLICY, network_from_sb3(self.model), card)
+        network = network_from_sb3(self.model)
+        network = self.begun.whole(network) if self.begun else network
+        save_policy(self.folder / POLICY, network, card)
         with whole(self.folder / BEST) as file:
             self.model.save(file)

@@ -6,14 +6,16 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from gymnasium.vector import VectorEnv
 
 from ...envs.task.observation import Entry
-from ...estimators.learned.memory import PARTS
+from ...estimators.learned.memory import PARTS, Traces
 from ...estimators.learned.network import Network
 from ..learned.files import Policy
 from .algorithms import BEGUN, Settings, algorithm_of, settings_of
 from .export import normalisation
 from .normalise import Scaling
+from .remembered import Remembered
 from .task import Task
 from .zips import check_zip, normaliser_of, unpickled
 
@@ -109,8 +111,9 @@ def _form_of(policy: Policy, algo: str) -> dict[str, Any]:
     if algo != "ppo" and not on_tensors:
         raise ValueError(f"{algo} begins with a zip, not with policy {policy.name}")
     form = network.output, network.history, kinds
-    if form != ("linear", 1, ["gru"] if on_tensors else []):
-        wanted = "a GRU" if on_tensors else "no cells"
+    known = [["gru"]] if on_tensors else [[], [Traces.kind]]
+    if form not in [("linear", 1, each) for each in known]:
+        wanted = "a GRU" if on_tensors else "nothing or traces"
         raise ValueError(
             f"{algo} goes on from dense layers without tanh at their end, {wanted} before them and "
             f"no older frames; (output, history, cells) of {policy.name} are {form}"
@@ -136,7 +139,8 @@ def started_by(policy: Policy, task: Task, layout: Sequence[Entry]) -> Start:
     form, told = _form_of(policy, task.algo), task.settings.get("policy_kwargs", {})
     if told != told | form:
         raise ValueError(f"{policy.name} is a network of {form}, and the settings say {told}")
-    if network.cells:
+    on_tensors = algorithm_of(task.algo).on_tensors
+    if on_tensors:
         cell = network.cells[0]
         arrays = dict(zip(_GRU, (getattr(cell, part) for part in PARTS), strict=True))
         layers = [f"layers.{2 * i}" for i in range(len(network.weights))]
@@ -146,7 +150,8 @@ def started_by(policy: Policy, task: Task, layout: Sequence[Entry]) -> Start:
     for layer, W, b in zip(layers, network.weights, network.biases, strict=True):
         arrays |= {f"{layer}.weight": W, f"{layer}.bias": b}
     tensors = {name: torch.tensor(x, dtype=torch.float32) for name, x in arrays.items()}
-    scaling = network.mean.tolist(), network.scale.tolist(), network.clip, None
+    read = network if on_tensors else network.dense
+    scaling = read.mean.tolist(), read.scale.tolist(), read.clip, None
     return Start(policy.name, {"policy": tensors}, {}, scaling, partial=True)
 
 
@@ -186,3 +191,26 @@ class Driver:
             memory[np.asarray(start, np.bool_)] = 0.0
         actions = self.network(np.asarray(obs, np.float64), memory)
         return np.clip(actions, -1.0, 1.0).astype(np.float32), memory
+
+
+class Begun:
+    """A policy that a training goes on from, and how.
+
+    start: of the model; driver: at the wheel as the policy is. PPO has no memory: traces, which
+    stay as they are, are part of its environments.
+
+    layout: of the task's observation. Raises what `started_by` raises.
+    """
+
+    def __init__(self, policy: Policy, task: Task, layout: Sequence[Entry]) -> None:
+        self.start, self._network = started_by(policy, task, layout), policy.network
+        self._apart = bool(policy.network.cells) and not algorithm_of(task.algo).on_tensors
+        self.driver = Driver(policy.network.dense if self._apart else policy.network)
+
+    def around(self, env: VectorEnv[Any, Any, Any]) -> VectorEnv[Any, Any, Any]:
+        """A vector env as the model sees it."""
+        return Remembered(env, self._network) if self._apart else env
+
+    def whole(self, network: Network) -> Network:
+        """The network of plain observations, of the model's."""
+        return self._network.ending(network) if self._apart else network

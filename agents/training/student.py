@@ -5,6 +5,7 @@ matrix of the teacher's design, over the cost of the episode: the score's logari
 """
 
 import itertools
+import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple
@@ -14,8 +15,9 @@ import numpy.typing as npt
 
 from ...envs.backend.extras import extra
 from ...envs.task.observation import Entry
-from ...estimators.learned.memory import Cell
+from ...estimators.learned.memory import Cell, Memory
 from ...estimators.learned.network import Network
+from .traces import TraceLayer
 
 with extra("train", "distillation needs torch"):
     import torch
@@ -78,14 +80,15 @@ class Course:
     """How a student learns.
 
     rounds: of driving and learning, the first one with the teacher at the wheel. epochs: passes
-    over all drives in a round, `LONGER` times as many in the last one. cells: of a GRU, 0 for a
-    student without memory. hidden: sizes of the dense layers. learning_rate: of Adam, falling to a
-    fiftieth in each round. noise: largest standard deviation of what shakes the teacher's actions.
-    seed: of weights and episodes. batch: episodes, for a student with memory. told: how much the
-    squared errors count of what its cells have to say, all that the teacher reads and the student
-    does not see, in standard deviations, where the errors of doing nothing count 1.
+    over all drives in a round, `LONGER` times as many in the last one. cells: of a GRU; traces:
+    bent units of `Traces`; neither for a student without memory. hidden: sizes of the dense layers.
+    learning_rate: of Adam, falling to a fiftieth in each round. noise: largest standard deviation
+    of what shakes the teacher's actions. seed: of weights and episodes. batch: episodes, for a
+    student with memory. told: how much the squared errors count of what a student with memory has
+    to say, all that the teacher reads and it does not see, in standard deviations, where the errors
+    of doing nothing count 1.
 
-    Raises ValueError for a number out of range, or something to tell without cells.
+    Raises ValueError for a number out of range, cells and traces, or something to tell without.
     """
 
     rounds: int = 7
@@ -97,15 +100,18 @@ class Course:
     seed: int = 0
     batch: int = 16
     told: float = 0.0
+    traces: int = 0
 
     def __post_init__(self) -> None:
         sizes = self.rounds, self.epochs, self.batch, *self.hidden
-        if min(sizes) < 1 or min(self.cells, self.seed) < 0:
+        if min(sizes) < 1 or min(self.cells, self.traces, self.seed) < 0:
             raise ValueError(f"rounds, epochs and sizes are 1 at least, cells and seed 0: {self}")
         if not (self.learning_rate > 0.0 and self.noise >= 0.0 and self.told >= 0.0):
             raise ValueError(f"learning_rate is above zero, noise and told not below: {self}")
-        if self.told and not self.cells:
-            raise ValueError("a student without cells has nothing to say: told is for those with")
+        if self.cells and self.traces:
+            raise ValueError(f"a student has cells or traces, got {self.cells} and {self.traces}")
+        if self.told and not (self.cells or self.traces):
+            raise ValueError("a student without memory has nothing to say: told is for those with")
 
     def described(self) -> dict[str, Any]:
         """All numbers but the seed, in JSON types."""
@@ -113,28 +119,38 @@ class Course:
         del found["seed"]
         return found
 
+    @property
+    def window(self) -> int:
+        """Steps through which the gradient goes back in time; through traces all of them."""
+        return sys.maxsize if self.traces else WINDOW
+
 
 class Student(nn.Module):
-    """A GRU, if there is one, and dense layers behind it, on mixed observations.
+    """A GRU or traces, if there are any, and dense layers behind, on mixed observations.
 
-    told: so many more numbers, linear in what the cells hold, are of use in training alone.
+    told: so many more numbers, linear in what the cells, or behind traces the last layer but one,
+    hold, are of use in training alone.
     """
 
     def __init__(self, inputs: int, width: int, course: Course, told: int = 0) -> None:
         super().__init__()
         self.cell = nn.GRU(inputs, course.cells, batch_first=True) if course.cells else None
-        sizes = [course.cells or inputs, *course.hidden, width]
+        self.traces = TraceLayer(inputs, course.traces) if course.traces else None
+        remembered = self.traces.size if self.traces else course.cells
+        sizes = [remembered or inputs, *course.hidden, width]
         self.dense = nn.ModuleList(nn.Linear(a, b) for a, b in itertools.pairwise(sizes))
-        self.tell = nn.Linear(course.cells, told) if course.told else None
-        self.recurrent = bool(course.cells)
+        self.tell = nn.Linear(course.cells or sizes[-2], told) if course.told else None
+        self.recurrent = bool(remembered)
 
     def forward(self, z: Any, state: Any = None) -> tuple[Any, Any]:
         """(actions and what is told (B, T, m + q), the next state) of inputs (B, T, k)."""
-        if self.cell is not None:
-            z, state = self.cell(z, state)
-        more = [] if self.tell is None else [self.tell(z)]
+        memory = self.cell or self.traces
+        if memory is not None:
+            z, state = memory(z, state)
+        held = z
         for layer in self.dense[:-1]:
             z = nn.functional.silu(layer(z))
+        more = [] if self.tell is None else [self.tell(held if self.cell else z)]
         return torch.cat([self.dense[-1](z), *more], dim=-1), state
 
     def network(self, scaling: Scaling) -> Network:
@@ -142,7 +158,13 @@ class Student(nn.Module):
         numbers = {name: value.detach().numpy().copy() for name, value in self.named_parameters()}
         names = ("weight_ih_l0", "weight_hh_l0", "bias_ih_l0", "bias_hh_l0")
         first = "cell.weight_ih_l0" if self.cell else "dense.0.weight"
-        numbers[first] = numbers[first] @ scaling.mixing
+        cells: list[Memory] = []
+        if self.traces:
+            cells.append(self.traces.cell(scaling.mixing))
+        else:
+            numbers[first] = numbers[first] @ scaling.mixing
+        if self.cell:
+            cells.append(Cell("gru", *(numbers[f"cell.{name}"] for name in names)))
         dense = range(len(self.dense))
         return Network(
             scaling.mean,
@@ -151,7 +173,7 @@ class Student(nn.Module):
             [numbers[f"dense.{i}.bias"] for i in dense],
             "silu",
             clip=CLIP,
-            cells=[Cell("gru", *(numbers[f"cell.{name}"] for name in names))] if self.cell else [],
+            cells=cells,
         )
 
 
@@ -188,10 +210,11 @@ class _Episodes:
     """Some episodes of a few lessons at once, cut into windows that the state goes through."""
 
     def __init__(self, drives: Sequence[Drives], scaling: Scaling, course: Course) -> None:
-        self.drives, self.scaling, self.batch = drives, scaling, course.batch
+        self.drives, self.scaling = drives, scaling
+        self.batch, self.window = course.batch, course.window
         self.everyone = [(i, j) for i, each in enumerate(drives) for j in range(len(each.costs))]
         longest = max(each.weights.shape[1] for each in drives)
-        self.most = -(-len(self.everyone) // self.batch) * -(-longest // WINDOW)
+        self.most = -(-len(self.everyone) // self.batch) * -(-longest // self.window)
 
     def __iter__(self) -> Iterator[Batch]:
         names = ("obs", "labels", "told", "weights")
@@ -208,8 +231,8 @@ class _Episodes:
                     array[row, :length] = getattr(self.drives[i], name)[j]
             S = torch.from_numpy(np.stack([self.drives[i].curvature for i, _ in rows]))
             arrays[0] = self.scaling.mixed(arrays[0])
-            for at in range(0, longest, WINDOW):
-                z, y, q, w = (torch.from_numpy(a[:, at : at + WINDOW]) for a in arrays)
+            for at in range(0, longest, self.window):
+                z, y, q, w = (torch.from_numpy(a[:, at : at + self.window]) for a in arrays)
                 yield z, y, q, w, S, at == 0
 
 

@@ -1,6 +1,6 @@
 """The bridge to stable-baselines3: its `VecEnv` over the native vector env, a call for all rows."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NoReturn
 
 import gymnasium as gym
@@ -21,6 +21,7 @@ with extra("train", "training needs torch and stable-baselines3"):
 
 Observations = npt.NDArray[np.float32]
 Indices = int | Iterable[int] | None
+Wrapping = Callable[[VectorEnv[Any, Any, Any]], VectorEnv[Any, Any, Any]]
 
 
 class _Nothing(dict[str, Any]):
@@ -171,18 +172,20 @@ def make_vec_env(
     env_kwargs: Mapping[str, Any] | None = None,
     monitor_file: str | None = None,
     info_keywords: Sequence[str] = (),
+    wrapper_class: Wrapping | None = None,
 ) -> VecMonitor:
     """As stable-baselines3's function of this name, on the native vector env.
 
     seed: of row 0; row i gets seed + i at the first reset. estimator: a name, or arguments of
     `EstimateObservation`. env_kwargs: of the environment. monitor_file: a CSV file of episodes,
-    with the `info_keywords` of their last step.
+    with the `info_keywords` of their last step. wrapper_class: called with the native vector env,
+    its estimator around it, gives what is bridged.
 
     Raises ValueError for an id without a native vector env, and what `gym.make_vec` and
     `EstimateObservation` raise.
     """
     env = make_native_env(env_id, num_envs, estimator, env_kwargs)
-    bridge = NativeVecEnv(env)
+    bridge = NativeVecEnv(env if wrapper_class is None else wrapper_class(env))
     bridge.action_space.seed(seed)
     bridge.seed(seed)
     return VecMonitor(bridge, monitor_file, tuple(info_keywords))

@@ -214,6 +214,9 @@ def distill_command(
     ] = None,
     batch: Annotated[int, typer.Option(help="Episodes, with a GRU.")] = 16,
     noise: Annotated[float, typer.Option(help="That shakes the teacher, at most.")] = 0.02,
+    traces: Annotated[
+        int, typer.Option(min=0, help="Bent units whose running means it reads, instead of a GRU.")
+    ] = 0,
     told: Annotated[
         float, typer.Option(help="Weight of what the teacher reads, as its GRU estimates it.")
     ] = 0.0,
@@ -229,7 +232,9 @@ def distill_command(
     target, console = out or Path(f"{name}.safetensors"), Console()
     check_files(policy=target)
     sizes = tuple(hidden or (64, 64))
-    course = Course(rounds, epochs, cells, sizes, noise=noise, seed=seed, batch=batch, told=told)
+    course = Course(
+        rounds, epochs, cells, sizes, noise=noise, seed=seed, batch=batch, told=told, traces=traces
+    )
     about = {"class": kind, "teacher": teacher, "cars": cars, "varied": varied}
     about |= course.described()
     options = {"algorithm": "distill", "algorithm_options": about, "seeds": {"training": seed}}

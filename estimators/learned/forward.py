@@ -13,7 +13,7 @@ import numpy.typing as npt
 from ...envs.backend.decorators import counted, jit
 from ...envs.backend.elementary import clip, exp
 from ...envs.backend.primitives import maximum, minimum
-from .memory import GATES, PARTS, Array, Cell
+from .memory import Array, Memory
 
 ACTIVATIONS = ("tanh", "relu", "elu", "leaky-relu", "silu")
 OUTPUTS = ("tanh", "linear")
@@ -25,8 +25,8 @@ class Packed(NamedTuple):
     """A network as compiled code takes it.
 
     mean, scale: of a frame, or of the stack. clip: infinite for none. inputs: of a frame. history:
-    frames. cells: (k, 2) gates and size of each. sizes: of the dense layers, inputs first.
-    activation, output: places in their tuples. numbers: of each cell and layer in turn, weights
+    frames. cells: (k, 4) the form of each. sizes: of the dense layers, inputs first. activation,
+    output: places in their tuples. numbers: of each cell and layer in turn; a layer's are weights
     (inputs, outputs) row by row, then biases.
     """
 
@@ -45,7 +45,7 @@ class Packed(NamedTuple):
 def packed(
     scaling: tuple[Array, Array, float | None],
     history: int,
-    cells: Sequence[Cell],
+    cells: Sequence[Memory],
     layers: Sequence[tuple[Array, Array]],
     activation: str,
     output: str,
@@ -53,19 +53,19 @@ def packed(
     """scaling: mean, scale and clip. layers: weights (outputs, inputs) and biases of each."""
     mean, scale, most = scaling
     first = cells[0].weight_in if cells else layers[0][0]
-    arrays = [getattr(cell, name) for cell in cells for name in PARTS]
-    arrays += [part for layer in layers for part in layer]
+    numbers = [cell.numbers for cell in cells]
+    numbers += [part.T.ravel() for layer in layers for part in layer]
     return Packed(
         mean,
         scale,
         np.inf if most is None else float(most),
         first.shape[1] // history,
         history,
-        np.array([(GATES[each.kind], each.size) for each in cells], np.int64).reshape(-1, 2),
+        np.array([each.form for each in cells], np.int64).reshape(-1, 4),
         np.array([layers[0][0].shape[1], *(len(b) for _, b in layers)], np.int64),
         ACTIVATIONS.index(activation),
         OUTPUTS.index(output),
-        np.concatenate([each.T.ravel() for each in arrays]),
+        np.concatenate(numbers),
     )
 
 
@@ -147,6 +147,24 @@ def _in_turn(z: Any, h: Any, numbers: Any, at: int, taken: Any, held: Any) -> in
 
 
 @counted
+def _traced(z: Any, m: Any, form: Any, numbers: Any, at: int) -> Any:
+    """(a step of `Traces`, the place behind); m: steps so far and means, updated."""
+    units, times = form[1], form[3]
+    out = np.empty(units * (1 + times))
+    end = _sums(z, numbers, at + times, out[:units])
+    for i in range(units - form[2], units):
+        out[i] = _bent(out[i], SILU)
+    m[0] += 1.0
+    for j in range(times):
+        share = maximum(numbers[at + j], 1.0 / m[0])
+        for i in range(units):
+            k = j * units + i
+            m[1 + k] += share * (out[i] - m[1 + k])
+            out[units + k] = m[1 + k]
+    return out, end
+
+
+@counted
 def forward(net: Any, x: Any, state: Any, out: Any) -> None:
     """out (N, width) of observations x (N, inputs); state (N, memory) is updated."""
     k, stacked, last = net.inputs, net.inputs * net.history, len(net.sizes) - 1
@@ -168,9 +186,14 @@ def forward(net: Any, x: Any, state: Any, out: Any) -> None:
         number, at = 0, frames
         for c in range(len(net.cells)):
             gates, size = net.cells[c, 0], net.cells[c, 1]
-            wide = size * (gates - 2)
-            number = _cell(z, m[at : at + wide], gates, net.numbers, number)
-            z, at = m[at : at + size].copy(), at + wide
+            if gates == 0:
+                wide = 1 + size * net.cells[c, 3]
+                z, number = _traced(z, m[at : at + wide], net.cells[c], net.numbers, number)
+            else:
+                wide = size * (gates - 2)
+                number = _cell(z, m[at : at + wide], gates, net.numbers, number)
+                z = m[at : at + size].copy()
+            at += wide
         for layer in range(last):
             y = np.empty(net.sizes[layer + 1])
             number = _sums(z, net.numbers, number, y)

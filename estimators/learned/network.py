@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from .forward import ACTIVATIONS as ACTIVATIONS
 from .forward import OUTPUTS, Packed, forward, packed
-from .memory import PARTS, Array, Cell
+from .memory import Array, Memory
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +36,7 @@ class Network:
     output: str = "linear"
     clip: float | None = None
     history: int = 1
-    cells: Sequence[Cell] = ()
+    cells: Sequence[Memory] = ()
 
     def __post_init__(self) -> None:
         for name in ("mean", "scale"):
@@ -87,7 +87,7 @@ class Network:
     def _check_numbers(self) -> None:
         arrays = {"mean": self.mean, "scale": self.scale}
         for i, cell in enumerate(self.cells):
-            arrays |= {f"{name} of cell {i}": getattr(cell, name) for name in PARTS}
+            arrays |= {f"{name} of cell {i}": getattr(cell, name) for name in cell.parts}
         for i, (W, b) in enumerate(zip(self.weights, self.biases, strict=True)):
             arrays |= {f"the weights of layer {i}": W, f"the biases of layer {i}": b}
         for name, values in arrays.items():
@@ -144,6 +144,27 @@ class Network:
         scaling, kinds = (self.mean, self.scale, self.clip), (self.activation, self.output)
         layers = list(zip(self.weights, self.biases, strict=True))
         return packed(scaling, self.history, self.cells, layers, *kinds)
+
+    @property
+    def dense(self) -> "Network":
+        """Behind cells the dense layers alone, as a network of what these give; else itself."""
+        if not self.cells:
+            return self
+        width = self.weights[0].shape[1]
+        plain = np.zeros(width), np.ones(width)
+        return replace(self, mean=plain[0], scale=plain[1], clip=None, history=1, cells=())
+
+    def ending(self, dense: "Network") -> "Network":
+        """The same network with other dense layers, those of a network of what they read."""
+        layers = replace(self, weights=dense.weights, biases=dense.biases)
+        return replace(layers, activation=dense.activation, output=dense.output)
+
+    def remembered(self, x: Array, state: Array) -> Array:
+        """(N, k) what the first dense layer reads, arguments as of a call."""
+        before = self._packed._replace(sizes=self._packed.sizes[:1])
+        out = np.empty((len(x), int(before.sizes[0])))
+        forward(before, x, state, out)
+        return out
 
     def __call__(self, x: Array, state: Array | None = None) -> Array:
         """(N, width) of observations (N, inputs).

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from safetensors import SafetensorError, safe_open
 
-from .memory import GATES, PARTS, Cell, cell_shapes
+from .memory import GATES, PARTS, Cell, Memory, Traces, cell_shapes
 from .network import Network
 
 MOST_BYTES = 2**26
@@ -58,8 +58,14 @@ def architecture_of(network: Network) -> dict[str, Any]:
         clip=network.clip,
         action_width=network.width,
         history=network.history,
-        cells=[[cell.kind, cell.size] for cell in network.cells],
+        cells=[_described(cell) for cell in network.cells],
     )
+
+
+def _described(cell: Memory) -> list[Any]:
+    if isinstance(cell, Traces):
+        return [cell.kind, len(cell.bias_in), cell.bent, list(cell.times)]
+    return [cell.kind, cell.size]
 
 
 def network_of(fields: Any, inputs: int, tensors: Tensors) -> Network:
@@ -76,7 +82,10 @@ def network_of(fields: Any, inputs: int, tensors: Tensors) -> Network:
     if not sizes or not all(type(size) is int and size > 0 for size in (*sizes, history)):
         raise ValueError(f"the card's layer sizes are positive integers, got {fields!r}")
     if not (isinstance(cells, list) and all(map(_is_cell, cells))):
-        raise ValueError(f"the card's cells are pairs of {', '.join(GATES)} and a size: {cells!r}")
+        raise ValueError(
+            f"the card's cells are pairs of {', '.join(GATES)} and a size, or {Traces.kind} with "
+            f"units, how many are bent, and times: {cells!r}"
+        )
     if not (clip is None or type(clip) in (int, float)):
         raise ValueError(f"clip is above zero or None, got {clip!r}")
     _check_tensors(tensors, _shapes(inputs, history, cells, sizes))
@@ -89,34 +98,42 @@ def network_of(fields: Any, inputs: int, tensors: Tensors) -> Network:
         str(fields["output"]),
         clip,
         history,
-        [
-            Cell(kind, *(tensors[f"cell_{i}_{part}"] for part in PARTS))
-            for i, (kind, _) in enumerate(cells)
-        ],
+        [_memory(f"cell_{i}_", *cell, tensors=tensors) for i, cell in enumerate(cells)],
     )
 
 
-def _is_cell(pair: Any) -> bool:
-    return (
-        isinstance(pair, list)
-        and len(pair) == 2
-        and pair[0] in tuple(GATES)
-        and type(pair[1]) is int
-        and pair[1] > 0
-    )
+def _is_cell(cell: Any) -> bool:
+    if not isinstance(cell, list) or not cell:
+        return False
+    kind, *numbers = cell
+    if kind == Traces.kind and len(numbers) == 3 and isinstance(numbers[2], list):
+        times = numbers.pop()
+        return all(type(each) is int for each in numbers) and (
+            all(type(each) in (int, float) for each in times)
+        )
+    return kind in tuple(GATES) and len(numbers) == 1 and type(numbers[0]) is int and numbers[0] > 0
+
+
+def _memory(prefix: str, kind: str, _: int, *traces: Any, tensors: Tensors) -> Memory:
+    parts = Traces.parts if traces else PARTS
+    arrays: list[Any] = [tensors[prefix + part] for part in parts]
+    return Traces(*arrays, *traces) if traces else Cell(kind, *arrays)
 
 
 _Shapes = dict[str, tuple[tuple[int, ...], ...]]
 
 
-def _shapes(inputs: int, history: int, cells: list[tuple[str, int]], sizes: list[int]) -> _Shapes:
+def _shapes(inputs: int, history: int, cells: list[Any], sizes: list[int]) -> _Shapes:
     """The shapes that each tensor may have."""
     wide = inputs * history
     shapes: _Shapes = dict.fromkeys(("mean", "scale"), ((inputs,), (wide,)))
-    for i, (kind, size) in enumerate(cells):
-        own = cell_shapes(kind, size, wide)
+    for i, (kind, size, *traces) in enumerate(cells):
+        if traces:
+            own = dict(zip(Traces.parts, ((size, wide), (size,)), strict=True))
+        else:
+            own = cell_shapes(kind, size, wide)
         shapes |= {f"cell_{i}_{part}": (shape,) for part, shape in own.items()}
-        wide = size
+        wide = size * (1 + len(traces[1])) if traces else size
     for i, size in enumerate(sizes):
         shapes |= {f"weight_{i}": ((size, wide),), f"bias_{i}": ((size,),)}
         wide = size
@@ -142,7 +159,7 @@ def tensors_of(network: Network) -> Tensors:
     """What a file holds of a network."""
     tensors: Tensors = {"mean": network.mean, "scale": network.scale}
     for i, cell in enumerate(network.cells):
-        for part in PARTS:
+        for part in cell.parts:
             tensors[f"cell_{i}_{part}"] = np.ascontiguousarray(getattr(cell, part), np.float32)
     for i, (W, b) in enumerate(zip(network.weights, network.biases, strict=True)):
         tensors[f"weight_{i}"] = np.ascontiguousarray(W, np.float32)

@@ -183,6 +183,18 @@ BAD: dict[str, tuple[Callable[[Any, Any, Any], Any], str]] = {
     "cells": (lambda t, m, c: c["network"].update(cells=[["rnn", 3]]), "pairs of gru, lstm and"),
     "cell of no size": (lambda t, m, c: c["network"].update(cells=[["gru", -3]]), "pairs of gru"),
     "cell of text": (lambda t, m, c: c["network"].update(cells="gru"), "pairs of gru"),
+    "traces without times": (
+        lambda t, m, c: c["network"].update(cells=[["traces", 5, 2]]),
+        "or traces with units, how many are bent, and times",
+    ),
+    "traces of text": (
+        lambda t, m, c: c["network"].update(cells=[["traces", 5, 2, ["3"]]]),
+        "or traces with units",
+    ),
+    "no traces' tensors": (
+        lambda t, m, c: c["network"].update(cells=[["traces", 5, 2, [3, 10.0]]]),
+        r"missing tensors: \['cell_0_bias_in', 'cell_0_weight_in'\]",
+    ),
     "no cell's tensors": (
         lambda t, m, c: c["network"].update(cells=[["gru", 3]]),
         r"missing tensors: \['cell_0_bias_in'",

@@ -184,6 +184,8 @@ def test_a_training_that_diverges_stops_with_the_step_and_leaves_the_last_good_f
         ({"told": -1.0}, "noise and told not below"),
         ({"batch": 0}, "1 at least"),
         ({"told": 1.0, "cells": 0}, "nothing to say"),
+        ({"traces": -1}, "cells and seed 0"),
+        ({"traces": 4, "cells": 3}, "cells or traces, got 3 and 4"),
     ],
 )
 def test_a_course_out_of_range_is_refused(wrong: dict[str, Any], message: str) -> None:

@@ -1,0 +1,85 @@
+"""PPO goes on from a policy with traces: they are part of its environments, and stay."""
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+pytest.importorskip("stable_baselines3")
+import torch
+
+from sideslip.agents.learned.card import Card
+from sideslip.agents.learned.files import Policy, load_policy
+from sideslip.agents.rollout import costs_of
+from sideslip.agents.training.keeper import BEGUN_WITH, Means, evaluation_seeds
+from sideslip.agents.training.remembered import Remembered
+from sideslip.agents.training.starts import Driver, task_from
+from sideslip.agents.training.student import Course, Scaling, Student
+from sideslip.agents.training.train import train
+
+ID = "sideslip/YawFusion-v0"
+OPTIONS: dict[str, Any] = {"vehicle": "coms", "nominal": "coms", "reference": "zero-slip"}
+OPTIONS |= {"scenario": {"base": "coms-slalom", "duration": 0.3}}
+STEPS = 30  # of an episode
+
+
+def cars(count: int) -> Any:
+    return gym.make_vec(ID, num_envs=count, autoreset_mode="SameStep", info="ends", **OPTIONS)
+
+
+@pytest.fixture(scope="module")
+def policy() -> Policy:
+    """Random weights: it acts in some way that what is remembered decides."""
+    torch.manual_seed(0)
+    card, rng = Card.of(ID, OPTIONS), np.random.default_rng(0)
+    wide = len(card.observation)
+    scaling = Scaling(rng.normal(size=wide), np.full(wide, 0.3), np.eye(wide))
+    student = Student(wide, 1, Course(traces=6, hidden=(8, 4)))
+    return Policy("traced", student.network(scaling), card)
+
+
+def test_an_observation_is_what_is_remembered_across_episodes(policy: Policy) -> None:
+    """The last one of an episode too, which the row's next episode does not see."""
+    bare, env = cars(3), Remembered(cars(3), policy.network)
+    state = np.zeros((3, policy.network.memory))
+    seen, (obs, _) = bare.reset(seed=5)[0], env.reset(seed=5)
+    ended = 0
+    for step in range(1, 2 * STEPS + 3):
+        assert obs == pytest.approx(policy.network.remembered(seen.astype(float), state), abs=1e-5)
+        action = np.full((3, 1), 0.1, np.float32)
+        seen, _, _, over, bares = bare.step(action)
+        obs, _, _, same, infos = env.step(action)
+        assert np.array_equal(over, same) and obs in env.observation_space
+        if over.any():
+            last = np.stack(bares["final_obs"][over]).astype(float)
+            theirs = policy.network.remembered(last, state[over].copy())
+            assert np.stack(infos["final_obs"][over]) == pytest.approx(theirs, abs=1e-5)
+            state[over], ended = 0.0, ended + 1
+            assert step % STEPS == 0
+    assert ended == 2
+    env.reset(seed=5)
+    first = policy.network.remembered(bare.reset(seed=5)[0].astype(float), 0.0 * state)
+    assert env.reset(seed=5)[0] == pytest.approx(first, abs=1e-5)
+
+
+def test_ppo_goes_on_behind_the_traces(policy: Policy, tmp_path: Path) -> None:
+    settings = task_from(policy).settings | {"n_steps": 8, "batch_size": 16, "n_epochs": 1}
+    task = task_from(policy, settings=settings, num_envs=4, n_eval_envs=4)
+    found = train(task, 64, tmp_path, means=Means(eval_freq=64), trained_agent=policy)
+    assert found.evaluations[0].of_start == pytest.approx(1.0, abs=1e-6)
+    kept = load_policy(tmp_path / "policy.safetensors").network
+    for part in ("weight_in", "bias_in"):
+        assert np.array_equal(*(getattr(each.cells[0], part) for each in (kept, policy.network)))
+    assert np.array_equal(kept.mean, policy.network.mean)
+    seeds = evaluation_seeds(4)
+    costs = costs_of(task.vector_env(4), Driver(kept), seeds)
+    theirs = costs_of(Remembered(task.vector_env(4), policy.network), found.model, seeds)
+    last = found.best is found.evaluations[-1]
+    assert (costs == pytest.approx(theirs, rel=1e-5)) is last
+    layer: Any = found.model.policy.action_net
+    moved = np.abs(layer.weight.detach().numpy() - policy.network.weights[-1])
+    assert moved.max() > 1e-5 and (tmp_path / BEGUN_WITH).exists()
+    again = train(task, 96, tmp_path, resume=True)
+    assert again.evaluations[:2] == found.evaluations and len(again.evaluations) == 3
