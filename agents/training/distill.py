@@ -167,6 +167,7 @@ def distill(
         steps += sum(int((each.weights > 0.0).sum()) for each in fresh)
         if scaling is None:
             scaling = scaling_of(fresh, cars.layout, lessons[0].teacher.needs)
+            model.whiten(fresh, scaling)
             usual = [float(np.median(each.costs)) for each in fresh]
             told = np.concatenate([each.told[each.weights > 0.0] for each in fresh])
             middle, spread = told.mean(0), told.std(0)

@@ -18,7 +18,7 @@ from gymnasium.vector import VectorEnv
 
 from ...envs.backend.extras import extra
 from ..env_facts import layout_of
-from .student import whitening
+from .traces.mixing import whitening
 
 with extra("train", "training needs {}"):
     import torch

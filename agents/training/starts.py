@@ -15,8 +15,8 @@ from ..learned.files import Policy
 from .algorithms import BEGUN, Settings, algorithm_of, settings_of
 from .export import normalisation
 from .normalise import Scaling
-from .remembered import Remembered
 from .task import Task
+from .traces.remembered import Remembered
 from .zips import check_zip, normaliser_of, unpickled
 
 import torch  # isort: skip  # after ours, which say which extra is missing

@@ -17,7 +17,8 @@ from ...envs.backend.extras import extra
 from ...envs.task.observation import Entry
 from ...estimators.learned.memory import Cell, Memory
 from ...estimators.learned.network import Network
-from .traces import TraceLayer
+from .traces.layer import TraceLayer
+from .traces.mixing import whitening
 
 with extra("train", "distillation needs torch"):
     import torch
@@ -153,6 +154,11 @@ class Student(nn.Module):
         more = [] if self.tell is None else [self.tell(held if self.cell else z)]
         return torch.cat([self.dense[-1](z), *more], dim=-1), state
 
+    def whiten(self, drives: Sequence[Drives], scaling: Scaling) -> None:
+        """Mix what traces hold plain, so that nothing of it is correlated on these drives."""
+        if self.traces is not None:
+            self.traces.whiten([(scaling.mixed(each.obs), each.weights > 0.0) for each in drives])
+
     def network(self, scaling: Scaling) -> Network:
         """The same function of plain observations, by NumPy."""
         numbers = {name: value.detach().numpy().copy() for name, value in self.named_parameters()}
@@ -161,6 +167,8 @@ class Student(nn.Module):
         cells: list[Memory] = []
         if self.traces:
             cells.append(self.traces.cell(scaling.mixing))
+            layer = [numbers[f"dense.0.{part}"] for part in ("weight", "bias")]
+            numbers["dense.0.weight"], numbers["dense.0.bias"] = self.traces.behind(*layer)
         else:
             numbers[first] = numbers[first] @ scaling.mixing
         if self.cell:
@@ -189,12 +197,6 @@ def scaling_of(drives: Sequence[Drives], layout: Sequence[Entry], needs: Sequenc
     mean, spread = seen.mean(0, np.float64), seen.std(0, dtype=np.float64)
     scale = np.where(there & (spread > 1e-9), 1.0 / np.maximum(spread, 1e-9), 0.0)
     return Scaling(mean, scale, whitening(normalised(seen, mean, scale), _LEAST))
-
-
-def whitening(z: Array | Single, least: float) -> Array:
-    """(k, k) what makes the covariance of z (n, k) one; a smaller eigenvalue counts as `least`."""
-    sizes, axes = np.linalg.eigh(np.cov(z, rowvar=False))
-    return np.asarray(axes / np.sqrt(np.maximum(sizes, least)) @ axes.T)
 
 
 def normalised(obs: Single, mean: Array, scale: Array) -> Single:

@@ -15,8 +15,8 @@ from sideslip.estimators.learned.network import Network
 pytest.importorskip("torch")
 import torch
 
-from sideslip.agents.training.student import Course, Scaling, Student
-from sideslip.agents.training.traces import TraceLayer
+from sideslip.agents.training.student import Course, Drives, Scaling, Student
+from sideslip.agents.training.traces.layer import TraceLayer
 
 CARD = Card.of("sideslip/YawVision-v0")
 WIDE, RNG = len(CARD.observation), np.random.default_rng(0)
@@ -88,6 +88,7 @@ def test_the_network_is_torchs(cut: int) -> None:
     mixing = np.eye(5) + 0.3 * np.ones((5, 5))
     scaling = Scaling(rng.normal(size=5), rng.uniform(0.5, 2.0, 5), mixing)
     x = rng.normal(size=(3, 150, 5)).astype(np.float32)
+    student.whiten([drives_of(x)], scaling)
     z, net = torch.from_numpy(scaling.mixed(x)), student.network(scaling)
     first, between = student(z[:, :cut])
     parts = [first] + ([student(z[:, cut:], between)[0]] if cut < 150 else [])
@@ -96,13 +97,38 @@ def test_the_network_is_torchs(cut: int) -> None:
     assert np.abs(ours - theirs).max() < 1e-6 < np.abs(np.diff(ours, axis=1)).max()
 
 
+def drives_of(x: np.ndarray) -> Drives:
+    """Of which one is over early: what it shows then is not counted."""
+    weights = np.ones(x.shape[:2], np.float32)
+    weights[0, 100:] = 0.0
+    return Drives(x, x[..., :2], x[..., :0], weights, np.eye(2, dtype=np.float32), np.ones(len(x)))
+
+
+def test_what_is_plain_goes_on_without_correlation() -> None:
+    """Where a first input moves slowly: its short means are nearly one number."""
+    rng = np.random.default_rng(1)
+    x = rng.normal(size=(40, 300, 3)).astype(np.float32)
+    x[..., 0] = x[..., 0].cumsum(1) / 10.0
+    scaling = Scaling(x.mean((0, 1)), 1.0 / x.std((0, 1)), np.eye(3))
+    student, z = Student(3, 1, Course(traces=4)), torch.from_numpy(scaling.mixed(x))
+    layer: Any = student.traces
+    there = drives_of(x).weights > 0.0
+    before = layer(z)[0].detach().numpy()[there][:, :18]
+    student.whiten([drives_of(x)], scaling)
+    mixed = layer(z)[0].detach().numpy()[there][:, :18]
+    assert np.abs(np.corrcoef(before.T) - np.eye(18)).max() > 0.99
+    assert np.cov(mixed.T) == pytest.approx(np.eye(18), abs=0.3)  # what hardly varies less
+    assert mixed.mean(0) == pytest.approx(0.0, abs=0.05)
+    Student(3, 1, Course()).whiten([], scaling)  # nothing remembered, nothing to mix
+
+
 def test_the_slope_reaches_the_first_step() -> None:
     """Which the last mean holds as much of as of any other."""
     layer, z = TraceLayer(2, 3, (3, 1000)), torch.randn(1, 120, 2, requires_grad=True)
-    units, traced = layer(z)[0][0, -1].split([5, 10])
-    (slope,) = torch.autograd.grad(traced[5], z)
+    last = layer(z)[0][0, -1]  # two inputs with two means of each, then the same of three units
+    (slope,) = torch.autograd.grad(last[4], z)
     assert slope[0, :, 0].numpy() == pytest.approx(1.0 / 120.0, rel=1e-4)
-    assert torch.equal(units[:2], z[0, -1])
+    assert torch.equal(last[:2], z[0, -1]) and layer.size == len(last) == 15
 
 
 def test_a_file_holds_the_traces(tmp_path: Path) -> None:

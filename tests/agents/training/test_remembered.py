@@ -14,9 +14,9 @@ from sideslip.agents.learned.card import Card
 from sideslip.agents.learned.files import Policy, load_policy
 from sideslip.agents.rollout import costs_of
 from sideslip.agents.training.keeper import BEGUN_WITH, Means, evaluation_seeds
-from sideslip.agents.training.remembered import Remembered
 from sideslip.agents.training.starts import Driver, task_from
 from sideslip.agents.training.student import Course, Scaling, Student
+from sideslip.agents.training.traces.remembered import Remembered
 from sideslip.agents.training.train import train
 
 ID = "sideslip/YawFusion-v0"

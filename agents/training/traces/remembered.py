@@ -6,8 +6,8 @@ import numpy as np
 from gymnasium.vector import VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
-from ...envs.task.observation import Entry, space_of
-from ...estimators.learned.network import Network
+from ....envs.task.observation import Entry, space_of
+from ....estimators.learned.network import Network
 
 
 class Remembered(VectorWrapper[Any, Any, Any, Any, Any]):

@@ -1,0 +1,109 @@
+"""Running means by torch, for training: `Traces` of the runtime, whole episodes at once."""
+
+import functools
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ....envs.backend.extras import extra
+from ....estimators.learned.memory import Array, Traces
+from .mixing import whitening
+
+with extra("train", "training needs torch"):
+    import torch
+    from torch import nn
+
+TIMES = (3, 10, 30, 100, 300)
+"""Steps of the means: of control periods of 10 ms from the motors' lag to half a drive."""
+_BLOCK = 50  # steps whose means are one product of matrices
+_APART = 7  # steps, of those by which means are mixed
+_SMALL = 1e-4  # variance, of what varies by 1, that a mixture of means has at least
+_LEAST = 1e-300  # instead of nothing: what a first step leaves of what was before
+
+
+class TraceLayer(nn.Module):
+    """The inputs and so many bent units, with the means of all.
+
+    inputs: as many units are plain: the inputs themselves. bent: units of a layer of SiLU. What is
+    plain and its means go on mixed, less `mean` times `mixing`: what tells most, as how a sensor
+    changes, is the small difference of two of them.
+    """
+
+    def __init__(self, inputs: int, bent: int, times: Sequence[float] = TIMES) -> None:
+        super().__init__()
+        self.inputs, self.times = inputs, tuple(times)
+        self.unit = nn.Linear(inputs, bent)
+        plain = inputs * (1 + len(self.times))
+        self.mean: torch.Tensor
+        self.register_buffer("mean", torch.zeros(plain))
+        self.mixing: torch.Tensor
+        self.register_buffer("mixing", torch.eye(plain))
+
+    @property
+    def size(self) -> int:
+        """Numbers of the output: of the plain units and their means, then of the bent ones."""
+        return (self.inputs + self.unit.out_features) * (1 + len(self.times))
+
+    def forward(self, z: Any, state: Any = None) -> tuple[Any, Any]:
+        """(units and means (B, T, size), the next state) of inputs (B, T, k), all of one age.
+
+        state: (B, times, units + 1) means, and steps so far; None where episodes begin.
+        """
+        u = torch.cat([z, nn.functional.silu(self.unit(z))], -1)
+        if state is None:
+            state = u.new_zeros(len(u), len(self.times), u.shape[-1] + 1)
+        first, means, found = int(state[0, 0, -1]), state[..., :-1], []
+        for part in torch.split(u, _BLOCK, 1):
+            new, old = _weights(self.times, first, part.shape[1])
+            each = torch.einsum("nts,bsk->bntk", new, part) + old[..., None] * means[:, :, None]
+            found.append(each)
+            first, means = first + part.shape[1], each[:, :, -1]
+        all_of = torch.cat([u[:, None], torch.cat(found, 2)], 1).transpose(1, 2)
+        plain, bent = (each.flatten(2) for each in all_of.tensor_split([self.inputs], -1))
+        age = means.new_full((*means.shape[:-1], 1), float(first))
+        mixed = (plain - self.mean) @ self.mixing
+        return torch.cat([mixed, bent], -1), torch.cat([means, age], -1)
+
+    def whiten(self, seen: Sequence[tuple[Any, Any]]) -> None:
+        """Mix by what the plain part is on inputs (B, T, k) where a mask (B, T) says so."""
+        with torch.no_grad():
+            found = [
+                self(torch.from_numpy(z))[0][..., : len(self.mean)][torch.from_numpy(there)][
+                    ::_APART
+                ]
+                for z, there in seen
+            ]
+        plain = torch.cat(found).numpy()
+        self.mean.copy_(torch.from_numpy(plain.mean(0)))
+        self.mixing.copy_(torch.from_numpy(whitening(plain, _SMALL)))
+
+    def cell(self, mixing: Array) -> Traces:
+        """The units of inputs that are mixed first, (k, k), by NumPy."""
+        bent = self.unit.weight.detach().numpy() @ mixing
+        bias = np.concatenate([np.zeros(self.inputs), self.unit.bias.detach().numpy()])
+        return Traces(np.concatenate([mixing, bent]), bias, self.unit.out_features, self.times)
+
+    def behind(self, weight: Array, bias: Array) -> tuple[Array, Array]:
+        """Weights (m, size) and biases (m,) of the next layer for what `cell` gives: time by time,
+        plain units before bent ones, not mixed."""
+        size, times = len(self.mean), 1 + len(self.times)
+        plain = weight[:, :size] @ self.mixing.numpy().astype(np.float64).T
+        bias = bias - plain @ self.mean.numpy()
+        parts = [each.reshape(len(bias), times, -1) for each in (plain, weight[:, size:])]
+        return np.concatenate(parts, -1).reshape(len(bias), -1), bias
+
+
+@functools.cache
+def _weights(times: tuple[float, ...], first: int, steps: int) -> tuple[Any, Any]:
+    """What each step of a block counts for in the means of each, (times, T, T), and what was
+    before, (times, T); first: steps before the block."""
+    ages = first + 1.0 + np.arange(steps)
+    shares = np.maximum(1.0 / ages, -np.expm1(-1.0 / np.array(times))[:, None])
+    left = np.log(np.maximum(1.0 - shares, _LEAST)).cumsum(-1)
+    since = left[:, :, None] - left[:, None, :]
+    new = np.tril(np.exp(np.minimum(since, 0.0))) * shares[:, None, :]
+    return (
+        torch.from_numpy(new.astype(np.float32)),
+        torch.from_numpy(np.exp(left).astype(np.float32)),
+    )
