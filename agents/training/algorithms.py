@@ -42,6 +42,7 @@ Settings = dict[str, Any]
 HYPERPARAMS = Path(__file__).parent / "hyperparams"
 PERIOD = 0.01  # s, of control: of the environments whose discount stands in the files
 BEGUN = "begun"  # the entry of a training that goes on from a policy
+BEGUN_TRACES = "begun-traces"  # from one with traces
 EVENLY = -0.55  # log of the deviation of actions drawn evenly
 
 _OF_TRAINING = ("n_timesteps", "n_envs", "policy", "normalize")

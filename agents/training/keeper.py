@@ -13,7 +13,6 @@ import numpy as np
 from ... import __version__
 from ...envs.backend.files import whole, write_whole
 from ...envs.record import Array
-from ..env_facts import layout_of
 from ..learned.card import Card
 from ..learned.files import Policy, save_policy
 from ..rollout import cost_ratios, costs_of
@@ -133,7 +132,7 @@ class Keeper(BaseCallback):
         self.tested = task.vector_env(task.n_eval_envs)
         self.begun_with, self.begun = begun_with, None
         if begun_with is not None:
-            self.begun = Begun(begun_with, task, layout_of(self.tested))
+            self.begun = Begun(begun_with, task, self.tested, _SCALING + task.seed)
             self.tested = self.begun.around(self.tested)
         base: Any = self.tested.unwrapped
         self.period: float = base.control_period * base.dt  # s

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,12 +12,13 @@ from gymnasium.vector import VectorEnv
 from ...envs.task.observation import Entry
 from ...estimators.learned.memory import PARTS, Traces
 from ...estimators.learned.network import Network
+from ..env_facts import layout_of
 from ..learned.files import Policy
-from .algorithms import BEGUN, Settings, algorithm_of, settings_of
+from .algorithms import BEGUN, BEGUN_TRACES, Settings, algorithm_of, settings_of
 from .export import normalisation
 from .normalise import Scaling
 from .task import Task
-from .traces.remembered import Remembered
+from .traces.remembered import Remembered, mixing_of
 from .zips import check_zip, normaliser_of, unpickled
 
 import torch  # isort: skip  # after ours, which say which extra is missing
@@ -86,7 +88,7 @@ def task_from(policy: Policy, **fields: Any) -> Task:
     own: dict[str, Any] = {"env_id": card.env_id, "env_options": options, "scenarios": scenarios}
     if fields.get("estimator", card.estimator) == card.estimator:
         own |= {"estimator": card.estimator, "estimator_options": dict(card.estimator_options)}
-    settings = fields.pop("settings", None) or settings_of(algo, BEGUN)
+    settings = fields.pop("settings", None) or settings_of(algo, _entry(policy))
     own["settings"] = _formed(settings, policy, algo)
     return Task(**own | fields)
 
@@ -96,7 +98,12 @@ def settings_in(file: str | Path | None, algo: str, env_id: str, start: Any) -> 
     policy, of going on from it, with its form. Raises as `settings_of` and `task_from`."""
     if not isinstance(start, Policy):
         return settings_of(algo, env_id, file)
-    return _formed(settings_of(algo, BEGUN, file), start, algo)
+    return _formed(settings_of(algo, _entry(start), file), start, algo)
+
+
+def _entry(policy: Policy) -> str:
+    """The settings of going on from it."""
+    return BEGUN_TRACES if Traces.kind in [cell.kind for cell in policy.network.cells] else BEGUN
 
 
 def _formed(settings: Settings, policy: Policy, algo: str) -> Settings:
@@ -197,20 +204,28 @@ class Begun:
     """A policy that a training goes on from, and how.
 
     start: of the model; driver: at the wheel as the policy is. PPO has no memory: traces, which
-    stay as they are, are part of its environments.
+    stay as they are, are part of its environments, mixed as the policy's own drives show them.
 
-    layout: of the task's observation. Raises what `started_by` raises.
+    env: of the task, without them. seed: of those drives. Raises what `started_by` raises.
     """
 
-    def __init__(self, policy: Policy, task: Task, layout: Sequence[Entry]) -> None:
-        self.start, self._network = started_by(policy, task, layout), policy.network
-        self._apart = bool(policy.network.cells) and not algorithm_of(task.algo).on_tensors
-        self.driver = Driver(policy.network.dense if self._apart else policy.network)
+    def __init__(
+        self, policy: Policy, task: Task, env: VectorEnv[Any, Any, Any], seed: int
+    ) -> None:
+        layout, self._network = layout_of(env), policy.network
+        self.start, self.driver = started_by(policy, task, layout), Driver(policy.network)
+        self._mixing = None
+        if policy.network.cells and not algorithm_of(task.algo).on_tensors:
+            alone = Driver(policy.network.dense)
+            self._mixing = mixing_of(env, policy.network, lambda obs: alone.predict(obs)[0], seed)
+            mixed = self._mixing.without(policy.network)
+            self.start = started_by(replace(policy, network=mixed), task, layout)
+            self.driver = Driver(mixed.dense)
 
     def around(self, env: VectorEnv[Any, Any, Any]) -> VectorEnv[Any, Any, Any]:
         """A vector env as the model sees it."""
-        return Remembered(env, self._network) if self._apart else env
+        return Remembered(env, self._network, self._mixing) if self._mixing else env
 
     def whole(self, network: Network) -> Network:
         """The network of plain observations, of the model's."""
-        return self._network.ending(network) if self._apart else network
+        return self._network.ending(self._mixing.within(network)) if self._mixing else network

@@ -8,7 +8,7 @@ import numpy as np
 
 from ....envs.backend.extras import extra
 from ....estimators.learned.memory import Array, Traces
-from .mixing import whitening
+from .mixing import APART, SMALL, whitening
 
 with extra("train", "training needs torch"):
     import torch
@@ -17,8 +17,6 @@ with extra("train", "training needs torch"):
 TIMES = (3, 10, 30, 100, 300)
 """Steps of the means: of control periods of 10 ms from the motors' lag to half a drive."""
 _BLOCK = 50  # steps whose means are one product of matrices
-_APART = 7  # steps, of those by which means are mixed
-_SMALL = 1e-4  # variance, of what varies by 1, that a mixture of means has at least
 _LEAST = 1e-300  # instead of nothing: what a first step leaves of what was before
 
 
@@ -70,13 +68,13 @@ class TraceLayer(nn.Module):
         with torch.no_grad():
             found = [
                 self(torch.from_numpy(z))[0][..., : len(self.mean)][torch.from_numpy(there)][
-                    ::_APART
+                    ::APART
                 ]
                 for z, there in seen
             ]
         plain = torch.cat(found).numpy()
         self.mean.copy_(torch.from_numpy(plain.mean(0)))
-        self.mixing.copy_(torch.from_numpy(whitening(plain, _SMALL)))
+        self.mixing.copy_(torch.from_numpy(whitening(plain, SMALL)))
 
     def cell(self, mixing: Array) -> Traces:
         """The units of inputs that are mixed first, (k, k), by NumPy."""

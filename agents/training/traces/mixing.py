@@ -6,6 +6,9 @@ import numpy as np
 
 from ....estimators.learned.memory import Array
 
+APART = 7  # steps, of those by which means are mixed
+SMALL = 1e-4  # variance that a mixture of means has at least
+
 
 def whitening(z: Any, least: float) -> Array:
     """(k, k) what makes the covariance of z (n, k) one; a smaller eigenvalue counts as `least`."""

@@ -1,29 +1,60 @@
 """What a policy remembers as an observation, so that whoever learns needs no memory."""
 
-from typing import Any
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium.vector import VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
 from ....envs.task.observation import Entry, space_of
+from ....estimators.learned.memory import Array
 from ....estimators.learned.network import Network
+from .mixing import APART, SMALL, whitening
+
+Driving = Callable[[Any], Any]
+
+
+class Mixing(NamedTuple):
+    """What is remembered, x (k,), without correlation: (x - mean) mixing, which is symmetric."""
+
+    mean: Array
+    mixing: Array
+
+    def without(self, network: Network) -> Network:
+        """A network of mixed x that gives what one of plain x does."""
+        first = network.weights[0] @ np.linalg.inv(self.mixing)
+        return _beginning(network, first, network.biases[0] + network.weights[0] @ self.mean)
+
+    def within(self, network: Network) -> Network:
+        """A network of plain x that gives what one of mixed x does."""
+        first = network.weights[0] @ self.mixing
+        return _beginning(network, first, network.biases[0] - first @ self.mean)
+
+
+def _beginning(network: Network, weights: Array, biases: Array) -> Network:
+    rest = network.weights[1:], network.biases[1:]
+    return replace(network, weights=[weights, *rest[0]], biases=[biases, *rest[1]])
 
 
 class Remembered(VectorWrapper[Any, Any, Any, Any, Any]):
     """A vector env whose observations (N, k) are what a network's dense layers read.
 
     env: resets a row in the step that ends it; its observation is the network's. What the network
-    remembers of a row begins anew with its episode.
+    remembers of a row begins anew with its episode. mixing: of the observations, None for none.
     """
 
-    def __init__(self, env: VectorEnv[Any, Any, Any], network: Network) -> None:
+    def __init__(
+        self, env: VectorEnv[Any, Any, Any], network: Network, mixing: Mixing | None = None
+    ) -> None:
         super().__init__(env)
         width = network.dense.inputs
         self.layout = tuple(Entry(f"memory_{i}", "-", -np.inf, np.inf) for i in range(width))
         self.single_observation_space = space_of(self.layout)
         self.observation_space = batch_space(self.single_observation_space, env.num_envs)
         self._network, self._state = network, np.zeros((env.num_envs, network.memory))
+        self._mixing = mixing
 
     def reset(self, **arguments: Any) -> tuple[Any, dict[str, Any]]:
         """The inner env's."""
@@ -48,4 +79,23 @@ class Remembered(VectorWrapper[Any, Any, Any, Any, Any]):
 
     def _read(self, obs: Any, state: Any) -> Any:
         """(N, k) float32; state (N, memory) is updated."""
-        return self._network.remembered(obs.astype(np.float64), state).astype(np.float32)
+        x = self._network.remembered(obs.astype(np.float64), state)
+        x = x if self._mixing is None else (x - self._mixing.mean) @ self._mixing.mixing
+        return x.astype(np.float32)
+
+
+def mixing_of(env: VectorEnv[Any, Any, Any], network: Network, drive: Driving, seed: int) -> Mixing:
+    """By what a network remembers in its own drives: one episode of each row, from a seed on.
+
+    env: as of `Remembered`. drive: gives actions of what its dense layers read.
+    """
+    seen, found = Remembered(env, network), []
+    obs, _ = seen.reset(seed=seed)
+    running, step = np.ones(env.num_envs, np.bool_), 0
+    while running.any():
+        if step % APART == 0:
+            found.append(obs[running])
+        obs, _, terminated, truncated, _ = seen.step(drive(obs))
+        running, step = running & ~(terminated | truncated), step + 1
+    x = np.concatenate(found).astype(np.float64)
+    return Mixing(x.mean(0), whitening(x, SMALL))
