@@ -19,6 +19,7 @@ from sideslip.agents.training import keeper, train
 from sideslip.agents.training.algorithms import (
     ALGORITHMS,
     BEGUN,
+    BEGUN_TRACES,
     HYPERPARAMS,
     algorithm_of,
     check_settings,
@@ -152,7 +153,8 @@ def test_the_packages_settings_are_of_ids_there_are() -> None:
 
     for name, algorithm in ALGORITHMS.items():
         entries = yaml.safe_load((HYPERPARAMS / f"{algorithm.zoo}.yml").read_text())
-        assert "default" in entries and set(entries) - {"default", BEGUN} <= set(gym.registry)
+        ours = {"default", BEGUN, BEGUN_TRACES}
+        assert "default" in entries and set(entries) - ours <= set(gym.registry)
         for key in entries:
             check_settings(name, entries[key])
             assert settings_of(name, key) == entries[key]

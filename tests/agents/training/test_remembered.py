@@ -16,7 +16,7 @@ from sideslip.agents.rollout import costs_of
 from sideslip.agents.training.keeper import BEGUN_WITH, Means, evaluation_seeds
 from sideslip.agents.training.starts import Driver, task_from
 from sideslip.agents.training.student import Course, Scaling, Student
-from sideslip.agents.training.traces.remembered import Remembered
+from sideslip.agents.training.traces.remembered import Remembered, mixing_of
 from sideslip.agents.training.train import train
 
 ID = "sideslip/YawFusion-v0"
@@ -64,8 +64,28 @@ def test_an_observation_is_what_is_remembered_across_episodes(policy: Policy) ->
     assert env.reset(seed=5)[0] == pytest.approx(first, abs=1e-5)
 
 
+def test_mixed_and_back_a_network_is_the_same(policy: Policy) -> None:
+    """And what is remembered in its own drives varies alike, mixed."""
+    net = policy.network
+    drive = Driver(net.dense)
+    mixing = mixing_of(cars(60), net, lambda obs: drive.predict(obs)[0], 3)
+    mixed, x = mixing.without(net), np.random.default_rng(1).normal(size=(5, net.dense.inputs))
+    theirs = net.dense(x)
+    assert mixed.dense((x - mixing.mean) @ mixing.mixing) == pytest.approx(theirs, abs=1e-5)
+    assert np.abs(mixed.dense(x) - theirs).max() > 1e-3
+    assert mixing.within(mixed).dense(x) == pytest.approx(theirs, abs=1e-4)
+    env = Remembered(cars(60), net, mixing)
+    seen, (obs, _) = [], env.reset(seed=3)
+    for _ in range(STEPS):
+        seen.append(obs)
+        obs, *_ = env.step(Driver(mixed.dense).predict(obs)[0])
+    found = np.concatenate(seen[::7])
+    assert np.abs(found.mean(0)).max() < 0.05 and np.var(found, axis=0).max() < 1.1
+
+
 def test_ppo_goes_on_behind_the_traces(policy: Policy, tmp_path: Path) -> None:
     settings = task_from(policy).settings | {"n_steps": 8, "batch_size": 16, "n_epochs": 1}
+    assert settings["learning_rate"] == "lin_1e-4"  # of the entry for hundreds of inputs
     task = task_from(policy, settings=settings, num_envs=4, n_eval_envs=4)
     found = train(task, 64, tmp_path, means=Means(eval_freq=64), trained_agent=policy)
     assert found.evaluations[0].of_start == pytest.approx(1.0, abs=1e-6)
