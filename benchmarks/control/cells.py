@@ -50,7 +50,11 @@ LEARNED: dict[str, tuple[tuple[str, str], ...]] = {
     "car-steering": (("joint", "distill-car-steering"), ("", "raw-car-steering")),
     "car-yaw": (("joint", "distill-car-yaw"), ("", "raw-car-yaw")),
     "coms-model": (("joint", "ppo-coms-steering"), ("joint", "distill-coms-steering")),
-    "coms-zero-slip": (("joint", "ppo-coms-yaw"), ("joint", "distill-coms-yaw")),
+    "coms-zero-slip": (
+        ("joint", "ppo-coms-yaw"),
+        ("joint", "distill-coms-yaw"),
+        ("", "raw-coms-yaw"),
+    ),
 }
 """(estimator, policy), the best one first, by the class of contests that the policy was trained on,
 by its shipped name or path."""

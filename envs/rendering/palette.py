@@ -62,6 +62,7 @@ CONTROLLERS = {
     "distill-car-yaw": "#5E8F2E",
     "raw-car-steering": "#1F93C6",
     "raw-car-yaw": "#2A8DBD",
+    "raw-coms-yaw": "#3D84B8",
 }
 RUNGS = {
     "nominal": "#CF00B4",
