@@ -68,15 +68,15 @@ def scenario_in(contest: Contest, condition: str) -> dict[str, Any]:
     return changed(contest, CONDITIONS[condition])
 
 
-def contestants(contest: Contest) -> list[tuple[str, str]]:
-    """(estimator, controller) of everybody who drives a contest: rungs, classics, policies."""
-    classics = [who for who in PAPERS if who in CONTROLLERS[contest.env_id]]
+def contestants(kind: str) -> list[tuple[str, str]]:
+    """(estimator, controller) of everybody who drives a class: rungs, classics, policies."""
+    classics = [who for who in PAPERS if who in CONTROLLERS[chosen(kind)[0].env_id]]
     return [
         ("", NOMINAL),
         ("", PARAMETERS),
         *((REFERENCE_FILTER, who) for who in classics),
         *ADAPTIVE.items(),
-        *LEARNED[contest.kind],
+        *LEARNED[kind],
     ]
 
 
@@ -140,32 +140,39 @@ def run(
         cells = [
             Cell(contest, *who, {"scenario": scenario_in(contest, condition)})
             for contest in everyone
-            for who in contestants(contest)
+            for who in contestants(contest.kind)
         ]
         results[condition] = measure(
             cells, seeds, jobs=jobs, console=console, keep=keep, title=f"{NAME}, {condition}"
         )
-    found = [_found(kind, results) for kind in LEARNED]
+    found = [
+        Found(
+            kind,
+            {
+                condition: [everybody(those, contest, condition) for contest in chosen(kind)]
+                for condition, those in results.items()
+            },
+        )
+        for kind in LEARNED
+    ]
     for each in found:
-        _tabled(suite, each)
+        driven = ", ".join(contest.scenario for contest in chosen(each.kind))
+        note = f"No training met: {'; '.join(NEVER_MET)}."
+        tabled(suite, each, chosen(each.kind)[0].env_id, driven, note)
     suite.verdict = answer(found)
-    _illustrated(suite, found)
+    illustrated(suite, found)
     return suite
 
 
-def _found(kind: str, results: Mapping[str, Results]) -> Found:
-    found = Found(kind)
-    for condition, those in results.items():
-        found.driven[condition] = []
-        for contest in chosen(kind):
-            mine = {who: those.of(contest, who, e) for e, who in contestants(contest)}
-            wrong = [
-                f"{who}, {condition}: {each.error}" for who, each in mine.items() if each.error
-            ]
-            if wrong:
-                raise ValueError("; ".join(wrong))
-            found.driven[condition].append(mine)
-    return found
+def everybody(results: Results, contest: Contest, condition: str) -> dict[str, Driven]:
+    """The episodes of all who drive a contest; ValueError with the reason where somebody cannot."""
+    mine = {
+        who: results.of(contest, who, estimator) for estimator, who in contestants(contest.kind)
+    }
+    wrong = [f"{who}, {condition}: {each.error}" for who, each in mine.items() if each.error]
+    if wrong:
+        raise ValueError("; ".join(wrong))
+    return mine
 
 
 def answer(found: Sequence[Found]) -> str:
@@ -189,8 +196,9 @@ def _least(shares: Sequence[float]) -> str:
     return f"{min(there):.2f}" if (there := [each for each in shares if each == each]) else "-"
 
 
-def _tabled(suite: Suite, found: Found) -> None:
-    names = [who for _, who in contestants(chosen(found.kind)[0])]
+def tabled(suite: Suite, found: Found, env_id: str, driven: str, more: str) -> None:
+    """A class's rows and tables; driven: what was, more: to be said of it in the note."""
+    names = [who for _, who in contestants(found.kind)]
     episodes = len(found.costs(NOMINAL))
     rivals = [who for who in (NOMINAL, *PAPERS, *RIVALS) if who in names]
     shares, all_in_all = [], []
@@ -207,14 +215,13 @@ def _tabled(suite: Suite, found: Found) -> None:
         all_in_all.append([who, *beaten, f"{100.0 * fails:.1f} %", f"{ratio:.2f}"])
         who_and_how = {"controller": who, "n": episodes, "salt": salt_of()}
         for condition, each in mine.items():
-            where = {"suite": NAME, "scenario": f"{found.kind}, {condition}"}
-            version = {"env_version": f"{chosen(found.kind)[0].env_id} {__version__}"}
+            if not np.isfinite(each.value):
+                continue  # there is no gap
+            where = {"suite": suite.name, "scenario": f"{found.kind}, {condition}"}
+            version = {"env_version": f"{env_id} {__version__}"}
             suite.rows.append(Row.of("score", each, **where, **who_and_how, **version))
-    driven = ", ".join(each.scenario for each in chosen(found.kind))
-    note = (
-        f"{driven}; {episodes // len(found.driven)} episodes a condition, the same for everybody."
-    )
-    note += f" No training met: {'; '.join(NEVER_MET)}."
+    count = episodes // len(found.driven)
+    note = f"{driven}; {count} episodes a condition, the same for everybody. {more}"
     if any("-" in row for row in shares):
         note += f" -: nominal's mean log ratio to {PARAMETERS} is below {LEAST}."
     suite.tables += [
@@ -234,13 +241,13 @@ def _shown(share: Estimate) -> str:
     return f"{value:.2f} [{low:.2f}, {high:.2f}]" if np.isfinite(value) else "-"
 
 
-def _illustrated(suite: Suite, found: Sequence[Found]) -> None:
+def illustrated(suite: Suite, found: Sequence[Found]) -> None:
     """What each costs, and how often it costs how much; nothing without plotly."""
     try:
         from .report.figures import curves, groups_with_interval
     except ModuleNotFoundError:
         return
-    names = {each.kind: [w for _, w in contestants(chosen(each.kind)[0])] for each in found}
+    names = {each.kind: [w for _, w in contestants(each.kind)] for each in found}
     costs: dict[str, dict[str, Estimate]] = {}
     for each in found:
         logs = {who: np.log(np.minimum(each.ratios(who), FAILED)) for who in names[each.kind]}

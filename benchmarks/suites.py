@@ -73,6 +73,7 @@ SUITES: dict[str, tuple[str, _Run]] = {
     "unknown": (".unknown.suite", _seeds),
     "control": (".control.suite", _control),
     "learned": (".learned", _learned),
+    "learned-outside": (".learned_outside", _learned),
     "memory": (
         ".memory.suite",
         lambda suite, r: suite.run(r.quick, r.episodes, r.jobs, r.console, r.keep),

@@ -23,7 +23,7 @@ def test_a_condition_changes_the_drive_and_no_filter_hears_of_it(kind: str, cond
         scenario = scenario_in(contest, condition)
         same = scenario_from(scenario) == scenario_from(contest.scenario)
         assert same == (condition == TRAINED)
-        for estimator, who in learned.contestants(contest):
+        for estimator, who in learned.contestants(kind):
             if estimator:
                 plain, now = (
                     estimate_options(Cell(contest, estimator, who, options))

@@ -1,0 +1,101 @@
+"""`sideslip bench learned-outside`: a class's contest, and what its drives and ratios are."""
+
+import dataclasses
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("vehiclemodels")
+from sideslip.agents import make_agent
+from sideslip.agents.rollout import rollout
+from sideslip.benchmarks import learned_outside as outside_suite
+from sideslip.benchmarks.control.build import estimate_options
+from sideslip.benchmarks.control.cells import ADAPTIVE, LEARNED, Cell
+from sideslip.benchmarks.control.contests import NOMINAL, PARAMETERS, contests
+from sideslip.benchmarks.control.episodes import NUMBERS, Chunk, Driven
+from sideslip.benchmarks.harness.drives import make_env
+from sideslip.benchmarks.learned import Found, contestants
+from sideslip.benchmarks.learned_outside import KINDS, MANOEUVRE, OUTSIDE_ID, drive, outside
+from sideslip.envs.outside.plants import OUTSIDE_PLANTS, outside_vehicle
+from sideslip.envs.scenarios.manoeuvres import scenario_from
+
+FLAT = {"name", "road", "bank", "vehicle", "nominal"}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_only_the_car_and_the_road_are_others(kind: str) -> None:
+    contest = outside(kind, "drift")
+    like = next(c for c in contests() if (c.kind, c.scenario) == (kind, MANOEUVRE))
+    assert contest.kind == kind and contest.reference == like.reference
+    ours, theirs = (scenario_from(c.env_options["scenario"]) for c in (like, contest))
+    for field in dataclasses.fields(ours):
+        same = getattr(ours, field.name) == getattr(theirs, field.name)
+        assert same or field.name in FLAT, field.name
+    for estimator, who in contestants(kind):
+        here, there = Cell(contest, estimator, who), Cell(like, estimator, who)
+        assert here.best == there.best or who == PARAMETERS  # a rung that was not measured here
+        if estimator:
+            mine, those = (estimate_options(cell)["options"] for cell in (here, there))
+            assert {**mine, "bank_sd": 0.0} == {**those, "bank_sd": 0.0}  # a flat road's levels
+
+
+def test_designers_have_the_outside_car_and_its_actuators_are_the_class_s() -> None:
+    for kind, width in zip(KINDS, (2, 1), strict=True):
+        env: Any = make_env(OUTSIDE_ID, **outside(kind, "single-track").env_options)
+        assert env.action_space.shape == (width,)
+        assert env.unwrapped.nominal.mass == outside_vehicle().mass
+        assert env.unwrapped.nominal.friction == 0.65
+
+
+def test_a_drive_costs_what_the_single_car_s_costs() -> None:
+    contest, seeds = outside("car-yaw", "drift"), (3, 5)
+    driven = drive(Chunk(Cell(contest, "", "raw-car-yaw"), seeds))
+    assert not driven.error
+    env = make_env(OUTSIDE_ID, **contest.env_options)
+    alone = [rollout(env, make_agent("raw-car-yaw", env), seed) for seed in seeds]
+    assert driven.costs == pytest.approx([each.cost for each in alone], rel=1e-6)
+    assert driven["failure"].tolist() == [each["failure"][-1] for each in alone]
+
+
+def test_a_reason_is_the_drive_s_error() -> None:
+    driven = drive(Chunk(Cell(outside("car-yaw", "drift"), "", "lqr"), (0,)))
+    assert "beta_hat" in driven.error and np.isnan(driven.costs).all()
+
+
+def driven_at(costs: Any, failed: Any = 0.0) -> Driven:
+    numbers = np.zeros((len(costs), len(NUMBERS)))
+    numbers[:, NUMBERS.index("cost")] = costs
+    numbers[:, NUMBERS.index("failure")] = failed
+    return Driven(numbers, 0.0)
+
+
+def test_ratios_are_paired_over_each_rival_and_a_failure_counts() -> None:
+    (_, policy), *_ = LEARNED["car-yaw"]
+    planner = ADAPTIVE["joint, friction"]
+    rng, found = np.random.default_rng(0), Found("car-yaw")
+    for model in OUTSIDE_PLANTS:
+        nominal = rng.uniform(100.0, 200.0, 400)
+        factors = dict.fromkeys((who for _, who in contestants("car-yaw")), 1.0)
+        factors |= {planner: 0.5, policy: 2.0}
+        mine = {who: driven_at(factor * nominal) for who, factor in factors.items()}
+        gone = np.arange(400) < 100
+        mine["two-dof"] = driven_at(nominal, gone)
+        mine[planner] = driven_at(0.5 * nominal, gone)
+        found.driven[model] = [mine]
+    table = outside_suite._ratios(found)
+    rows = {who: row for who, *row in table.cells}
+    assert [cell.split()[0] for cell in rows[policy]] == ["200", "400"] * 3
+    assert rows[NOMINAL][0] == rows[planner][1] == ""
+    fails = f"{100.0 * math.exp(0.25 * math.log(20.0)):.0f}"
+    assert [cell.split()[0] for cell in rows["two-dof"]] == [fails, "200"] * 3
+    said = outside_suite.answer([found])
+    assert f"{policy} costs 200 [200, 200] % of nominal's, 400 [400, 400] % of {planner}'s" in said
+    assert "0 % fail" in said
+
+
+def test_without_the_extra_it_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(outside_suite, "find_spec", lambda _: None)
+    suite = outside_suite.run(4, jobs=1)
+    assert not suite.tables and "sideslip[outside]" in suite.text
