@@ -66,14 +66,22 @@ def steps_of(
         running = running & ~start
 
 
+def drives_of(
+    env: VectorEnv[Any, Any, Any], agent: Any, seeds: Sequence[int]
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """The cost J of each seed's first episode, (N,), and its steps; agent: of `steps_of`."""
+    costs, lengths = np.zeros(env.num_envs), np.full(env.num_envs, -1.0)  # the reset is no step
+    for step in steps_of(env, agent, list(seeds)):
+        costs -= np.where(step.running, step.reward, 0.0)
+        lengths += step.running
+    return costs, lengths
+
+
 def costs_of(
     env: VectorEnv[Any, Any, Any], agent: Any, seeds: Sequence[int]
 ) -> npt.NDArray[np.float64]:
-    """The cost J of each seed's first episode, (N,); agent: of `steps_of`."""
-    costs = np.zeros(env.num_envs)
-    for step in steps_of(env, agent, list(seeds)):
-        costs -= np.where(step.running, step.reward, 0.0)
-    return costs
+    """The costs of `drives_of`."""
+    return drives_of(env, agent, seeds)[0]
 
 
 def cost_ratios(

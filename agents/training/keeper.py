@@ -15,7 +15,8 @@ from ...envs.backend.files import whole, write_whole
 from ...envs.record import Array
 from ..learned.card import Card
 from ..learned.files import Policy, save_policy
-from ..rollout import cost_ratios, costs_of
+from ..rollout import cost_ratios, costs_of, drives_of
+from ..vec_env import zoo
 from ..vec_env.env import make_vec_env
 from .algorithms import algorithm_of, make_model, options_of, spread_of
 from .checkpoint import load_parameters, save_checkpoint
@@ -242,7 +243,7 @@ class Keeper(BaseCallback):
         """Cost of the policy as it is; the best one so far and the checkpoint are written."""
         self.check()
         self.spent += time.process_time() - self.since
-        costs = costs_of(self.tested, self.model, self.seeds)
+        costs, lengths = drives_of(self.tested, self.model, self.seeds)
         cost, ratio = float(np.mean(self._means(costs) * self.alike)), None
         if self.to_beat is not None:
             ratio = float(np.exp(np.log(cost_ratios(costs, self.to_beat)).mean()))
@@ -264,6 +265,7 @@ class Keeper(BaseCallback):
         save_checkpoint(self.folder / CHECKPOINT, self.model, checkpoint)
         lines = "".join(json.dumps(each._asdict()) + "\n" for each in self.evaluations)
         write_whole(self.folder / CURVE, lines.encode())
+        zoo.leave(self.folder, self.task.env_id, self.model, costs, lengths)
         self.since = time.process_time()
 
     def _keep_best(self, now: Evaluation) -> None:

@@ -2,11 +2,13 @@
 
 import itertools
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from gymnasium.vector import VectorEnv
 
 from ...envs.scenarios.manoeuvres import scenario_from
+from ..vec_env import zoo
 from ..vec_env.env import make_native_env
 from .algorithms import Settings, algorithm_of, check_settings, settings_of
 
@@ -81,3 +83,26 @@ class Task:
         """Another vector env of the task, not the one that is trained on."""
         options = self.options(num_envs)
         return make_native_env(self.env_id, num_envs, self.around, options)
+
+    def zoo_folder(self, logs: Path) -> Path:
+        """Where rl-baselines3-zoo would leave the next training of this kind; ValueError for an
+        algorithm that it has not."""
+        algorithm = algorithm_of(self.algo)
+        if algorithm.on_tensors:
+            raise ValueError(f"rl-baselines3-zoo has no {self.algo}: its folder is no use")
+        return zoo.next_folder(logs, algorithm.zoo, self.env_id)
+
+    def describe_for_zoo(self, folder: Path, steps: int, eval_freq: int) -> None:
+        """Make a folder of `zoo_folder` with what the zoo's `enjoy` reads; of a mixture it drives
+        the first."""
+        first = {"scenario": self.scenarios[0]} if self.scenarios else {}
+        arguments = {
+            "algo": algorithm_of(self.algo).zoo,
+            "env": self.env_id,
+            "env_kwargs": self.env_options | first,
+            "eval_freq": eval_freq,
+            "n_eval_envs": self.n_eval_envs,
+            "n_timesteps": steps,
+            "seed": self.seed,
+        }
+        zoo.describe(folder, self.settings | {"n_envs": self.num_envs}, self.around, arguments)

@@ -159,13 +159,20 @@ def words_of(task: "Task", steps: int) -> list[str]:
     return words + [word for name, value in numbers.items() for word in (name, str(value))]
 
 
-def folder_of(task: "Task", start: str = "") -> str:
-    """A training's folder without --out, by its task and what it begins with."""
+def folder_of(task: "Task", start: str, out: Path | None, logs: Path | None) -> Path:
+    """A training's folder: out, the next one of the zoo's in logs, or by its task and what it
+    begins with. ValueError for both."""
+    if logs is not None:
+        if out is not None:
+            raise ValueError(f"--log-folder {logs} numbers its folders itself: without --out {out}")
+        return task.zoo_folder(logs)
+    if out is not None:
+        return out
     given = task.env_options.items()
     options = [each if isinstance(each, str) else name for name, each in given]
     options += ["mixture"] if task.scenarios else []
     words = [task.env_id.rpartition("/")[2], task.algo, task.estimator, *options, start]
-    return "-".join(["train", *filter(None, words), str(task.seed)])
+    return Path("-".join(["train", *filter(None, words), str(task.seed)]))
 
 
 def environment() -> dict[str, str]:

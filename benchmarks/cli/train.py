@@ -82,6 +82,10 @@ def train_command(
     out: Annotated[
         Path | None, typer.Option(help="Folder; default: train-ENV-ALGO...-SEED here.")
     ] = None,
+    log_folder: Annotated[
+        Path | None,
+        typer.Option("--log-folder", "-f", help="Instead of --out, as the zoo: FOLDER/ALGO/ENV_N."),
+    ] = None,
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on with the training in the folder.")
     ] = False,
@@ -112,7 +116,7 @@ def train_command(
         check_env(env)
     agent, new = start_and_task(trained_agent)
     task = task_in(out) if resume and out else new(**options)
-    folder = out or Path(folder_of(task, trained_agent.stem if trained_agent else ""))
+    folder = folder_of(task, trained_agent.stem if trained_agent else "", out, log_folder)
     if conf_file is not None:
         start = start_in(folder) if resume else agent
         options["settings"] = settings_in(conf_file, task.algo, task.env_id, start)
@@ -124,6 +128,8 @@ def train_command(
     given = [str(word) for pair in more.items() if pair[1] for word in pair]
     command = shlex.join([*words_of(task, steps), *given])
     command = f"{aim.command}; sideslip train --resume --steps {steps}" if resume else command
+    if log_folder is not None:
+        task.describe_for_zoo(folder, steps, eval_freq)
     console = Console()
     with _Bar(console, steps, disable=not progress) as bar:
         project = wandb_project_name if track else ""

@@ -130,8 +130,26 @@ def test_the_command_of_a_card_says_what_the_filter_was(run: Run) -> None:
 
 def test_the_folder_is_named_by_what_is_trained() -> None:
     task = train.Task("sideslip/YawGps-v0", "ppo", "dakf", {"scenario": "gust"}, 7)
-    assert folder_of(task) == "train-YawGps-v0-ppo-dakf-gust-7"
-    assert folder_of(task, "mine") == "train-YawGps-v0-ppo-dakf-gust-mine-7"
+    assert folder_of(task, "", None, None) == Path("train-YawGps-v0-ppo-dakf-gust-7")
+    assert folder_of(task, "mine", None, None) == Path("train-YawGps-v0-ppo-dakf-gust-mine-7")
+    assert folder_of(task, "", Path("here"), None) == Path("here")
+    zoos = folder_of(task, "", None, Path("logs"))
+    assert zoos == Path("logs/ppo/sideslip-YawGps-v0_1")
+
+
+def test_a_log_folder_is_the_zoo_s_and_numbered(
+    run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(enjoy, "evaluate", lambda *_: None)
+    monkeypatch.setattr(enjoy, "evaluation", lambda _: {"cost": {}})
+    for number in (1, 2):
+        status, out, err = run(*TINY, "--steps", 64, "-f", "logs")
+        assert status == 0, err
+        assert f"logs/ppo/sideslip-YawVision-v0_{number}/{train.POLICY}" in out
+    params = tmp_path / "logs/ppo/sideslip-YawVision-v0_2/sideslip-YawVision-v0"
+    assert "scenario: sine-with-dwell" in (params / "args.yml").read_text()
+    status, _, err = run(*TINY, "-f", "logs", "--out", "here")
+    assert status == 2 and "without --out here" in err
 
 
 def test_it_goes_on_from_a_distilled_policy_in_all_contests_of_its_class(
