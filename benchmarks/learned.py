@@ -158,7 +158,7 @@ def run(
     for each in found:
         driven = ", ".join(contest.scenario for contest in chosen(each.kind))
         note = f"No training met: {'; '.join(NEVER_MET)}."
-        tabled(suite, each, chosen(each.kind)[0].env_id, driven, note)
+        tabled(suite, each, each.kind, chosen(each.kind)[0].env_id, driven, note)
     suite.verdict = answer(found)
     illustrated(suite, found)
     return suite
@@ -196,7 +196,7 @@ def _least(shares: Sequence[float]) -> str:
     return f"{min(there):.2f}" if (there := [each for each in shares if each == each]) else "-"
 
 
-def tabled(suite: Suite, found: Found, env_id: str, driven: str, more: str) -> None:
+def tabled(suite: Suite, found: Found, title: str, env_id: str, driven: str, more: str) -> None:
     """A class's rows and tables; driven: what was, more: to be said of it in the note."""
     names = [who for _, who in contestants(found.kind)]
     episodes = len(found.costs(NOMINAL))
@@ -225,9 +225,9 @@ def tabled(suite: Suite, found: Found, env_id: str, driven: str, more: str) -> N
     if any("-" in row for row in shares):
         note += f" -: nominal's mean log ratio to {PARAMETERS} is below {LEAST}."
     suite.tables += [
-        Table(f"{found.kind}: share of the gap", ("controller", *found.driven), shares, note),
+        Table(f"{title}: share of the gap", ("controller", *found.driven), shares, note),
         Table(
-            f"{found.kind}: all conditions together",
+            f"{title}: all conditions together",
             ("controller", *(f"beats {each}" for each in rivals), "fails", "worst 5 %"),
             all_in_all,
             f"Of {episodes} episodes. worst 5 %: mean of the largest ratios to nominal's cost.",

@@ -130,18 +130,18 @@ def run(
     ]
     note = "Other seeds on each model. No training met any."
     for each in found:
-        tabled(suite, each, OUTSIDE_ID, f"{MANOEUVRE} on a straight road", note)
-        suite.tables.insert(-1, _ratios(each))
+        title = f"{each.kind} in a BMW"
+        tabled(suite, each, title, OUTSIDE_ID, f"{MANOEUVRE} on a straight road", note)
+        suite.tables.insert(-1, _ratios(each, title))
     suite.verdict = answer(found)
     illustrated(suite, found)
     return suite
 
 
 def answer(found: Sequence[Found]) -> str:
-    """The verdict: the best policy of each class, by its cost over its rivals' on all models."""
+    """The verdict: the policies of each class, by their cost over their rivals' on all models."""
     lines = []
-    for each in found:
-        (_, policy), *_ = LEARNED[each.kind]
+    for each, policy in ((one, who) for one in found for _, who in LEARNED[one.kind]):
         costs = {rival: _over(each, policy, rival, each.driven) for rival in _RIVALS}
         said = ", ".join(f"{_percent(cost)} % of {rival}'s" for rival, cost in costs.items())
         fails = 100.0 * share(each.failed(policy)).value
@@ -158,7 +158,7 @@ def _over(found: Found, who: str, rival: str, models: Iterable[str]) -> Estimate
     return geometric_mean(*logs)
 
 
-def _ratios(found: Found) -> Table:
+def _ratios(found: Found, title: str) -> Table:
     """What everybody costs on each model over `_RIVALS`."""
     cells = [
         [who, *("" if who == rival else _percent(_over(found, who, rival, [model]))
@@ -167,7 +167,7 @@ def _ratios(found: Found) -> Table:
     ]  # fmt: skip
     header = [f"{model}, % of {rival}" for model in found.driven for rival in _RIVALS]
     note = "Geometric means, paired, where the one compared with survives; a failure counts 20."
-    return Table(f"{found.kind}: cost over others'", ("controller", *header), cells, note)
+    return Table(f"{title}: cost over others'", ("controller", *header), cells, note)
 
 
 def _percent(ratio: Estimate) -> str:

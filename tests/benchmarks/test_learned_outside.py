@@ -84,7 +84,7 @@ def test_ratios_are_paired_over_each_rival_and_a_failure_counts() -> None:
         mine["two-dof"] = driven_at(nominal, gone)
         mine[planner] = driven_at(0.5 * nominal, gone)
         found.driven[model] = [mine]
-    table = outside_suite._ratios(found)
+    table = outside_suite._ratios(found, "car-yaw")
     rows = {who: row for who, *row in table.cells}
     assert [cell.split()[0] for cell in rows[policy]] == ["200", "400"] * 3
     assert rows[NOMINAL][0] == rows[planner][1] == ""
