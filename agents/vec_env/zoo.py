@@ -62,7 +62,7 @@ def leave(folder: Path, env_id: str, model: Any, costs: Array, lengths: Array) -
         return
     with whole(folder / f"{name_of(env_id)}.zip") as file:
         model.save(file)
-    now = {
+    now: dict[str, Any] = {
         "timesteps": np.array([model.num_timesteps]),
         "results": -costs[None],
         "ep_lengths": lengths[None].astype(np.int64),
