@@ -50,11 +50,14 @@ def test_designers_have_the_outside_car_and_its_actuators_are_the_class_s() -> N
 
 
 def test_a_drive_costs_what_the_single_car_s_costs() -> None:
+    """On a road so narrow that the cars leave it one after the other: what follows is no cost."""
     contest, seeds = outside("car-yaw", "drift"), (3, 5)
-    driven = drive(Chunk(Cell(contest, "", "raw-car-yaw"), seeds))
+    narrow = {"scenario": contest.env_options["scenario"] | {"half_width": 0.5}}
+    driven = drive(Chunk(Cell(contest, "", "raw-car-yaw", narrow), seeds))
     assert not driven.error
-    env = make_env(OUTSIDE_ID, **contest.env_options)
+    env = make_env(OUTSIDE_ID, **contest.env_options | narrow)
     alone = [rollout(env, make_agent("raw-car-yaw", env), seed) for seed in seeds]
+    assert alone[0].failed and len(alone[0]["t"]) != len(alone[1]["t"])
     assert driven.costs == pytest.approx([each.cost for each in alone], rel=1e-6)
     assert driven["failure"].tolist() == [each["failure"][-1] for each in alone]
 
