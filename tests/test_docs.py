@@ -5,6 +5,7 @@ import re
 import shutil
 import subprocess
 import sys
+from ast import literal_eval
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -65,6 +66,17 @@ def test_a_pages_examples_run(page: str, least: int, tmp_path: Path) -> None:
     blocks = [code for kind, _, code in FENCE.findall((ROOT / page).read_text())]
     assert len(blocks) >= least
     run("\n".join(blocks), tmp_path / "empty", ROOT / "src")
+
+
+@pytest.mark.long
+def test_the_slope_finds_tyres_and_gains(tmp_path: Path) -> None:
+    """The page's own lines: 17 and 23 kN/rad behind noise, and nearly the cost of LQR's gains."""
+    blocks = [code for _, _, code in FENCE.findall((ROOT / "docs" / "gradients.md").read_text())]
+    tyres, costs = run("\n".join(blocks), tmp_path / "empty", ROOT / "src").splitlines()[-2:]
+    assert literal_eval(tyres) == pytest.approx([17e3, 23e3], rel=0.05)
+    start, found, lqr = literal_eval(costs)
+    assert found < start - 0.3
+    assert found == pytest.approx(lqr, abs=0.15)
 
 
 EXTENDING = "".join(path.read_text() for path in DOCUMENTS if path.name == "EXTENDING.md")
