@@ -36,6 +36,7 @@ SHOWN: Mapping[str, tuple[str, str]] = {
     "policy `distill-coms-steering` on `joint`": ("distill-coms-steering", "joint"),
     "policy `raw-car-steering`, no filter": ("raw-car-steering", ""),
     "policy `raw-car-yaw`, no filter": ("raw-car-yaw", ""),
+    "policy `raw-coms-yaw`, no filter": ("raw-coms-yaw", ""),
     "`model-following` on `exact-kf`": ("model-following", REFERENCE_FILTER),
     "`two-dof` on `exact-kf`": ("two-dof", REFERENCE_FILTER),
     "`esc` on `exact-kf`": ("esc", REFERENCE_FILTER),
