@@ -12,6 +12,7 @@ Array = npt.NDArray[np.float64]
 GATES = {"gru": 3, "lstm": 4}
 """Gates of a kind of cell, in torch's order: reset, update, candidate; or input, forget,
 candidate, output."""
+LONGEST = 1e9  # steps of a mean: beyond any drive, and a number that arrays hold
 PARTS = ("weight_in", "weight_state", "bias_in", "bias_state")
 """The arrays of a cell: torch's weight_ih, weight_hh, bias_ih and bias_hh."""
 
@@ -98,8 +99,11 @@ class Traces:
             )
         if not 0 <= self.bent <= len(self.bias_in):
             raise ValueError(f"of {len(self.bias_in)} units {self.bent} cannot be bent")
-        if not self.times or not all(0.0 < each < np.inf for each in self.times):
-            raise ValueError(f"traces last one time or more, each above 0 steps, got {self.times}")
+        if not self.times or not all(0.0 < each <= LONGEST for each in self.times):
+            raise ValueError(
+                f"traces last one time or more, each above 0 steps and {LONGEST:g} at most, got "
+                f"{self.times}"
+            )
 
     @property
     def size(self) -> int:

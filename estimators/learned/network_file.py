@@ -108,9 +108,8 @@ def _is_cell(cell: Any) -> bool:
     kind, *numbers = cell
     if kind == Traces.kind and len(numbers) == 3 and isinstance(numbers[2], list):
         times = numbers.pop()
-        return all(type(each) is int for each in numbers) and (
-            all(type(each) in (int, float) for each in times)
-        )
+        sized = all(type(each) is int for each in numbers) and numbers[0] > 0
+        return sized and all(type(each) in (int, float) for each in times)
     return kind in tuple(GATES) and len(numbers) == 1 and type(numbers[0]) is int and numbers[0] > 0
 
 

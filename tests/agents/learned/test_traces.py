@@ -15,7 +15,7 @@ from sideslip.estimators.learned.network import Network
 pytest.importorskip("torch")
 import torch
 
-from sideslip.agents.training.student import Course, Drives, Scaling, Student
+from sideslip.agents.training.student import Course, Drives, Scaling, Student, _Episodes
 from sideslip.agents.training.traces.layer import TraceLayer
 
 CARD = Card.of("sideslip/YawVision-v0")
@@ -110,6 +110,7 @@ def test_what_is_plain_goes_on_without_correlation() -> None:
     x = rng.normal(size=(40, 300, 3)).astype(np.float32)
     x[..., 0] = x[..., 0].cumsum(1) / 10.0
     scaling = Scaling(x.mean((0, 1)), 1.0 / x.std((0, 1)), np.eye(3))
+    x[0, 100:] = 1e3  # where it is over
     student, z = Student(3, 1, Course(traces=4)), torch.from_numpy(scaling.mixed(x))
     layer: Any = student.traces
     there = drives_of(x).weights > 0.0
@@ -131,6 +132,15 @@ def test_the_slope_reaches_the_first_step() -> None:
     assert torch.equal(last[:2], z[0, -1]) and layer.size == len(last) == 15
 
 
+@pytest.mark.parametrize(("course", "steps"), [({"traces": 4}, 150), ({"cells": 4}, 50)])
+def test_an_episode_is_learned_through_whole(course: dict[str, Any], steps: int) -> None:
+    """By a GRU in windows."""
+    x = RNG.normal(size=(3, 150, 5)).astype(np.float32)
+    scaling = Scaling(np.zeros(5), np.ones(5), np.eye(5))
+    first, *_ = _Episodes([drives_of(x)], scaling, Course(batch=3, **course))
+    assert first[0].shape == (3, steps, 5)
+
+
 def test_a_file_holds_the_traces(tmp_path: Path) -> None:
     net, path = network(traces()), tmp_path / "mine.safetensors"
     save_policy(path, net, CARD)
@@ -150,6 +160,7 @@ def test_a_file_holds_the_traces(tmp_path: Path) -> None:
         ({"times": ()}, "one time or more"),
         ({"times": (3.0, 0.0)}, "each above 0 steps"),
         ({"times": (float("nan"),)}, "each above 0 steps"),
+        ({"times": (3, 10**400)}, "1e\\+09 at most"),
     ],
 )
 def test_traces_out_of_range_are_refused(change: dict[str, Any], named: str) -> None:
