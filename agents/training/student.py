@@ -106,7 +106,9 @@ class Course:
     def __post_init__(self) -> None:
         sizes = self.rounds, self.epochs, self.batch, *self.hidden
         if min(sizes) < 1 or min(self.cells, self.traces, self.seed) < 0:
-            raise ValueError(f"rounds, epochs and sizes are 1 at least, cells and seed 0: {self}")
+            raise ValueError(
+                f"rounds, epochs and sizes are 1 at least, cells, traces and seed 0: {self}"
+            )
         if not (self.learning_rate > 0.0 and self.noise >= 0.0 and self.told >= 0.0):
             raise ValueError(f"learning_rate is above zero, noise and told not below: {self}")
         if self.cells and self.traces:

@@ -58,6 +58,26 @@ def test_a_student_comes_nearer_to_its_teacher_on_seeds_it_has_not_seen(learned:
     assert teachers < ours < teachers + 0.5 * (none - teachers)
 
 
+def test_a_student_with_traces_mixes_them_once_by_the_first_drives(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[tuple[Any, Any]] = []
+
+    def whiten(self: Student, drives: Any, scaling: Scaling) -> None:
+        whole(self, drives, scaling)
+        asked.append((drives, self.traces))
+
+    whole = Student.whiten
+    monkeypatch.setattr(Student, "whiten", whiten)
+    course = replace(COURSE, rounds=2, epochs=1, cells=0, traces=3, told=0.5)
+    path = tmp_path / "student.safetensors"
+    found = distill(Card.of(ID, OPTIONS), [lesson()], course, path)
+    ((drives, traces),) = asked
+    assert len(drives) == 1 and traces.mean.abs().max() > 0.0
+    (cell,) = load_policy(path).network.cells
+    assert (cell.kind, cell.form) == ("traces", (0, len(found.policy.card.observation) + 3, 3, 5))
+
+
 def rolled(network: Any, obs: Any) -> list[Any]:
     """Actions of every step, each (N, width)."""
     state = np.zeros((len(obs), network.memory))
@@ -184,7 +204,7 @@ def test_a_training_that_diverges_stops_with_the_step_and_leaves_the_last_good_f
         ({"told": -1.0}, "noise and told not below"),
         ({"batch": 0}, "1 at least"),
         ({"told": 1.0, "cells": 0}, "nothing to say"),
-        ({"traces": -1}, "cells and seed 0"),
+        ({"traces": -1}, "cells, traces and seed 0"),
         ({"traces": 4, "cells": 3}, "cells or traces, got 3 and 4"),
     ],
 )

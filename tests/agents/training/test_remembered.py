@@ -13,8 +13,9 @@ import torch
 from sideslip.agents.learned.card import Card
 from sideslip.agents.learned.files import Policy, load_policy
 from sideslip.agents.rollout import costs_of
-from sideslip.agents.training.keeper import BEGUN_WITH, Means, evaluation_seeds
-from sideslip.agents.training.starts import Driver, task_from
+from sideslip.agents.training.export import network_from_sb3
+from sideslip.agents.training.keeper import _SCALING, BEGUN_WITH, Means, evaluation_seeds
+from sideslip.agents.training.starts import Begun, Driver, task_from
 from sideslip.agents.training.student import Course, Scaling, Student
 from sideslip.agents.training.traces.remembered import Remembered, mixing_of
 from sideslip.agents.training.train import train
@@ -93,11 +94,16 @@ def test_ppo_goes_on_behind_the_traces(policy: Policy, tmp_path: Path) -> None:
     for part in ("weight_in", "bias_in"):
         assert np.array_equal(*(getattr(each.cells[0], part) for each in (kept, policy.network)))
     assert np.array_equal(kept.mean, policy.network.mean)
+    begun = Begun(policy, task, task.vector_env(4), _SCALING + task.seed)
+    last = begun.whole(network_from_sb3(found.model))
     seeds = evaluation_seeds(4)
-    costs = costs_of(task.vector_env(4), Driver(kept), seeds)
-    theirs = costs_of(Remembered(task.vector_env(4), policy.network), found.model, seeds)
-    last = found.best is found.evaluations[-1]
-    assert (costs == pytest.approx(theirs, rel=1e-5)) is last
+    begins, ours, best = (
+        costs_of(task.vector_env(4), Driver(each), seeds) for each in (policy.network, last, kept)
+    )
+    theirs = costs_of(begun.around(task.vector_env(4)), found.model, seeds)
+    assert ours == pytest.approx(theirs, rel=1e-5) and ours != pytest.approx(begins, rel=1e-4)
+    first = found.best is found.evaluations[0]
+    assert best == pytest.approx(begins if first else ours, rel=1e-5)
     layer: Any = found.model.policy.action_net
     moved = np.abs(layer.weight.detach().numpy() - policy.network.weights[-1])
     assert moved.max() > 1e-5 and (tmp_path / BEGUN_WITH).exists()
