@@ -14,6 +14,7 @@ import numpy as np
 from rich import box
 from rich.console import Console
 from rich.markup import escape
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table as RichTable
 
 from ... import __version__
@@ -31,6 +32,7 @@ from ..harness.results import (
 if TYPE_CHECKING:
     from ...agents.rollout import Rollout
     from ...agents.training.task import Task
+    from ...agents.training.train import Progress as Now
 
 _ENDINGS = {
     "correction": (".safetensors",),
@@ -173,6 +175,31 @@ def folder_of(task: "Task", start: str, out: Path | None, logs: Path | None) -> 
     options += ["mixture"] if task.scenarios else []
     words = [task.env_id.rpartition("/")[2], task.algo, task.estimator, *options, start]
     return Path("-".join(["train", *filter(None, words), str(task.seed)]))
+
+
+class TrainingBar(Progress):
+    """Steps, the cost of the newest episodes, and the newest and the best evaluation."""
+
+    def __init__(self, console: Console, steps: int, disable: bool) -> None:
+        columns = (
+            TextColumn("{task.completed:,.0f} steps"),
+            BarColumn(20),
+            TextColumn("{task.description}"),
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+        )
+        super().__init__(*columns, console=console, disable=disable)
+        self._task = self.add_task("", total=steps)
+
+    def show(self, now: "Now") -> None:
+        """Show where the training stands."""
+        text = "" if now.cost is None else f"cost {now.cost:.3g} exploring, "
+        last, best = now.evaluations[-1], min(now.evaluations, key=lambda each: each.judged)
+        if last.of_start is None:
+            text += f"of none's {last.of_none:.3f}, best {best.of_none:.3f}"
+        else:
+            text += f"of its start's {last.of_start:.3f}, best {best.of_start:.3f}"
+        self.update(self._task, completed=now.steps, description=text)
 
 
 def environment() -> dict[str, str]:

@@ -8,18 +8,24 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
 from ... import __version__
-from ...agents.learned.files import load_policy
+from ...agents.learned.files import Policy, load_policy
 from ...envs.sensors.slow import SENSOR_SETS
 from .export import Trust
 from .names import check_env, complete
-from .output import check_files, command_line, folder_of, options_of, words_of, wrote
+from .output import (
+    TrainingBar,
+    check_files,
+    command_line,
+    folder_of,
+    options_of,
+    words_of,
+    wrote,
+)
 
 if TYPE_CHECKING:
-    from ...agents.training.train import Progress as Now
     from ...agents.training.train import Trained
 
 EPISODES, CONTESTS = 256, 32  # of the policy's test, and of each contest of its class
@@ -114,7 +120,11 @@ def train_command(
     options = {name: value for name, value in options.items() if value is not None}
     if env is not None:
         check_env(env)
+    if log_folder is not None and resume:
+        raise ValueError(f"--log-folder {log_folder} is for a new training: name the old --out")
     agent, new = start_and_task(trained_agent)
+    if log_folder is not None and isinstance(agent, Policy) and agent.network.memory:
+        raise ValueError(f"the zoo's `enjoy` drives nothing that remembers as {agent.name}: --out")
     task = task_in(out) if resume and out else new(**options)
     folder = folder_of(task, trained_agent.stem if trained_agent else "", out, log_folder)
     if conf_file is not None:
@@ -131,7 +141,7 @@ def train_command(
     if log_folder is not None:
         task.describe_for_zoo(folder, steps, eval_freq)
     console = Console()
-    with _Bar(console, steps, disable=not progress) as bar:
+    with TrainingBar(console, steps, disable=not progress) as bar:
         project = wandb_project_name if track else ""
         means = Means(eval_freq, device, tensorboard_log, bar.show, command, project)
         trained = train(task, steps, folder, resume, means, agent, trust)
@@ -146,31 +156,6 @@ def train_command(
         console.print(f"mean cost on test seeds{where}: {shown}", highlight=False, soft_wrap=True)
     wrote(console, folder / POLICY)
     wrote(console, folder / CURVE)
-
-
-class _Bar(Progress):
-    """Steps, the cost of the newest episodes, and the newest and the best evaluation."""
-
-    def __init__(self, console: Console, steps: int, disable: bool) -> None:
-        columns = (
-            TextColumn("{task.completed:,.0f} steps"),
-            BarColumn(20),
-            TextColumn("{task.description}"),
-            TimeElapsedColumn(),
-            TimeRemainingColumn(),
-        )
-        super().__init__(*columns, console=console, disable=disable)
-        self._task = self.add_task("", total=steps)
-
-    def show(self, now: "Now") -> None:
-        """Show where the training stands."""
-        text = "" if now.cost is None else f"cost {now.cost:.3g} exploring, "
-        last, best = now.evaluations[-1], min(now.evaluations, key=lambda each: each.judged)
-        if last.of_start is None:
-            text += f"of none's {last.of_none:.3f}, best {best.of_none:.3f}"
-        else:
-            text += f"of its start's {last.of_start:.3f}, best {best.of_start:.3f}"
-        self.update(self._task, completed=now.steps, description=text)
 
 
 def _table(trained: "Trained") -> Table:
@@ -218,13 +203,13 @@ def distill_command(
     hidden: Annotated[
         list[int] | None, typer.Option(help="Size of a dense layer (64, 64).")
     ] = None,
-    batch: Annotated[int, typer.Option(help="Episodes, with a GRU.")] = 16,
+    batch: Annotated[int, typer.Option(help="Episodes, with a GRU or traces.")] = 16,
     noise: Annotated[float, typer.Option(help="That shakes the teacher, at most.")] = 0.02,
     traces: Annotated[
         int, typer.Option(min=0, help="Bent units whose running means it reads, instead of a GRU.")
     ] = 0,
     told: Annotated[
-        float, typer.Option(help="Weight of what the teacher reads, as its GRU estimates it.")
+        float, typer.Option(help="Weight of what the teacher reads, as its GRU or traces tell it.")
     ] = 0.0,
     seed: Annotated[int, typer.Option(help="Of weights and episodes.")] = 0,
     episodes: Annotated[int, typer.Option(help="Of each contest's test.", min=2)] = 32,

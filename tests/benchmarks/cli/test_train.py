@@ -150,6 +150,11 @@ def test_a_log_folder_is_the_zoo_s_and_numbered(
     assert "scenario: sine-with-dwell" in (params / "args.yml").read_text()
     status, _, err = run(*TINY, "-f", "logs", "--out", "here")
     assert status == 2 and "without --out here" in err
+    status, _, err = run("--resume", "-f", "logs")
+    assert status == 2 and "logs is for a new training: name the old --out" in err
+    status, _, err = run("-i", "raw-coms-yaw", "-f", "logs")
+    assert status == 2 and "drives nothing that remembers as raw-coms-yaw: --out" in err
+    assert not list(tmp_path.glob("logs/*/*_3"))
 
 
 def test_it_goes_on_from_a_distilled_policy_in_all_contests_of_its_class(
