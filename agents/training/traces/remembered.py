@@ -54,7 +54,7 @@ class Remembered(VectorWrapper[Any, Any, Any, Any, Any]):
         self.single_observation_space = space_of(self.layout)
         self.observation_space = batch_space(self.single_observation_space, env.num_envs)
         self._network, self._state = network, np.zeros((env.num_envs, network.memory))
-        self._mixing = mixing
+        self._mixing = mixing and Mixing(mixing.mean, mixing.mixing.astype(np.float32))
 
     def reset(self, **arguments: Any) -> tuple[Any, dict[str, Any]]:
         """The inner env's."""
@@ -80,8 +80,9 @@ class Remembered(VectorWrapper[Any, Any, Any, Any, Any]):
     def _read(self, obs: Any, state: Any) -> Any:
         """(N, k) float32; state (N, memory) is updated."""
         x = self._network.remembered(obs.astype(np.float64), state)
-        x = x if self._mixing is None else (x - self._mixing.mean) @ self._mixing.mixing
-        return x.astype(np.float32)
+        if self._mixing is None:
+            return x.astype(np.float32)
+        return (x - self._mixing.mean).astype(np.float32) @ self._mixing.mixing
 
 
 def mixing_of(env: VectorEnv[Any, Any, Any], network: Network, drive: Driving, seed: int) -> Mixing:
