@@ -191,17 +191,6 @@ BAD: dict[str, tuple[Callable[[Any, Any, Any], Any], str]] = {
         lambda t, m, c: c["network"].update(cells=[["traces", 5, 2, ["3"]]]),
         "or traces with units",
     ),
-    "traces of no units, whatever they would take": (
-        lambda t, m, c: (
-            c["network"].update(cells=[["traces", 0, 0, [3]]], history=10**9),
-            t.update(
-                cell_0_weight_in=np.zeros((0, 3 * 10**9), np.float32),
-                cell_0_bias_in=np.zeros(0, np.float32),
-                weight_0=np.zeros((8, 0), np.float32),
-            ),
-        ),
-        "or traces with units",
-    ),
     "no traces' tensors": (
         lambda t, m, c: c["network"].update(cells=[["traces", 5, 2, [3, 10.0]]]),
         r"missing tensors: \['cell_0_bias_in', 'cell_0_weight_in'\]",

@@ -150,6 +150,14 @@ def test_a_file_holds_the_traces(tmp_path: Path) -> None:
     assert np.array_equal(policy.network(x), net(x))
 
 
+def test_a_file_of_no_units_cannot_ask_for_any_memory(tmp_path: Path) -> None:
+    """Tensors of nothing would fit a card of any number of frames."""
+    none = traces(weight_in=np.zeros((0, WIDE)), bias_in=np.zeros(0), bent=0)
+    save_policy(tmp_path / "mine.safetensors", network(none), CARD)
+    with pytest.raises(ValueError, match=r"traces with units.*\['traces', 0, 0, "):
+        load_policy(tmp_path / "mine.safetensors")
+
+
 @pytest.mark.parametrize(
     ("change", "named"),
     [
