@@ -12,6 +12,7 @@ from ...envs.backend.arrays import lane_count
 from ...envs.backend.decorators import counted, jit
 from ...envs.backend.eights import prefetch
 from ...envs.backend.primitives import maximum, minimum
+from ...envs.backend.simd import LANES
 from ..core.memory import FILTER, HEAD, Memory
 from ..entry import entry
 from ..wrappers.kernel import observe
@@ -82,8 +83,8 @@ def observe_batch(
     Filters of one shape do their rows in lanes, others alone.
     """
     waiting = 0
-    for k in range(len(lanes)):
-        b, first = lanes[k], k * lane_count()
+    for first in range(0, len(filters), lane_count()):  # without the compiler one by one
+        b = lanes[first // LANES]
         together, ahead = _gather(b, first, filters, done, rows), 0
         if together > 0:
             ahead = advance_block(b, first, filters, pool, places, fast, together, packets, counts)

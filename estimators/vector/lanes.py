@@ -83,7 +83,7 @@ def blocks(count: int) -> Any:
     size = -(-count // LANES) * BLOCK.itemsize
     room = np.zeros(size + _LINE, np.int8)
     first = -room.ctypes.data % _LINE
-    return room[first : first + size].view(BLOCK)
+    return room[first : first + size].view(BLOCK).view(np.recarray)
 
 
 @jit
