@@ -13,7 +13,7 @@ import numpy as np
 from ...envs.backend.decorators import jit
 from ...envs.backend.simd import LANES
 from ...envs.record import FAST, FAST_WIDTH
-from ..core.delay import BUFFER, LARSEN
+from ..core.delay import BUFFER, LARSEN, latch_due
 from ..core.intersample import NONE
 from ..core.memory import CORE, FASTS, INPUTS, SLOW, WINDOW, Memory
 from ..core.transition import KINEMATIC, VELOCITY_ROLL
@@ -181,6 +181,16 @@ def load(b: Block, lane: int, f: Memory) -> None:
     """A filter into its lane."""
     if b.model_speed[lane] != f.model_speed:
         _load_model(b, lane, f)
+    _load_states(b, lane, f)
+    for k in range(b.inputs):
+        b.u[k, lane] = f.u[k]
+    b.speed[lane], b.speed_before[lane], b.road_turn[lane] = f.speed, f.speed_before, f.road_turn
+    b.tick[lane], b.at[lane], b.cell[lane] = f.tick, f.at, f.cell
+    _load_clock(b, lane, f)
+
+
+@jit
+def _load_states(b: Block, lane: int, f: Memory) -> None:
     N = b.total
     for i in range(N):
         b.x[i, lane] = f.x[i]
@@ -188,10 +198,11 @@ def load(b: Block, lane: int, f: Memory) -> None:
         for i in range(N):
             for j in range(i, N):
                 b.P[i, j, lane] = f.P[i, j]
-    for k in range(b.inputs):
-        b.u[k, lane] = f.u[k]
-    b.speed[lane], b.speed_before[lane], b.road_turn[lane] = f.speed, f.speed_before, f.road_turn
-    b.tick[lane], b.at[lane], b.cell[lane] = f.tick, f.at, f.cell
+
+
+@jit
+def _load_clock(b: Block, lane: int, f: Memory) -> None:
+    """When the next capture is."""
     first = np.inf
     for s in range(SLOW):
         if f.period[s] > 0:
@@ -202,6 +213,17 @@ def load(b: Block, lane: int, f: Memory) -> None:
 @jit
 def store(b: Block, lane: int, f: Memory) -> None:
     """The state of a lane into its filter's record."""
+    _store_states(b, lane, f)
+    for k in range(b.inputs):
+        f.u[k] = b.u[k, lane]
+    for i in range(b.fasts):
+        f.y[i] = b.y[i, lane]
+    f.speed, f.speed_before, f.road_turn = b.speed[lane], b.speed_before[lane], b.road_turn[lane]
+    f.tick, f.at = b.tick[lane], b.at[lane]
+
+
+@jit
+def _store_states(b: Block, lane: int, f: Memory) -> None:
     N = b.total
     for i in range(N):
         f.x[i] = b.x[i, lane]
@@ -209,12 +231,16 @@ def store(b: Block, lane: int, f: Memory) -> None:
         for i in range(N):
             for j in range(i, N):
                 f.P[i, j] = f.P[j, i] = b.P[i, j, lane]
-    for k in range(b.inputs):
-        f.u[k] = b.u[k, lane]
-    for i in range(b.fasts):
-        f.y[i] = b.y[i, lane]
-    f.speed, f.speed_before, f.road_turn = b.speed[lane], b.speed_before[lane], b.road_turn[lane]
-    f.tick, f.at = b.tick[lane], b.at[lane]
+
+
+@jit
+def capture(b: Block, lane: int, f: Memory) -> None:
+    """Store by its record what a lane's filter captured at the last tick, with the model of now."""
+    _store_states(b, lane, f)
+    f.road_turn, f.speed_before = b.road_turn[lane], f.model_speed
+    latch_due(f, b.tick[lane])
+    _load_states(b, lane, f)
+    _load_clock(b, lane, f)
 
 
 @jit

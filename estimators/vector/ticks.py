@@ -1,7 +1,7 @@
 """The ticks of a block of filters: what all do in lanes, and by its record what one alone does.
 
-A lane's tick is computed by its record, as that of a filter alone is, where a camera captures, the
-model changes or a row is not sound. So is every packet.
+A lane's tick is computed by its record, as that of a filter alone is, where the model changes or a
+row is not sound. So is every packet, and what is stored of a capture.
 """
 
 from typing import Any
@@ -12,7 +12,7 @@ from ...envs.backend.arrays import at, lane_count, put
 from ...envs.backend.decorators import apart, counted, jit
 from ...envs.backend.eights import prefetch
 from ...envs.backend.primitives import anywhere, maximum, minimum, select
-from ...envs.record import FAST, PACKET
+from ...envs.record import FAST, FAST_WIDTH, PACKET
 from ..core.covariance import condition, project
 from ..core.fast import propagate, read, residual_of, signal
 from ..core.memory import SMALL, Gains, Memory, Row
@@ -21,7 +21,7 @@ from ..core.run import tick
 from ..core.speed import finite, low_passed, next_cell, off
 from ..core.transition import CURVATURE, LATERAL, road_turned
 from .designs import gains_of
-from .lanes import Block, load, remember_prediction, store
+from .lanes import Block, capture, load, remember_prediction, store
 
 
 @jit
@@ -30,7 +30,8 @@ def _fetch_next(b: Block, first: int, filters: Any, fast: Any, j: int, rows: int
     and its share of their states."""
     last = minimum(first + lane_count(), len(filters))
     for i in range(first, last):
-        prefetch(fast, i, j, 0)
+        prefetch(fast, i, j, 0)  # a row lies on two cache lines
+        prefetch(fast, i, j, FAST_WIDTH - 1)
     for lane in range(lane_count() * j // rows, lane_count() * (j + 1) // rows):
         if first + lane < last:
             f = filters[first + lane, 0]
@@ -55,7 +56,7 @@ def _read(b: Block, first: int, fast: Any, j: int) -> None:
 @jit
 def _sense(b: Block) -> Any:
     """Inputs into b.u_new, measurements into b.y; (speeds, whether a lane's tick stands apart)."""
-    odd = at(b.now) > at(b.next)
+    odd = at(b.here) != 1.0
     for i in range(b.inputs):
         put(b.u_new, signal(b.row, b.u_column[i], b.u_factor[i]), i)
         odd = odd | (finite(at(b.u_new, i)) ^ True)
@@ -104,6 +105,16 @@ def _correct(b: Block, first: int, filters: Any) -> None:
             for lane in range(lane_count()):
                 if b.wild[lane] == 1.0:
                     load(b, lane, filters[first + lane, 0])
+
+
+@jit
+def _capture(b: Block, first: int, filters: Any) -> None:
+    """What lanes that do this tick together captured at the last one."""
+    if anywhere(at(b.now) > at(b.next)):
+        for lane in range(lane_count()):
+            due = b.now[lane] > b.next[lane]
+            if due and b.here[lane] == 1.0 and b.apart[lane] == 0.0:
+                capture(b, lane, filters[first + lane, 0])
 
 
 @jit
@@ -228,6 +239,7 @@ def advance_block(
         if some and not _leave(b, first, filters, pool, places, fast, j):
             rows = j
             break
+        _capture(b, first, filters)
         _together(b, first, filters, pool, places, speed)
         if some:
             _return(b, first, filters, pool, places, fast, j)
