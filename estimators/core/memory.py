@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from ...envs.backend.lines import whole_lines
 from ...envs.record import PACKET_WIDTH
 from ...envs.sensors.slow import SLOW_NAMES
 
@@ -285,7 +286,16 @@ def _size(field: Any) -> int:
     return math.prod(field[2]) if len(field) > 2 else 1
 
 
-_AHEAD = ("ahead", _FLOAT, (1,))  # where small fields begin, all that a tick reads next to another
-FILTER = np.dtype([_AHEAD, *sorted(_FIELDS, key=_size), *_WINDOW], align=True)
-SMALL, HEAD = (sum(_size(field) for field in _FIELDS if _size(field) <= size) for size in (4, 64))
-"""Numbers of the fields of so many numbers each, which come first."""
+_OFTEN = (  # what a tick in lanes reads or writes by the record
+    *("n", "total", "periodic", "members", "measured", "speed", "speed_before", "model_speed"),
+    *("tick", "begun", "cell", "at", "cursor", "road_turn", "period", "next", "y", "u", "counts"),
+)
+_FIRST = {name: place for place, name in enumerate((*_OFTEN, "x", "P"))}
+_ORDER = sorted(_FIELDS, key=lambda field: (_FIRST.get(field[0], len(_FIRST)), _size(field)))
+_COUNT = sum(_size(field) for field in _ORDER[: len(_OFTEN)])
+_AHEAD = ("ahead", _FLOAT, (8 - _COUNT % 8,))  # with it x and P begin on cache lines
+FILTER = whole_lines([_AHEAD, *_ORDER, *_WINDOW])
+"""What is read often, x, P, what is small, the rest: next to each other what is read together."""
+OFTEN = 8 - _COUNT % 8 + _COUNT
+SMALL = sum(_size(field) for field in _ORDER[len(_FIRST) :] if _size(field) <= 64)
+"""Numbers ahead of x, and of the small fields behind P."""

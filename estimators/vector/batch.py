@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ...envs.backend.lines import zeros_on_lines
 from ...envs.record import FAST_WIDTH, PACKET_WIDTH, Log, Record
 from ...envs.sensors.link import SlowSensor
 from ..core.memory import FILTER, Counters
@@ -39,7 +40,7 @@ class BatchEstimator:
         self._of: list[Any] = [None] * len(setups)  # each row's design
         first = self._designs.built(setups[0])
         self.names, self.units = first.names, first.units
-        self.filters = np.zeros((len(setups), len(first.filters)), FILTER).view(np.recarray)
+        self.filters = zeros_on_lines((len(setups), len(first.filters)), FILTER)
         self.configure(range(len(setups)), setups)
 
     def __len__(self) -> int:

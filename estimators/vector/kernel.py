@@ -13,7 +13,7 @@ from ...envs.backend.decorators import counted, jit
 from ...envs.backend.eights import prefetch
 from ...envs.backend.primitives import maximum, minimum
 from ...envs.backend.simd import LANES
-from ..core.memory import FILTER, HEAD, Memory
+from ..core.memory import FILTER, OFTEN, SMALL, WIDTH, Memory
 from ..entry import entry
 from ..wrappers.kernel import observe
 from .designs import gains_of
@@ -26,8 +26,10 @@ _FEW = 4  # filters that are computed alone in less time than in lanes
 @jit
 def _fetch(f: Memory, like: Memory) -> None:
     """Have the caches fetch what a tick reads of a filter, whose states are as many as `like`'s."""
-    for i in range(0, HEAD, 8):
+    for i in range(0, OFTEN + like.total, 8):
         prefetch(f.ahead, i)
+    for i in range(0, SMALL, 8):
+        prefetch(f.P, WIDTH, i)
     for j in range(0, like.total, 8):
         for i in range(like.total):
             prefetch(f.P, i, j)

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ...envs.backend.decorators import jit
+from ...envs.backend.lines import whole_lines, zeros_on_lines
 from ...envs.backend.simd import LANES
 from ...envs.record import FAST, FAST_WIDTH
 from ..core.delay import BUFFER, LARSEN, latch_due
@@ -74,16 +75,12 @@ _FIELDS = (
     + [("u_column", np.int64, (INPUTS, 2)), ("y_column", np.int64, (FASTS, 2))]
     + [("column", np.int64, (FAST_WIDTH,)), ("columns", np.int64)]  # of a fast row, that are read
 )
-_LINE = 64  # bytes that a cache fetches at once
-BLOCK = np.dtype([*_FIELDS, ("rest", np.int8, _LINE - np.dtype(_FIELDS).itemsize % _LINE)])
+BLOCK = whole_lines(_FIELDS)
 
 
 def blocks(count: int) -> Any:
-    """Blocks for so many filters, nothing in them, each on a cache line."""
-    size = -(-count // LANES) * BLOCK.itemsize
-    room = np.zeros(size + _LINE, np.int8)
-    first = -room.ctypes.data % _LINE
-    return room[first : first + size].view(BLOCK).view(np.recarray)
+    """Blocks for so many filters, nothing in them."""
+    return zeros_on_lines((-(-count // LANES),), BLOCK)
 
 
 @jit

@@ -15,7 +15,7 @@ from ...envs.backend.primitives import anywhere, maximum, minimum, select
 from ...envs.record import FAST, FAST_WIDTH, PACKET
 from ..core.covariance import condition, project
 from ..core.fast import propagate, read, residual_of, signal
-from ..core.memory import SMALL, Gains, Memory, Row
+from ..core.memory import OFTEN, Gains, Memory, Row
 from ..core.packets import receive
 from ..core.run import tick
 from ..core.speed import finite, low_passed, next_cell, off
@@ -35,12 +35,11 @@ def _fetch_next(b: Block, first: int, filters: Any, fast: Any, j: int, rows: int
     for lane in range(lane_count() * j // rows, lane_count() * (j + 1) // rows):
         if first + lane < last:
             f = filters[first + lane, 0]
-            for k in range(0, b.total, 8):
-                prefetch(f.x, k)
-                for i in range(b.total if b.periodic == 0 else 0):
-                    prefetch(f.P, i, k)
-            for k in range(0, SMALL, 8):
+            for k in range(0, OFTEN + b.total, 8):
                 prefetch(f.ahead, k)
+            for i in range(b.total if b.periodic == 0 else 0):
+                for k in range(0, b.total, 8):
+                    prefetch(f.P, i, k)
 
 
 @jit
