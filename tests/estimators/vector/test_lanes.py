@@ -1,5 +1,6 @@
 """Filters in lanes have the bits of each alone, whatever happens to their neighbours."""
 
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from sideslip.estimators import FILTERS, make_estimator
 from sideslip.estimators.vector import kernel
 from sideslip.estimators.vector.lanes import BLOCK, blocks
 from sideslip.estimators.vector.make import make_batch
+from tests.estimators.simulation import GPS
 from tests.estimators.vector.test_batch import drives, feed, home, same_bits
 
 pytestmark = [
@@ -37,8 +39,10 @@ def troubled(name: str) -> list[Any]:
     return logs
 
 
-def same_as_alone(name: str, n: int, speed: float | None, **options: Any) -> None:
-    logs = troubled(name)
+def same_as_alone(
+    name: str, n: int, speed: float | None, logs: list[Any] | None = None, **options: Any
+) -> None:
+    logs = troubled(name) if logs is None else logs
     cars = [COMS.scaled(1.0 - 0.1 * (i % 2)) for i in range(COUNT)]
     told = [log.slow for log in logs]
     batch = make_batch(name, COUNT, vehicle=cars, sensors=told, speed=speed, **options)
@@ -74,6 +78,20 @@ def test_so_it_is_for_every_step(name: Any, n: Any, speed: Any) -> None:
 )
 def test_so_it_is_with_options(options: Any) -> None:
     same_as_alone("exact-kf", 10, 7.0, **options)
+
+
+def test_a_capture_is_of_its_own_tick() -> None:
+    """A course over the ground, on a road that turns, noisier the slower: the car speeds up so much
+    that its model is another one in most ticks, or by some of its captures alone."""
+    clock = dataclasses.replace(GPS, delays=(0.03,))
+    logs = drives(COUNT, "gps", clock, seconds=0.6)
+    for i, log in enumerate(logs):
+        fast = log.record.fast
+        fast[:, FAST.curvature] = np.random.default_rng(i).normal(0.02, 0.02, len(fast))
+        fast[:, [FAST.wheel_left, FAST.wheel_right]] *= (
+            1.0 + 0.2 * i * np.linspace(0, 1, len(fast))[:, None]
+        )
+    same_as_alone("exact-kf", 10, None, logs, slow=["gps"], gains="covariance")
 
 
 def test_rows_that_stand_still_or_begin_anew_leave_their_block_alone() -> None:
