@@ -1,7 +1,9 @@
 """The README's table of the matrix, made from the rows of a run.
 
 `sideslip bench control --json rows.json`, then `python -m sideslip.benchmarks.readme
-rows.json` writes the tiers' rows to docs/control.json and the table into README.md.
+rows.json` writes the tiers' rows to docs/control.json and the table into README.md. A policy that
+came after the run drives its seeds with `python -m sideslip.benchmarks.readme docs/control.json
+--add NAME`.
 """
 
 import re
@@ -10,9 +12,14 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich.console import Console
 
-from .control.cells import REFERENCE_CONTROLLER, REFERENCE_FILTER
-from .control.contests import NOMINAL, PARAMETERS, STATE
+from .control.cells import LEARNED, REFERENCE_CONTROLLER, REFERENCE_FILTER, Cell
+from .control.contests import NOMINAL, PARAMETERS, STATE, contests
+from .control.ladder import yardsticks
+from .control.run import measure
+from .control.seeds import seeds_of_contests
+from .control.tables import rows_of, standings
 from .harness.results import Row, read_json, write_json, write_text
 
 ROWS, README = Path("docs/control.json"), Path("README.md")
@@ -37,6 +44,7 @@ SHOWN: Mapping[str, tuple[str, str]] = {
     "policy `raw-car-steering`, no filter": ("raw-car-steering", ""),
     "policy `raw-car-yaw`, no filter": ("raw-car-yaw", ""),
     "policy `raw-coms-yaw`, no filter": ("raw-coms-yaw", ""),
+    "policy `raw-coms-steering`, no filter": ("raw-coms-steering", ""),
     "`model-following` on `exact-kf`": ("model-following", REFERENCE_FILTER),
     "`two-dof` on `exact-kf`": ("two-dof", REFERENCE_FILTER),
     "`esc` on `exact-kf`": ("esc", REFERENCE_FILTER),
@@ -87,9 +95,43 @@ def put(text: str, made: str) -> str:
     return pattern.sub(lambda _: made + "\n", text)
 
 
-def main(rows: Annotated[Path, typer.Argument(help="Of sideslip bench control --json.")]) -> None:
+def added(
+    rows: Sequence[Row], name: str, jobs: int | None = None, console: Console | None = None
+) -> list[Row]:
+    """The rows with those of a learned policy in its class's contests, on the rows' own seeds.
+
+    Its contests' reference points are driven anew. Raises ValueError for one that is not among
+    `LEARNED`.
+    """
+    reads = {kind: reads for kind, those in LEARNED.items() for reads, who in those if who == name}
+    if not reads:
+        known = ", ".join(who for those in LEARNED.values() for _, who in those)
+        raise ValueError(f"the matrix's policies are {known}, got {name!r}")
+    tier_1 = next(row for row in rows if (row.controller, row.scenario) == (STATE, "tier 1"))
+    episodes = tier_1.n // sum(contest.tier == "1" for contest in contests())
+    played = [contest for contest in contests() if contest.tier and contest.kind in reads]
+    asked = [Cell(contest, "", rung) for contest in played for rung in (NOMINAL, STATE)]
+    asked += [Cell(contest, reads[contest.kind], name) for contest in played]
+    seeds = seeds_of_contests(tier_1.salt, episodes)
+    results = measure(asked, seeds, jobs=jobs, console=console, title=name)
+    found = [row for row in rows if row.controller != name]
+    for tier in HEADS:
+        mine = yardsticks(results, [contest for contest in played if contest.tier == tier])
+        for each in standings(results.found, tier, mine):
+            if each.cell.controller == name:
+                new = (row for row in rows_of(each, tier_1.salt) if row.metric in METRICS)
+                found += [row for row in new if row.scenario == f"tier {tier}"]
+    return found
+
+
+def main(
+    rows: Annotated[Path, typer.Argument(help="Of sideslip bench control --json.")],
+    add: Annotated[list[str] | None, typer.Option(help="A policy that came later.")] = None,
+) -> None:
     """Write the tiers' rows and the README's table, in the repository's root."""
     found = tier_rows(rows)
+    for name in add or []:
+        found = added(found, name, console=Console(stderr=True))
     readme = put(README.read_text(encoding="utf-8"), table(found))
     write_json(ROWS, found)
     write_text(README, readme)

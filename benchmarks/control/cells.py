@@ -49,7 +49,11 @@ _CANDIDATES = tuple(name for those in ORACLES.values() for name in those)
 LEARNED: dict[str, tuple[tuple[str, str], ...]] = {
     "car-steering": (("joint", "distill-car-steering"), ("", "raw-car-steering")),
     "car-yaw": (("joint", "distill-car-yaw"), ("", "raw-car-yaw")),
-    "coms-model": (("joint", "ppo-coms-steering"), ("joint", "distill-coms-steering")),
+    "coms-model": (
+        ("joint", "ppo-coms-steering"),
+        ("", "raw-coms-steering"),
+        ("joint", "distill-coms-steering"),
+    ),
     "coms-zero-slip": (
         ("joint", "ppo-coms-yaw"),
         ("joint", "distill-coms-yaw"),

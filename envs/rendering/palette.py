@@ -63,6 +63,7 @@ CONTROLLERS = {
     "raw-car-steering": "#1F93C6",
     "raw-car-yaw": "#2A8DBD",
     "raw-coms-yaw": "#3D84B8",
+    "raw-coms-steering": "#15698F",
 }
 RUNGS = {
     "nominal": "#CF00B4",
