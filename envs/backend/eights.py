@@ -10,6 +10,7 @@ The functions are plain Python on NumPy arrays; below them stands what the compi
 """
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,8 @@ from numba.np.arrayobj import make_array, populate_array
 
 from .arrays import place, whole
 from .simd import EIGHT, FLOATS, LANES
+
+LINE = 64  # bytes that a cache fetches at once, eight numbers
 
 
 def eight(array: Any, *index: int) -> Any:
@@ -54,6 +57,20 @@ def mirror(array: Any, i: int, j: int) -> None:
 
 def prefetch(array: Any, *index: int) -> None:
     """Have the cache line of a number fetched that is soon read; it may lie beyond the array."""
+
+
+def whole_lines(fields: Sequence[Any]) -> np.dtype[Any]:
+    """A structured dtype of these fields, as long as so many whole cache lines."""
+    rest = -np.dtype(list(fields)).itemsize % LINE
+    return np.dtype([*fields, *([("rest", np.int8, rest)] if rest else [])])
+
+
+def zeros_on_lines(shape: tuple[int, ...], dtype: np.dtype[Any]) -> Any:
+    """A record array of zeros whose first record begins on a cache line, as its eights then do."""
+    size = math.prod(shape) * dtype.itemsize
+    room = np.zeros(size + LINE, np.int8)
+    first = -room.ctypes.data % LINE
+    return room[first : first + size].view(dtype).reshape(shape).view(np.recarray)
 
 
 def span(array: Any) -> int:

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ...envs.backend.lines import whole_lines
+from ...envs.backend.eights import whole_lines
 from ...envs.record import PACKET_WIDTH
 from ...envs.sensors.slow import SLOW_NAMES
 
@@ -136,10 +136,7 @@ _FAST = [  # inputs and fast measurements: sums of two columns of the fast row
     ("inputs", _INT),
     ("u_column", _INT, (INPUTS, 2)),
     ("u_factor", _FLOAT, (INPUTS, 2)),
-    (
-        "steer_jump",
-        _FLOAT,
-    ),  # rad, of the first input from row to row that needs another row; 0: none
+    ("steer_jump", _FLOAT),  # rad, a step of the first input that a row must confirm; 0: none
     ("steer_before", _FLOAT),  # rad, of the row before, as it came
     ("fasts", _INT),
     ("y_column", _INT, (FASTS, 2)),
@@ -282,20 +279,19 @@ _FIELDS = _MODEL + _BANK + _FAST + _SLOW + _DELAY + _GAINS + _SPEED + _NOW + _BE
 
 
 def _size(field: Any) -> int:
-    """Numbers of a field."""
     return math.prod(field[2]) if len(field) > 2 else 1
 
 
-_OFTEN = (  # what a tick in lanes reads or writes by the record
+_FIRST = (  # what a tick in lanes reads or writes by the record, next to another
     *("n", "total", "periodic", "members", "measured", "speed", "speed_before", "model_speed"),
     *("tick", "begun", "cell", "at", "cursor", "road_turn", "period", "next", "y", "u", "counts"),
+    *("x", "P"),
 )
-_FIRST = {name: place for place, name in enumerate((*_OFTEN, "x", "P"))}
-_ORDER = sorted(_FIELDS, key=lambda field: (_FIRST.get(field[0], len(_FIRST)), _size(field)))
-_COUNT = sum(_size(field) for field in _ORDER[: len(_OFTEN)])
-_AHEAD = ("ahead", _FLOAT, (8 - _COUNT % 8,))  # with it x and P begin on cache lines
-FILTER = whole_lines([_AHEAD, *_ORDER, *_WINDOW])
-"""What is read often, x, P, what is small, the rest: next to each other what is read together."""
-OFTEN = 8 - _COUNT % 8 + _COUNT
+_RANK = dict(zip(_FIRST, range(len(_FIRST)), strict=True))
+_ORDER = sorted(_FIELDS, key=lambda field: (_RANK.get(str(field[0]), len(_RANK)), _size(field)))
+_BEFORE = sum(_size(field) for field in _ORDER[: _RANK["x"]])
+_AHEAD = 8 - _BEFORE % 8  # with it x and P begin on cache lines
+FILTER = whole_lines([("ahead", _FLOAT, (_AHEAD,)), *_ORDER, *_WINDOW])
+OFTEN = _AHEAD + _BEFORE
 SMALL = sum(_size(field) for field in _ORDER[len(_FIRST) :] if _size(field) <= 64)
 """Numbers ahead of x, and of the small fields behind P."""

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...envs.backend.lines import zeros_on_lines
+from ...envs.backend.eights import zeros_on_lines
 from ...envs.record import FAST_WIDTH, PACKET_WIDTH, Log, Record
 from ...envs.sensors.link import SlowSensor
 from ..core.memory import FILTER, Counters

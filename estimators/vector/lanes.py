@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ...envs.backend.decorators import jit
-from ...envs.backend.lines import whole_lines, zeros_on_lines
+from ...envs.backend.eights import whole_lines, zeros_on_lines
 from ...envs.backend.simd import LANES
 from ...envs.record import FAST, FAST_WIDTH
 from ..core.delay import BUFFER, LARSEN, latch_due

@@ -9,10 +9,11 @@ import pytest
 from sideslip.envs import COMS
 from sideslip.envs.record import FAST, PACKET_WIDTH
 from sideslip.estimators import FILTERS, make_estimator
+from sideslip.estimators.core.memory import FILTER
 from sideslip.estimators.vector import kernel
 from sideslip.estimators.vector.lanes import BLOCK, blocks
 from sideslip.estimators.vector.make import make_batch
-from tests.estimators.simulation import GPS
+from tests.estimators.simulation import CAMERA, GPS
 from tests.estimators.vector.test_batch import drives, feed, home, same_bits
 
 pytestmark = [
@@ -151,9 +152,11 @@ def test_which_filters_are_in_lanes() -> None:
     assert (few._lanes["model_speed"] == 0.0).all()
 
 
-def test_blocks_lie_on_cache_lines() -> None:
-    made = blocks(33)
+def test_blocks_and_records_lie_on_cache_lines() -> None:
+    made, batch = blocks(33), make_batch("exact-kf", 3, sensors={"camera": CAMERA}, speed=7.0)
     assert len(made) == 3 and made.dtype == BLOCK
-    assert BLOCK.itemsize % 64 == 0 and made.ctypes.data % 64 == 0
-    assert BLOCK.fields is not None
-    assert all(BLOCK.fields[name][1] % 64 == 0 for name in ("x", "P", "GT", "row"))
+    for array in (made, batch.filters):
+        assert array.dtype.itemsize % 64 == 0 and array.ctypes.data % 64 == 0
+    for kind, names in ((BLOCK, ("x", "P", "GT", "row")), (FILTER, ("x", "P"))):
+        assert kind.fields is not None
+        assert all(kind.fields[name][1] % 64 == 0 for name in names)
