@@ -35,7 +35,7 @@ LEAST = 0.1  # mean log ratio between nominal and oracle-parameters, of which th
 _LEVELS = np.geomspace(0.1, 10.0, 41)
 _TEXT = (
     "The shipped policies beside controllers on the same late sensors, on salted seeds and in "
-    "conditions that no contest has; of each tier of a policy's class one contest. Share: of the "
+    "conditions that no contest has, in three contests of a policy's class. Share: of the "
     "paired log ratio of cost from nominal (0) to oracle-parameters (1), which knows car, friction "
     "and biases, over the contests, on the episodes that both survive; a failure counts as 20 "
     "times nominal's cost."
@@ -81,10 +81,11 @@ def contestants(kind: str) -> list[tuple[str, str]]:
 
 
 def chosen(kind: str) -> list[Contest]:
-    """The contest in the middle of each tier of a class."""
+    """Three contests of a class, the one in the middle of each tier or three of its only one."""
     mine = [each for each in contests() if each.kind == kind]
     tiers = [[c for c in mine if c.tier == tier] for tier in dict.fromkeys(c.tier for c in mine)]
-    return [those[len(those) // 2] for those in tiers]
+    each = max(3 // len(tiers), 1)
+    return [those[(2 * i + 1) * len(those) // (2 * each)] for those in tiers for i in range(each)]
 
 
 @dataclass
