@@ -81,7 +81,8 @@ def contestants(kind: str) -> list[tuple[str, str]]:
 
 
 def chosen(kind: str) -> list[Contest]:
-    """Three contests of a class, the one in the middle of each tier or three of its only one."""
+    """Contests of a class: the one in the middle of each of its three tiers, or three of its only
+    tier, evenly apart."""
     mine = [each for each in contests() if each.kind == kind]
     tiers = [[c for c in mine if c.tier == tier] for tier in dict.fromkeys(c.tier for c in mine)]
     each = max(3 // len(tiers), 1)

@@ -14,6 +14,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from .. import __version__
 from .control.cells import LEARNED, REFERENCE_CONTROLLER, REFERENCE_FILTER, Cell
 from .control.contests import NOMINAL, PARAMETERS, STATE, contests
 from .control.ladder import yardsticks
@@ -101,25 +102,33 @@ def added(
     """The rows with those of a learned policy in its class's contests, on the rows' own seeds.
 
     Its contests' reference points are driven anew. Raises ValueError for one that is not among
-    `LEARNED`.
+    `LEARNED`, for rows of another version or without tier 1, and where somebody cannot drive.
     """
-    reads = {kind: reads for kind, those in LEARNED.items() for reads, who in those if who == name}
-    if not reads:
+    of = {kind: read for kind, those in LEARNED.items() for read, who in those if who == name}
+    if not of:
         known = ", ".join(who for those in LEARNED.values() for _, who in those)
         raise ValueError(f"the matrix's policies are {known}, got {name!r}")
-    tier_1 = next(row for row in rows if (row.controller, row.scenario) == (STATE, "tier 1"))
-    episodes = tier_1.n // sum(contest.tier == "1" for contest in contests())
-    played = [contest for contest in contests() if contest.tier and contest.kind in reads]
+    tier_1 = [row for row in rows if (row.controller, row.scenario) == (STATE, "tier 1")]
+    versions = {row.env_version for row in tier_1}
+    if versions != {__version__}:
+        got = ", ".join(versions) or "none"
+        raise ValueError(f"expected rows of {STATE} in tier 1, of version {__version__}, got {got}")
+    count = sum(contest.tier == "1" for contest in contests())
+    episodes = -(-tier_1[0].n // count)  # n: of those that the rungs survived
+    played = [contest for contest in contests() if contest.tier and contest.kind in of]
     asked = [Cell(contest, "", rung) for contest in played for rung in (NOMINAL, STATE)]
-    asked += [Cell(contest, reads[contest.kind], name) for contest in played]
-    seeds = seeds_of_contests(tier_1.salt, episodes)
+    asked += [Cell(contest, of[contest.kind], name) for contest in played]
+    seeds = seeds_of_contests(tier_1[0].salt, episodes)
     results = measure(asked, seeds, jobs=jobs, console=console, title=name)
+    for cell, driven in results.found.items():
+        if driven.error:
+            raise ValueError(f"{cell.label} in {cell.contest.name}: {driven.error}")
     found = [row for row in rows if row.controller != name]
     for tier in HEADS:
         mine = yardsticks(results, [contest for contest in played if contest.tier == tier])
         for each in standings(results.found, tier, mine):
             if each.cell.controller == name:
-                new = (row for row in rows_of(each, tier_1.salt) if row.metric in METRICS)
+                new = (row for row in rows_of(each, tier_1[0].salt) if row.metric in METRICS)
                 found += [row for row in new if row.scenario == f"tier {tier}"]
     return found
 

@@ -7,11 +7,11 @@ import numpy as np
 
 from ...envs.backend.arrays import lane_count
 from ...envs.backend.decorators import jit
-from ...envs.backend.simd import LANES
 from .prediction import RESIDUALS, TERMINAL, roll_out
 from .prediction_model import Model, Start
 
-MOST_VARIABLES = LANES - 1  # one lane is the plan itself
+PLANS = 16  # that are tried at once
+MOST_VARIABLES = PLANS - 1  # one is the plan itself
 LIMIT = 2.0  # of a variable: from one limit of an input to the other
 DIFFERENCE = 0.01  # of a variable, for slopes
 LEAST_DAMPING = 1e-4  # Levenberg and Marquardt's, of the first of the steps that are tried
@@ -148,7 +148,7 @@ def improved(
     J is not finite where no plan was; then the plan is as it was.
     """
     n = len(plan)
-    all, A, g, J = lanes_of(n, blocks, LANES), np.empty((n, n)), np.empty(n), np.empty(LANES)
+    all, A, g, J = lanes_of(n, blocks, PLANS), np.empty((n, n)), np.empty(n), np.empty(PLANS)
     least, share, wheel = math.inf, 0.0, 0.0
     for _ in range(iterations):
         _poke(plan, all)
@@ -159,7 +159,7 @@ def improved(
         roll_all(model, start, K, terminal, blocks, all)
         _costs(all.residuals, J)
         best, least = 0, math.inf
-        for c in range(LANES):
+        for c in range(PLANS):
             if J[c] < least:
                 best, least = c, J[c]
         if least < math.inf:

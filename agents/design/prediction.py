@@ -2,7 +2,7 @@
 
 A plan is what is added to the linear regulator's answer, constant in blocks of steps; the sum is
 limited as the plant limits it. So the plan of zeros is the regulator itself, and where nothing is
-limited or bent it is the best one. Sixteen plans are rolled out in the lanes of one SIMD value.
+limited or bent it is the best one. As many plans as a SIMD value has lanes are rolled out at once.
 """
 
 import math

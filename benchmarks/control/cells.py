@@ -60,8 +60,8 @@ LEARNED: dict[str, tuple[tuple[str, str], ...]] = {
         ("", "raw-coms-yaw"),
     ),
 }
-"""(estimator, policy), the best one first, by the class of contests that the policy was trained on,
-by its shipped name or path."""
+"""(estimator, policy), first the one of which verdicts speak, by the class of contests that the
+policy was trained on, by its shipped name or path."""
 SHARED = {
     ORACLES[PARAMETERS][0]: ("adaptive-lqr", {"grip", "steer_weight"}),
     ORACLES[PARAMETERS][1]: ("adaptive-nmpc", {"horizon", "grip", "steer_weight"}),

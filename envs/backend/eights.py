@@ -7,6 +7,7 @@ functions take the lanes of one place, and `span` says that they go on by one co
 matrix of lanes only what stands on and above the diagonal counts.
 
 The functions are plain Python on NumPy arrays; below them stands what the compiler makes of each.
+Records of such matrices begin on cache lines, which eight numbers fill (`whole_lines`).
 """
 
 import math

@@ -1,12 +1,13 @@
 # numba's own types say too little about itself:
 # mypy: disable-error-code="attr-defined,no-untyped-call,no-untyped-def,misc,untyped-decorator"
-"""Lanes: sixteen numbers in one SIMD value, for which the compiler takes the equations unchanged.
+"""Lanes: many numbers in one SIMD value, for which the compiler takes the equations unchanged.
 
 A numba type whose machine value is LLVM's vector of doubles, with the integers and the truth values
 that go with it. Single numbers mix with lanes as they do with arrays. The arithmetic is that of
 single numbers, in the order written and without fused operations: a lane holds the very bits that
-the number alone would have. Sixteen are two of AVX-512's registers: while one waits for a result
-the other is computed, a third faster than eight. Narrower machines take more of theirs.
+the number alone would have, however many they are. With AVX-512 there are sixteen, two registers:
+while one waits for a result the other is computed, a third faster than eight. Elsewhere there are
+eight: sixteen would be four registers of sixteen, and most numbers would go through memory.
 
 Eight neighbours of a matrix's row are a type of their own, `EIGHT`: with it the sums of one
 filter's small matrices are taken for eight columns at once, in the order of each column alone.
@@ -21,10 +22,12 @@ from numba.core import types
 from numba.core.datamodel import models
 from numba.core.extending import register_model
 from numba.core.imputils import lower_builtin, lower_cast
+from numba.core.registry import cpu_target
 from numba.core.typeconv import Conversion
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 
-LANES = 16
+_FEATURES = cpu_target.target_context.codegen().magic_tuple()[2]  # by which kernels are kept, too
+LANES = 16 if "+avx512f" in _FEATURES else 8
 _DOUBLE, _LONG, _BIT = ir.DoubleType(), ir.IntType(64), ir.IntType(1)
 
 

@@ -279,6 +279,7 @@ _FIELDS = _MODEL + _BANK + _FAST + _SLOW + _DELAY + _GAINS + _SPEED + _NOW + _BE
 
 
 def _size(field: Any) -> int:
+    """How many numbers it has."""
     return math.prod(field[2]) if len(field) > 2 else 1
 
 
@@ -292,6 +293,5 @@ _ORDER = sorted(_FIELDS, key=lambda field: (_RANK.get(str(field[0]), len(_RANK))
 _BEFORE = sum(_size(field) for field in _ORDER[: _RANK["x"]])
 _AHEAD = 8 - _BEFORE % 8  # with it x and P begin on cache lines
 FILTER = whole_lines([("ahead", _FLOAT, (_AHEAD,)), *_ORDER, *_WINDOW])
-OFTEN = _AHEAD + _BEFORE
-SMALL = sum(_size(field) for field in _ORDER[len(_FIRST) :] if _size(field) <= 64)
-"""Numbers ahead of x, and of the small fields behind P."""
+OFTEN = _AHEAD + _BEFORE  # numbers before x
+SMALL = sum(_size(field) for field in _ORDER[len(_FIRST) :] if _size(field) <= 64)  # behind P

@@ -43,6 +43,12 @@ class BatchEstimator:
         self.filters = zeros_on_lines((len(setups), len(first.filters)), FILTER)
         self.configure(range(len(setups)), setups)
 
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """A copy's records lie on cache lines, too, and its lanes are empty."""
+        self.__dict__.update(state)
+        filters, self.filters = self.filters, zeros_on_lines(self.filters.shape, FILTER)
+        self.filters[:], self._lanes = filters, blocks(len(filters))
+
     def __len__(self) -> int:
         return len(self.filters)
 

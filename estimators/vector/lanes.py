@@ -1,9 +1,9 @@
-"""Sixteen filters of one shape in SIMD lanes: what their ticks read and write, side by side.
+"""Filters of one shape in SIMD lanes: what their ticks read and write, side by side.
 
 The filters' records stay what they are; a block has fields of the same names whose numbers are
-lanes, so the equations of `core` are compiled for it unchanged. Filter i of a batch has lane i mod
-16 of block i // 16. Its model stays there from call to call and is loaded anew where its speed is
-another one; its state is loaded and stored in every call.
+lanes, so the equations of `core` are compiled for it unchanged. Filter i of a batch has lane
+i mod LANES of block i // LANES. Its model stays there from call to call and is loaded anew where
+its speed is another one; its state is loaded and stored in every call.
 """
 
 from typing import Any
@@ -232,7 +232,7 @@ def _store_states(b: Block, lane: int, f: Memory) -> None:
 
 @jit
 def capture(b: Block, lane: int, f: Memory) -> None:
-    """Store by its record what a lane's filter captured at the last tick, with the model of now."""
+    """Store by its record what a lane's filter captured at its last tick; before the next one."""
     _store_states(b, lane, f)
     f.road_turn, f.speed_before = b.road_turn[lane], f.model_speed
     latch_due(f, b.tick[lane])

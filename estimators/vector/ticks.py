@@ -30,8 +30,8 @@ def _fetch_next(b: Block, first: int, filters: Any, fast: Any, j: int, rows: int
     and its share of their states."""
     last = minimum(first + lane_count(), len(filters))
     for i in range(first, last):
-        prefetch(fast, i, j, 0)  # a row lies on two cache lines
-        prefetch(fast, i, j, FAST_WIDTH - 1)
+        for k in range(0, FAST_WIDTH, 5):  # a row lies on two cache lines or three
+            prefetch(fast, i, j, k)
     for lane in range(lane_count() * j // rows, lane_count() * (j + 1) // rows):
         if first + lane < last:
             f = filters[first + lane, 0]
@@ -55,7 +55,7 @@ def _read(b: Block, first: int, fast: Any, j: int) -> None:
 @jit
 def _sense(b: Block) -> Any:
     """Inputs into b.u_new, measurements into b.y; (speeds, whether a lane's tick stands apart)."""
-    odd = at(b.here) != 1.0
+    odd = at(b.here) != 1.0  # nowhere, as far as anybody looks at it
     for i in range(b.inputs):
         put(b.u_new, signal(b.row, b.u_column[i], b.u_factor[i]), i)
         odd = odd | (finite(at(b.u_new, i)) ^ True)
@@ -109,7 +109,7 @@ def _correct(b: Block, first: int, filters: Any) -> None:
 @jit
 def _capture(b: Block, first: int, filters: Any) -> None:
     """What lanes that do this tick together captured at the last one."""
-    if anywhere(at(b.now) > at(b.next)):
+    if anywhere((at(b.now) > at(b.next)) & (at(b.here) == 1.0)):
         for lane in range(lane_count()):
             due = b.now[lane] > b.next[lane]
             if due and b.here[lane] == 1.0 and b.apart[lane] == 0.0:

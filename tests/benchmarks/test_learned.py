@@ -9,7 +9,7 @@ import pytest
 from sideslip.benchmarks import learned
 from sideslip.benchmarks.control.build import estimate_options
 from sideslip.benchmarks.control.cells import LEARNED, Cell
-from sideslip.benchmarks.control.contests import NOMINAL, PARAMETERS
+from sideslip.benchmarks.control.contests import NOMINAL, PARAMETERS, contests
 from sideslip.benchmarks.control.episodes import NUMBERS, Driven
 from sideslip.benchmarks.distillation import VARIED
 from sideslip.benchmarks.learned import CONDITIONS, NEVER_MET, TRAINED, Found, chosen, scenario_in
@@ -102,3 +102,15 @@ def test_the_verdict_tells_what_training_met_from_what_it_never_did() -> None:
     assert "beats adaptive-lqr in 33 %" in said
     found.driven.pop("no camera from 2 to 7 s")
     assert "at worst 0.50 where it trained, - where never" in learned.answer([found])
+
+
+@pytest.mark.parametrize("kind", LEARNED)
+def test_three_contests_of_a_class_are_driven(kind: str) -> None:
+    """One of each tier where there are three; else evenly apart, none twice."""
+    there = [each for each in contests() if each.kind == kind]
+    tiers, found = dict.fromkeys(each.tier for each in there), chosen(kind)
+    assert len(set(found)) == len(found) == 3 and set(found) <= set(there)
+    assert len({each.tier for each in found}) == len(tiers)
+    if len(tiers) == 1:
+        first, middle, last = (there.index(each) for each in found)
+        assert middle - first == last - middle and middle == len(there) // 2

@@ -2,17 +2,20 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from sideslip import __version__
 from sideslip.benchmarks import readme
 from sideslip.benchmarks.control.cells import Cell
 from sideslip.benchmarks.control.contests import NOMINAL, STATE, TITLES, contests
-from sideslip.benchmarks.control.episodes import Chunk, drive
+from sideslip.benchmarks.control.episodes import NUMBERS, Chunk, Driven, drive
+from sideslip.benchmarks.control.run import Results
 from sideslip.benchmarks.control.scores import gains
 from sideslip.benchmarks.control.seeds import seeds_of_contests
-from sideslip.benchmarks.harness.results import Row
+from sideslip.benchmarks.harness.results import Row, write_json
 
 ROOT = Path(readme.__file__ or "").resolve().parents[1]
 
@@ -36,13 +39,18 @@ def test_a_line_has_every_tier_with_cost_interval_and_failures() -> None:
         readme.put("# a README", line)
 
 
+STATE_ROW = Row("control", "tier 1", "cost_vs_nominal", 0.3, "", STATE, n=41, salt="5a17")
+STATE_ROW = replace(STATE_ROW, env_version=__version__)
+"""Of 14 contests with three seeds each, one of which a rung did not survive."""
+
+
 def test_a_policy_that_came_later_drives_the_seeds_of_the_rows(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Its rows take the place of older ones of its name; everybody else's stay."""
     contest = next(c for c in contests() if c.kind == "coms-model" and c.tier == "1")
     monkeypatch.setattr(readme, "contests", lambda: (contest,))
-    state = Row("control", "tier 1", "cost_vs_nominal", 0.3, "", STATE, n=3, salt="5a17")
+    state = replace(STATE_ROW, n=3)
     old = replace(state, controller="raw-coms-steering")
     first, *new = readme.added([state, old], "raw-coms-steering", jobs=1)
     assert first is state and {row.metric for row in new} == set(readme.METRICS)
@@ -53,5 +61,52 @@ def test_a_policy_that_came_later_drives_the_seeds_of_the_rows(
     )
     cost = next(row.value for row in new if row.metric == "cost_vs_nominal")
     assert cost == pytest.approx(np.exp(-gains(nominal.costs, own).mean()))
+
+
+@pytest.mark.parametrize(
+    ("name", "reads", "tiers"),
+    [
+        ("raw-coms-steering", "", {"tier 1"}),
+        ("ppo-coms-yaw", "joint", {"tier 1"}),
+        ("raw-car-yaw", "", {"tier 2a", "tier 2b", "tier 2c"}),
+    ],
+)
+def test_it_is_in_every_tier_of_its_class_on_what_it_reads(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, name: str, reads: str, tiers: set[str]
+) -> None:
+    """By the command, with drives that are made up."""
+
+    def measured(asked: list[Cell], seeds: Any, **_: Any) -> Results:
+        rng = np.random.default_rng(0)
+        drives = [rng.uniform(0.5, 1.0, (len(seeds(cell.contest)), len(NUMBERS))) for cell in asked]
+        for numbers in drives:
+            numbers[:, NUMBERS.index("failure")] = 0.0
+        return Results({c: Driven(each, 0.0) for c, each in zip(asked, drives, strict=True)})
+
+    monkeypatch.setattr(readme, "measure", measured)
+    monkeypatch.chdir(tmp_path)
+    Path("docs").mkdir()
+    readme.README.write_text((ROOT / readme.README).read_text())
+    write_json(tmp_path / "rows.json", [STATE_ROW])
+    readme.main(tmp_path / "rows.json", [name])
+    new = [row for row in readme.tier_rows(readme.ROWS) if row.controller == name]
+    assert {row.scenario for row in new} == tiers and len(new) == 2 * len(tiers)
+    assert {row.estimator for row in new} == {reads}
+    if tiers == {"tier 1"}:
+        assert {row.n for row in new} == {7 * 3}
+
+
+def test_rows_that_nobody_can_be_added_to_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ValueError, match=r"the matrix's policies are .*, got 'lqr'"):
-        readme.added([state], "lqr")
+        readme.added([STATE_ROW], "lqr")
+    for rows, got in (([], "none"), ([replace(STATE_ROW, env_version="0.1.0")], r"0\.1\.0")):
+        with pytest.raises(
+            ValueError, match=f"of oracle-state in tier 1, of version .*, got {got}"
+        ):
+            readme.added(rows, "raw-coms-yaw")
+    wrong = Driven(np.zeros((0, len(NUMBERS))), 0.0, error="no action")
+    monkeypatch.setattr(
+        readme, "measure", lambda asked, *_, **__: Results(dict.fromkeys(asked, wrong))
+    )
+    with pytest.raises(ValueError, match=r"in .*: no action"):
+        readme.added([STATE_ROW], "raw-coms-yaw")

@@ -1,15 +1,19 @@
 """Filters in lanes have the bits of each alone, whatever happens to their neighbours."""
 
+import copy
 import dataclasses
+import itertools
+import pickle
 from typing import Any
 
 import numpy as np
 import pytest
 
 from sideslip.envs import COMS
+from sideslip.envs.backend.simd import LANES
 from sideslip.envs.record import FAST, PACKET_WIDTH
 from sideslip.estimators import FILTERS, make_estimator
-from sideslip.estimators.core.memory import FILTER
+from sideslip.estimators.core.memory import FILTER, OFTEN, SMALL, WIDTH
 from sideslip.estimators.vector import kernel
 from sideslip.estimators.vector.lanes import BLOCK, blocks
 from sideslip.estimators.vector.make import make_batch
@@ -20,7 +24,7 @@ pytestmark = [
     pytest.mark.compiled,
     pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning"),
 ]
-COUNT = 19  # a block, and three filters that are alone
+COUNT = 19  # whole blocks, and three filters that are alone
 LOOKED_AT = (0, 1, 2, 4, 6, 7, 15, 16, 18)
 
 
@@ -152,11 +156,34 @@ def test_which_filters_are_in_lanes() -> None:
     assert (few._lanes["model_speed"] == 0.0).all()
 
 
+def test_a_capture_leaves_its_tick_in_lanes() -> None:
+    """Of all filters on the same clock, and each captures once."""
+    log = drives(1, "camera", CAMERA, seconds=0.05)[0]
+    batch = make_batch("exact-kf", 5, sensors=log.slow, speed=7.0)
+    due = int(batch.filters[0, 0].next[0])
+    feed(batch, [log] * 5, 1, last=due + 1)  # what it measured is stored in the next tick
+    assert (batch.filters["next"][:, 0, 0] == due).all()
+    feed(batch, [log] * 5, 1, first=due + 1, last=due + 2)
+    lanes = batch._lanes[0]
+    assert (lanes["here"][:5] == 1.0).all() and (lanes["apart"] == 0.0).all()
+    assert (batch.filters["next"][:, 0, 0] > due).all()
+    assert (lanes["next"][:5] > lanes["now"][:5]).all()
+
+
 def test_blocks_and_records_lie_on_cache_lines() -> None:
+    """A copy's, too, and next to each other what is fetched together."""
     made, batch = blocks(33), make_batch("exact-kf", 3, sensors={"camera": CAMERA}, speed=7.0)
-    assert len(made) == 3 and made.dtype == BLOCK
-    for array in (made, batch.filters):
+    assert len(made) == -(-33 // LANES) and made.dtype == BLOCK
+    copies = [batch, copy.deepcopy(batch), pickle.loads(pickle.dumps(batch))]
+    for array in (made, *(each.filters for each in copies), *(each._lanes for each in copies)):
         assert array.dtype.itemsize % 64 == 0 and array.ctypes.data % 64 == 0
     for kind, names in ((BLOCK, ("x", "P", "GT", "row")), (FILTER, ("x", "P"))):
         assert kind.fields is not None
         assert all(kind.fields[name][1] % 64 == 0 for name in names)
+    assert FILTER.names is not None and FILTER.fields is not None
+    places = [FILTER.fields[name] for name in FILTER.names[FILTER.names.index("x") :]]
+    (x, P), behind = (each[1] // 8 for each in places[:2]), places[2:]
+    assert x == OFTEN and P == OFTEN + WIDTH
+    small = list(itertools.takewhile(lambda each: each[0].itemsize <= 64 * 8, behind))
+    assert small[-1][1] + small[-1][0].itemsize == 8 * (P + WIDTH * WIDTH + SMALL)
+    assert len(small) > 80
