@@ -107,28 +107,40 @@ def lessons_of(
     return found
 
 
-def start_and_task(agent: Path | None) -> "tuple[Path | Policy | None, Callable[..., Task]]":
+def start_and_task(
+    agent: Path | None, varied: int = 0
+) -> "tuple[Path | Policy | None, Callable[..., Task]]":
     """What `sideslip train -i` begins with, and what makes its task of the fields that were said.
 
     agent: a zip's path stays what it is; a distilled policy goes on in all contests of its class,
     but for those with a driver where cars are driven on tensors: rows are of one kind there.
+    varied: so many times in each of them as `VARIED` says, too, drawn by the training's seed and
+    not as `lessons_of` draws. Raises ValueError for them without contests of a class.
     """
     from ..agents.training.algorithms import algorithm_of
     from ..agents.training.starts import task_from
     from ..agents.training.task import Task
 
-    if agent is None or not is_policy(str(agent)):
+    policy = load_policy(agent) if agent is not None and is_policy(str(agent)) else None
+    kind = policy.card.algorithm_options.get("class") if policy else None
+    if varied and kind is None:
+        raise ValueError(f"--varied is for a policy of a class of contests, got {agent}")
+    if policy is None:
         return agent, Task
-    policy = load_policy(agent)
 
     def going_on(**fields: Any) -> Task:
-        kind = policy.card.algorithm_options.get("class")
-        alone = "scenario" in fields.get("env_options", {})
-        if kind is not None and "scenarios" not in fields and not alone:
-            names = [each.scenario for each in contests_of(kind)]
+        said = "scenarios" in fields or "scenario" in fields.get("env_options", {})
+        if said and varied:
+            raise ValueError("--varied is of a policy's own contests: without other scenarios")
+        if kind is not None and not said:
+            mine, rng = contests_of(kind), np.random.default_rng([fields.get("seed", 0), 1])
             if algorithm_of(fields.get("algo", "ppo")).on_tensors:
-                names = [each for each in names if scenario_from(each).steering != "driver"]
-            fields["scenarios"] = names
+                mine = [c for c in mine if scenario_from(c.scenario).steering != "driver"]
+            fields["scenarios"] = [
+                changed(contest, change) if change else contest.scenario
+                for contest in mine
+                for change in _changes(varied, rng)
+            ]
         return task_from(policy, **fields)
 
     return policy, going_on

@@ -3,6 +3,7 @@
 `sideslip train-estimator`: a network learns to correct a filter's sideslip angle."""
 
 import shlex
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -84,6 +85,9 @@ def train_command(
         Path | None,
         typer.Option("--trained-agent", "-i", help="Begin with an sb3 zip or a policy."),
     ] = None,
+    varied: Annotated[
+        int, typer.Option(min=0, help="With a policy: each contest so often with another car (0).")
+    ] = 0,
     trust: Trust = False,
     out: Annotated[
         Path | None, typer.Option(help="Folder; default: train-ENV-ALGO...-SEED here.")
@@ -122,7 +126,7 @@ def train_command(
         check_env(env)
     if log_folder is not None and resume:
         raise ValueError(f"--log-folder {log_folder} is for a new training: name the old --out")
-    agent, new = start_and_task(trained_agent)
+    agent, new = start_and_task(trained_agent, varied)
     if log_folder is not None and isinstance(agent, Policy) and agent.network.memory:
         raise ValueError(f"the zoo's `enjoy` drives nothing that remembers as {agent.name}: --out")
     task = task_in(out) if resume and out else new(**options)
@@ -135,8 +139,10 @@ def train_command(
     steps = aim.steps if steps is None else steps
     eval_freq = aim.eval_freq if eval_freq is None else eval_freq
     more = {"--eval-freq": eval_freq, "--conf-file": conf_file, "--trained-agent": trained_agent}
+    more |= {"--varied": varied}
     given = [str(word) for pair in more.items() if pair[1] for word in pair]
-    command = shlex.join([*words_of(task, steps), *given])
+    named = replace(task, scenarios=[]) if varied else task
+    command = shlex.join([*words_of(named, steps), *given])
     command = f"{aim.command}; sideslip train --resume --steps {steps}" if resume else command
     if log_folder is not None:
         task.describe_for_zoo(folder, steps, eval_freq)

@@ -137,3 +137,26 @@ def test_a_policy_goes_on_in_the_contests_that_its_algorithm_can_drive() -> None
     assert start_and_task(Path("distill-car-yaw"))[1]().scenarios == names
     assert start_and_task(None) == (None, Task)
     assert start_and_task(Path("here/best_model.zip")) == (Path("here/best_model.zip"), Task)
+
+
+def test_where_it_is_said_contests_are_varied_too() -> None:
+    """Each so often, by the training's seed, and not as a distillation's lessons are."""
+    _, task = start_and_task(Path("raw-coms-yaw"), 2)
+    names = [each.scenario for each in contests_of("coms-zero-slip")]
+    found = task().scenarios
+    varied = [each for each in found if not isinstance(each, str)]
+    assert [each for each in found if isinstance(each, str)] == names
+    assert [each["base"] for each in varied] == [name for name in names for _ in range(2)]
+    assert all(each["gps_outage"] and each["front_stiffness"] for each in varied)
+    assert task(seed=0).scenarios == found != task(seed=1).scenarios
+    rng = np.random.default_rng(0)
+    taught = [each["gps_outage"] for _ in names for each in distillation._changes(2, rng) if each]
+    assert not {each["gps_outage"] for each in varied} & set(taught)
+    for agent, fields, said in (
+        (None, {}, "for a policy of a class of contests, got None"),
+        (Path("here/best_model.zip"), {}, "got here/best_model.zip"),
+        (Path("raw-coms-yaw"), {"scenarios": ["coms-step"]}, "without other scenarios"),
+        (Path("raw-coms-yaw"), {"env_options": {"scenario": "coms-step"}}, "without other"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            start_and_task(agent, 2)[1](**fields)
