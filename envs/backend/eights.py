@@ -63,7 +63,7 @@ def prefetch(array: Any, *index: int) -> None:
 def whole_lines(fields: Sequence[Any]) -> np.dtype[Any]:
     """A structured dtype of these fields, as long as so many whole cache lines."""
     rest = -np.dtype(list(fields)).itemsize % LINE
-    return np.dtype([*fields, *([("rest", np.int8, rest)] if rest else [])])
+    return np.dtype([*fields, *([("to_line_end", np.int8, rest)] if rest else [])])
 
 
 def zeros_on_lines(shape: tuple[int, ...], dtype: np.dtype[Any]) -> Any:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from sideslip.envs import COMS
+from sideslip.envs.backend.eights import whole_lines
 from sideslip.envs.backend.simd import LANES
 from sideslip.envs.record import FAST, PACKET_WIDTH
 from sideslip.estimators import FILTERS, make_estimator
@@ -187,3 +188,11 @@ def test_blocks_and_records_lie_on_cache_lines() -> None:
     small = list(itertools.takewhile(lambda each: each[0].itemsize <= 64 * 8, behind))
     assert small[-1][1] + small[-1][0].itemsize == 8 * (P + WIDTH * WIDTH + SMALL)
     assert len(small) > 80
+
+
+def test_a_dtype_is_whole_lines_whatever_its_fields_are() -> None:
+    """They are many as a filter's are, or few; what is filled up has no name of theirs."""
+    for count in (1, 7, 8, 9):
+        made = whole_lines([("rest", np.float64, (count,)), ("x", np.int64)])
+        assert made.itemsize == 64 * -(-(count + 1) // 8) and made.names is not None
+        assert made.names[:2] == ("rest", "x")
