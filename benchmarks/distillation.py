@@ -32,9 +32,16 @@ JOINT, RIVAL = "joint, friction", "adaptive-nmpc"
 OUTPUTS = ("beta", "gamma", "phi", "phi_rate", "F_d", "N_d", "bias", "front_tyres", "rear_tyres",
            "inverse_friction")  # fmt: skip
 """What a student on `joint` reads of it, with standard deviations."""
-VARIED = {"tyres": (0.4, 2.0), "mass": (0.8, 1.3), "camera": (0.01, 0.12), "gps": (2.0, 6.0)}
-"""Of lessons that are varied: factors on each axle's tyres, in every episode, and, of a lesson, on
-the true car's mass; how late its camera is, and how long its GPS is out, in s."""
+VARIED = {
+    "tyres": (0.4, 2.0),
+    "wind": (-500.0, 500.0),
+    "mass": (0.8, 1.3),
+    "camera": (0.01, 0.12),
+    "out": (2.0, 6.0),
+}
+"""Of lessons that are varied: factors on each axle's tyres and the wind's force from the side, in
+N, in every episode, and, of a lesson, on the true car's mass; how late its camera is, and how long
+its GPS or its camera is out, in s."""
 _ALONE = (*RUNGS, *(name for names in ORACLES.values() for name in names))
 FILTERS = ("", "joint")
 
@@ -67,12 +74,15 @@ def _changes(varied: int, rng: np.random.Generator) -> Iterator[JsonMap]:
     """What lessons change of their contest's scenario: nothing, then `VARIED` so many times."""
     yield {}
     for _ in range(varied):
-        begins, lasts = rng.uniform(0.0, 4.0), rng.uniform(*VARIED["gps"])
+        begins, lasts = rng.uniform(0.0, 4.0), rng.uniform(*VARIED["out"])
         yield {
             "front_stiffness": VARIED["tyres"],
             "rear_stiffness": VARIED["tyres"],
             "camera_delays": [round(rng.uniform(*VARIED["camera"]), 3)],  # whole ticks
-            "gps_outage": (begins, begins + lasts),
+            f"{rng.choice(('gps', 'camera'))}_outage": (begins, begins + lasts),
+            "wind_force": VARIED["wind"],
+            "wind_start": (0.0, 4.0),
+            "wind_length": (1.0, 4.0),
             "mass": float(rng.uniform(*VARIED["mass"])),
         }
 
@@ -83,8 +93,8 @@ def lessons_of(
     """A lesson for each contest of a class, and more of each where what the contest keeps varies.
 
     teacher: a rung, a controller of the matrix, which reads its filter there, or a policy, which
-    reads the one of its card. cars: of each lesson. varied: lessons of each contest that are
-    varied, as `VARIED` says; no filter and no teacher learns of it. seed: of what is drawn for
+    reads the one of its card. cars: of each contest's lesson. varied: so many more, as `VARIED`
+    says, share as many cars; no filter and no teacher learns of it. seed: of what is drawn for
     them. Raises ValueError for another name, or where that observation lacks what the teacher
     needs.
     """
@@ -99,8 +109,9 @@ def lessons_of(
         for change in _changes(varied, rng):
             own = {"scenario": changed(contest, change)} if change else {}
             cell = Cell(contest, reads.get(teacher, REFERENCE_FILTER), teacher, own)
-            twins, agent = make_cars(cell, cars)
-            env: Any = gym.make_vec(contest.env_id, num_envs=cars, **contest.env_options | own)
+            count = -(-cars // varied) if change else cars
+            twins, agent = make_cars(cell, count)
+            env: Any = gym.make_vec(contest.env_id, num_envs=count, **contest.env_options | own)
             if estimator:
                 env = EstimateObservation(env, estimator, **_options(contest, teacher))
             found.append(Lesson(env, twins, agent))

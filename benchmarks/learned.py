@@ -56,9 +56,10 @@ CONDITIONS: Mapping[str, Mapping[str, Any]] = {
     "a quarter heavier": {"mass": 1.25},
     "no camera from 2 to 7 s": {"camera_outage": (2.0, 7.0)},
     "400 N from the side": {"wind_force": 400.0, "wind_start": 2.0, "wind_length": 3.0},
+    "road banked by 2 deg": {"bank": float(np.radians(2.0)), "curve_start": -1.0},
 }
 """What each one changes of a contest's scenario, as `contests.changed` takes it."""
-NEVER_MET = ("gyro 0.5 deg/s off", "no camera from 2 to 7 s", "400 N from the side")
+NEVER_MET = ("gyro 0.5 deg/s off", "road banked by 2 deg")
 """Those that no training varied (`distillation.VARIED` has the others)."""
 QUICK_CONDITIONS = (TRAINED, "tyres 1.4 to 1.8", "no GPS from 2 to 7 s", "400 N from the side")
 

@@ -20,17 +20,8 @@ from ..learned.card import Card
 from ..learned.files import Policy, save_policy
 from ..learned.policy import Learned
 from ..rollout import FLOOR
-from .student import (
-    LONGER,
-    Course,
-    Drives,
-    Scaling,
-    Single,
-    Student,
-    fitted,
-    normalised,
-    scaling_of,
-)
+from .student import LONGER, Course, Student, fitted
+from .traces.drives import Drives, Scaling, Single, normalised, scaling_of
 
 import torch  # isort: skip  # after ours, which say which extra is missing
 

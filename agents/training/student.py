@@ -8,17 +8,16 @@ import itertools
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from ...envs.backend.extras import extra
-from ...envs.task.observation import Entry
 from ...estimators.learned.memory import Cell, Memory
 from ...estimators.learned.network import Network
+from .traces.drives import CLIP, Drives, Scaling
 from .traces.layer import TraceLayer
-from .traces.mixing import whitening
 
 with extra("train", "distillation needs torch"):
     import torch
@@ -27,53 +26,12 @@ with extra("train", "distillation needs torch"):
 Array = npt.NDArray[np.float64]
 Single = npt.NDArray[np.float32]
 
-CLIP = 8.0  # standard deviations of an input
 WINDOW = 50  # steps through which the gradient goes back in time
 SAMPLES = 512  # steps of a batch without memory
 LONGER = 3  # times as many epochs in the last round
-UNREAD = ("gps_X", "gps_Y", "gps_satellites")
-"""Where the car is says nothing of how to hold it."""
-_LEAST = 1e-3  # variance, of what varies by 1, that a mixture of inputs has at least
-
 Batch = tuple[Any, Any, Any, Any, Any, bool]
 """Mixed observations (B, T, k), labels (B, T, m), what is told (B, T, q), weights (B, T),
 curvatures (B, m, m), and whether it begins the episodes."""
-
-
-class Drives(NamedTuple):
-    """Episodes of a lesson, oldest step first: observations (N, T, k), the teacher's actions
-    (N, T, m), what it reads that is not in them (N, T, q), and the weights of the actions' errors
-    (N, T), zero where an episode was over. curvature: (m, m), of a lesson. costs: (N,)."""
-
-    obs: Single
-    labels: Single
-    told: Single
-    weights: Single
-    curvature: Single
-    costs: Array
-
-    @property
-    def missed_by_zero(self) -> float:
-        """The loss of a student that does nothing, all episodes together."""
-        each = np.einsum("nti,ij,ntj->nt", self.labels, self.curvature, self.labels)
-        return float((each * self.weights).sum())
-
-
-class Scaling(NamedTuple):
-    """What a student makes of an observation: clip((x - mean) scale) mixing.
-
-    mean, scale: (k,), scale zero of what is not read. mixing: (k, k), symmetric; what varies
-    little while its parts vary much, as course less heading, then varies as much as they do.
-    """
-
-    mean: Array
-    scale: Array
-    mixing: Array
-
-    def mixed(self, obs: Single) -> Single:
-        """Inputs of a `Student`, of observations (..., k)."""
-        mixing = self.mixing.astype(np.float32)
-        return normalised(obs, self.mean, self.scale) @ mixing
 
 
 @dataclass(frozen=True)
@@ -185,25 +143,6 @@ class Student(nn.Module):
             clip=CLIP,
             cells=cells,
         )
-
-
-def scaling_of(drives: Sequence[Drives], layout: Sequence[Entry], needs: Sequence[str]) -> Scaling:
-    """How a student sees what these drives see.
-
-    needs: what the teacher reads. A student that has all of it reads nothing else, of which it
-    would only learn noise; one that has less reads whatever varies, but for `UNREAD`.
-    """
-    seen = np.concatenate([each.obs[each.weights > 0.0] for each in drives])
-    names = [entry.name for entry in layout]
-    there = np.isin(names, needs) if set(needs) <= set(names) else ~np.isin(names, UNREAD)
-    mean, spread = seen.mean(0, np.float64), seen.std(0, dtype=np.float64)
-    scale = np.where(there & (spread > 1e-9), 1.0 / np.maximum(spread, 1e-9), 0.0)
-    return Scaling(mean, scale, whitening(normalised(seen, mean, scale), _LEAST))
-
-
-def normalised(obs: Single, mean: Array, scale: Array) -> Single:
-    """Observations (..., k) as a student reads them."""
-    return np.clip((obs - mean.astype(np.float32)) * scale.astype(np.float32), -CLIP, CLIP)
 
 
 def _joined(parts: Sequence[Single]) -> Any:

@@ -126,6 +126,8 @@ def train_command(
         check_env(env)
     if log_folder is not None and resume:
         raise ValueError(f"--log-folder {log_folder} is for a new training: name the old --out")
+    if varied and resume:
+        raise ValueError(f"--varied {varied} is for a new training: an old one keeps its contests")
     agent, new = start_and_task(trained_agent, varied)
     if log_folder is not None and isinstance(agent, Policy) and agent.network.memory:
         raise ValueError(f"the zoo's `enjoy` drives nothing that remembers as {agent.name}: --out")

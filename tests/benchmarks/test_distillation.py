@@ -3,6 +3,7 @@
 from pathlib import Path
 from unittest.mock import Mock
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -11,7 +12,7 @@ from sideslip.agents.learned.files import Policy
 from sideslip.agents.training.task import Task
 from sideslip.benchmarks import distillation
 from sideslip.benchmarks.control.cells import ADAPTIVE
-from sideslip.benchmarks.control.contests import contests
+from sideslip.benchmarks.control.contests import changed, contests
 from sideslip.benchmarks.distillation import (
     FILTERS,
     VARIED,
@@ -77,15 +78,37 @@ def test_varied_lessons_differ_in_what_training_is_to_cover() -> None:
     assert VARIED["mass"][0] < min(masses) < 1.0 < max(masses) < VARIED["mass"][1]
 
 
-def test_the_gps_of_a_varied_lesson_is_out_for_seconds() -> None:
-    plain, varied = (lesson.cars for lesson in lessons_of("coms-zero-slip", "none", "", 1, 1)[:2])
-    ages = []
-    for cars in (plain, varied):
-        column = [entry.name for entry in cars.layout].index("gps_age")
-        cars.reset(seed=[3])
-        steps = [cars.step(np.zeros((1, 1), np.float32))[0][0, column] for _ in range(500)]
-        ages.append(max(steps[60:]))  # before it none has come
-    assert ages[0] < 0.6 and ages[1] > 1.0
+def test_gps_or_camera_of_a_varied_lesson_is_out_for_seconds() -> None:
+    """One of them, and each in some lesson."""
+    lessons = lessons_of("coms-zero-slip", "none", "", 4, 4)
+    assert [lesson.cars.num_envs for lesson in lessons[:5]] == [4, 1, 1, 1, 1]
+    names = [entry.name for entry in lessons[0].cars.layout]
+    columns = [names.index(f"{sensor}_age") for sensor in ("gps", "camera")]
+    out = set()
+    for lesson in lessons[:5]:
+        cars = lesson.cars
+        cars.reset(seed=list(range(cars.num_envs)))
+        idle = np.zeros((cars.num_envs, 1), np.float32)
+        steps = [cars.step(idle)[0][0, columns] for _ in range(500)]
+        late = np.max(steps[60:], axis=0) > 1.0  # before it none has come
+        out.add(tuple(late))
+    assert out == {(False, False), (True, False), (False, True)}
+
+
+def test_the_wind_of_a_varied_lesson_blows_from_both_sides() -> None:
+    contest = contests_of("coms-zero-slip")[0]
+    _, change = distillation._changes(1, np.random.default_rng(0))
+    calm = {key: value for key, value in change.items() if not key.startswith("wind_")}
+    aside = []
+    for each in (change, calm):
+        options = contest.env_options | {"scenario": changed(contest, each)}
+        cars = gym.make_vec(contest.env_id, num_envs=8, **options).unwrapped
+        cars.reset(seed=list(range(8)))
+        column = [entry.name for entry in cars.layout].index("gps_Y")
+        idle = np.zeros((8, 1), np.float32)
+        aside.append([cars.step(idle)[0][:, column] for _ in range(500)][-1])
+    off = aside[0] - aside[1]
+    assert off.min() < -0.05 and off.max() > 0.05 and len(set(off)) > 4
 
 
 def test_who_cannot_drive_a_contest_is_no_number_of_a_card(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -147,11 +170,16 @@ def test_where_it_is_said_contests_are_varied_too() -> None:
     varied = [each for each in found if not isinstance(each, str)]
     assert [each for each in found if isinstance(each, str)] == names
     assert [each["base"] for each in varied] == [name for name in names for _ in range(2)]
-    assert all(each["gps_outage"] and each["front_stiffness"] for each in varied)
+    assert all(each["wind_force"] and each["front_stiffness"] for each in varied)
+    assert {"gps_outage", "camera_outage"} < {key for each in varied for key in each}
     assert task(seed=0).scenarios == found != task(seed=1).scenarios
     rng = np.random.default_rng(0)
-    taught = [each["gps_outage"] for _ in names for each in distillation._changes(2, rng) if each]
-    assert not {each["gps_outage"] for each in varied} & set(taught)
+    taught = [each for _ in names for each in distillation._changes(2, rng) if each]
+    outages = [
+        {each[key] for each in those for key in each if key.endswith("_outage")}
+        for those in (varied, taught)
+    ]
+    assert outages[0] and not outages[0] & outages[1]
     for agent, fields, said in (
         (None, {}, "for a policy of a class of contests, got None"),
         (Path("here/best_model.zip"), {}, "got here/best_model.zip"),

@@ -11,7 +11,7 @@ from sideslip.benchmarks.control.build import estimate_options
 from sideslip.benchmarks.control.cells import LEARNED, Cell
 from sideslip.benchmarks.control.contests import NOMINAL, PARAMETERS, contests
 from sideslip.benchmarks.control.episodes import NUMBERS, Driven
-from sideslip.benchmarks.distillation import VARIED
+from sideslip.benchmarks.distillation import VARIED, _changes
 from sideslip.benchmarks.learned import CONDITIONS, NEVER_MET, TRAINED, Found, chosen, scenario_in
 from sideslip.envs.scenarios.manoeuvres import scenario_from
 
@@ -49,9 +49,12 @@ def test_what_training_met_is_what_varied_lessons_vary() -> None:
         assert low <= tyres[0] and tyres[1] <= high
         assert VARIED["mass"][0] <= change.get("mass", 1.0) <= VARIED["mass"][1]
         assert max(change.get("camera_delays", [0.0])) <= VARIED["camera"][1]
-        begins, ends = change.get("gps_outage", (0.0, VARIED["gps"][0]))
-        assert VARIED["gps"][0] <= ends - begins <= VARIED["gps"][1]
-    varied = {"front_stiffness", "rear_stiffness", "mass", "camera_delays", "gps_outage"}
+        assert change.get("wind_force", 0.0) <= VARIED["wind"][1]
+        for sensor in ("gps", "camera"):
+            begins, ends = change.get(f"{sensor}_outage", (0.0, VARIED["out"][0]))
+            assert VARIED["out"][0] <= ends - begins <= VARIED["out"][1]
+    rng = np.random.default_rng(0)
+    varied = {key for change in _changes(20, rng) for key in change}
     for name in NEVER_MET:
         assert not varied & set(CONDITIONS[name])
     assert {key for each in kept.values() for key in each} == varied | {"camera_jitter"}

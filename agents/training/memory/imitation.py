@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from ..distill import DISTILLING, Lesson, Round, drive
-from ..student import LONGER, Array, Course, Drives, Scaling, Single, fitted, normalised, scaling_of
+from ..student import LONGER, Course, fitted
+from ..traces.drives import Array, Drives, Scaling, Single, normalised, scaling_of
 from .networks import Memory, make_memory
 
 import torch  # isort: skip  # after ours, which say which extra is missing
@@ -80,7 +81,7 @@ def imitated(
         drives.append(seen._replace(curvature=np.full((1, 1), weight, np.float32)))
         steps += int((seen.weights > 0.0).sum())
         if scaling is None:
-            mean, scale, _ = scaling_of(drives, cars.layout, lesson.teacher.needs)
+            mean, scale, _ = scaling_of(drives, cars.layout, lesson.teacher.needs, False)
             scaling = Scaling(mean, scale, np.eye(len(mean)))  # memories mix by themselves
             model.whiten(drives, mean, scale)
         last = i == course.rounds - 1

@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ....envs.arguments import check_choice
-from ..student import Array, Drives, normalised
+from ..traces.drives import Array, Drives, normalised
 from ..traces.mixing import whitening
 
 import torch  # isort: skip  # after ours, which say which extra is missing

@@ -15,7 +15,8 @@ from sideslip.estimators.learned.network import Network
 pytest.importorskip("torch")
 import torch
 
-from sideslip.agents.training.student import Course, Drives, Scaling, Student, _Episodes
+from sideslip.agents.training.student import Course, Student, _Episodes
+from sideslip.agents.training.traces.drives import Drives, Scaling
 from sideslip.agents.training.traces.layer import TraceLayer
 
 CARD = Card.of("sideslip/YawVision-v0")

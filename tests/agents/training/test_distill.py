@@ -17,15 +17,15 @@ from sideslip.agents.rollout import FLOOR
 from sideslip.agents.rungs import make_rung
 from sideslip.agents.training import distill as training
 from sideslip.agents.training.distill import Lesson, distill, drive
-from sideslip.agents.training.student import (
+from sideslip.agents.training.student import Course, Student, fitted
+from sideslip.agents.training.traces.drives import (
     UNREAD,
-    Course,
+    Drives,
     Scaling,
-    Student,
-    fitted,
     normalised,
     scaling_of,
 )
+from sideslip.envs.task.observation import Entry
 
 ID, CARS = "sideslip/YawFusion-v0", 16
 SHORT = {"base": "coms-step", "duration": 1.2, "onset": 0.1}
@@ -167,6 +167,21 @@ def test_a_student_that_sees_what_its_teacher_reads_reads_nothing_else() -> None
         scaling = scaling_of(seen, cars.layout, needs)
         reads = {name for name, each in zip(names, scaling.scale, strict=True) if each > 0.0}
         assert reads == there if there else "gyro" in reads and not reads & set(UNREAD)
+
+
+def test_an_age_is_scaled_as_it_varies_while_packets_come() -> None:
+    """Ten seconds that stand for none yet, and an outage, would else hide a step of 10 ms."""
+    ages = np.tile(np.arange(12) * 0.01 + 0.05, 25)[None, :, None].astype(np.float32)
+    ages[:, :20], ages[:, 200:] = 10.0, np.arange(100)[:, None] * 0.01 + 0.17
+    layout = [Entry(name, "-", -10.0, 10.0) for name in ("gps_age", "gyro")]
+    obs = np.concatenate([ages, np.sin(ages)], axis=-1)
+    drives = Drives(obs, obs, obs, np.ones((1, 300), np.float32), np.eye(2), np.ones(1))
+    z, plain = (
+        normalised(obs, scaling.mean, scaling.scale)[0, :, 0]
+        for scaling in (scaling_of([drives], layout, ("beta",), each) for each in (True, False))
+    )
+    assert z[:20].min() == 8.0 == z[-1] and np.abs(z[20:200]).max() < 4.0
+    assert np.diff(z[24:36]).min() > 0.1 > 20.0 * np.diff(plain[24:36]).max()
 
 
 def test_a_training_that_diverges_stops_with_the_step_and_leaves_the_last_good_file(

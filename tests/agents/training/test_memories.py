@@ -14,7 +14,8 @@ from sideslip.agents.training.distill import Lesson, drive
 from sideslip.agents.training.memory.imitation import Remembering, imitated
 from sideslip.agents.training.memory.inputs import LATEST, RATE, Prepared
 from sideslip.agents.training.memory.networks import MEMORIES, Kalman, make_memory
-from sideslip.agents.training.student import Course, normalised, scaling_of
+from sideslip.agents.training.student import Course
+from sideslip.agents.training.traces.drives import normalised, scaling_of
 
 ID, CARS, INPUTS, FRESH, STEPS = "sideslip/LinearYawVision-v0", 16, 5, 4, 90
 CAMERA = {"period": 0.04, "delays": [0.03], "loss": 0.3}
@@ -101,7 +102,7 @@ def lesson(**camera: Any) -> Lesson:
 def test_inputs_are_whitened() -> None:
     mine = lesson()
     seen = [drive(mine, None, range(CARS), 0.3)]
-    mean, scale, _ = scaling_of(seen, mine.cars.layout, mine.teacher.needs)
+    mean, scale, _ = scaling_of(seen, mine.cars.layout, mine.teacher.needs, False)
     inputs = len(mine.cars.layout)
     model = make_memory("mlp", inputs, inputs - 1, 0)
     model.whiten(seen, mean, scale)

@@ -16,7 +16,8 @@ from sideslip.agents.rollout import costs_of
 from sideslip.agents.training.export import network_from_sb3
 from sideslip.agents.training.keeper import _SCALING, BEGUN_WITH, Means, evaluation_seeds
 from sideslip.agents.training.starts import Begun, Driver, task_from
-from sideslip.agents.training.student import Course, Scaling, Student
+from sideslip.agents.training.student import Course, Student
+from sideslip.agents.training.traces.drives import Scaling
 from sideslip.agents.training.traces.remembered import Remembered, mixing_of
 from sideslip.agents.training.train import train
 

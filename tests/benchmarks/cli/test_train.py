@@ -83,6 +83,7 @@ def test_it_goes_on_with_what_the_folder_holds(
         (("--estimator", "dakf"), "dakf needs the slow sensor gps"),
         (("--option", "scenario=moon"), "unknown scenario 'moon'"),
         (("--resume",), "holds no training to go on with"),
+        (("--resume", "--varied", 2), "varied 2 is for a new training"),
         (("--steps", "0"), "steps is at least 1, got 0"),
         (("--num-envs", "0"), "greater than or equal to 1"),
         (("--seed", "-1"), "seed is at least 0, got -1"),
