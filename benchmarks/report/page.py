@@ -5,11 +5,14 @@ between them is the suite's, the rest its author's.
 """
 
 import re
+import textwrap
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from ..harness.results import Suite, Table, write_text
 
+_FILL = partial(textwrap.fill, width=120, break_long_words=False, break_on_hyphens=False)
 _MARKED = r"(?<=^<!-- tables of {} -->\n).*?(?=^<!-- end -->$)"
 
 
@@ -20,7 +23,7 @@ def table_markdown(table: Table) -> str:
     )
     lines = [f"| {' | '.join(row)} |" for row in (head, *rows)]
     lines.insert(1, "|---" * len(head) + "|")
-    note = f"\n{table.note}\n" if table.note else ""
+    note = f"\n{_FILL(table.note)}\n" if table.note else ""
     return "\n".join([f"## {table.title}", "", *lines, ""]) + note
 
 
