@@ -29,6 +29,7 @@ from .task import Task
 from stable_baselines3.common.base_class import BaseAlgorithm  # isort: skip  # after ours, which
 from stable_baselines3.common.callbacks import BaseCallback  # isort: skip  # name a missing extra
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm  # isort: skip
+from stable_baselines3.common.utils import get_device  # isort: skip
 from stable_baselines3.common.vec_env import VecEnv  # isort: skip
 
 CHECKPOINT, CURVE = "checkpoint.safetensors", "curve.jsonl"
@@ -83,7 +84,7 @@ class Means:
     folder for TensorBoard. report: called after every rollout. command: for the policy's card.
     track: a project of Weights & Biases, "" for none.
 
-    Raises ValueError for evaluations that are less than a step apart.
+    Raises ValueError for evaluations that are less than a step apart, or no device of torch's.
     """
 
     eval_freq: int = 250_000
@@ -96,6 +97,11 @@ class Means:
     def __post_init__(self) -> None:
         if self.eval_freq < 1:
             raise ValueError(f"eval_freq is at least 1, got {self.eval_freq}")
+        try:
+            get_device(self.device)
+        except RuntimeError:
+            named = "a device is cpu, cuda or another of torch's, or auto"
+            raise ValueError(f"{named}, got {self.device!r}") from None
 
 
 @dataclass(frozen=True)

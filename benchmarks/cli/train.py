@@ -3,6 +3,7 @@
 `sideslip train-estimator`: a network learns to correct a filter's sideslip angle."""
 
 import shlex
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -152,7 +153,12 @@ def train_command(
     with TrainingBar(console, steps, disable=not progress) as bar:
         project = wandb_project_name if track else ""
         means = Means(eval_freq, device, tensorboard_log, bar.show, command, project)
-        trained = train(task, steps, folder, resume, means, agent, trust)
+        try:
+            trained = train(task, steps, folder, resume, means, agent, trust)
+        except Exception:
+            if log_folder is not None and not (folder / POLICY).exists():
+                shutil.rmtree(folder)  # it has nothing but the zoo's description
+            raise
     console.print(_table(trained))
     kind = load_policy(folder / POLICY).card.algorithm_options.get("class")
     if kind is not None:

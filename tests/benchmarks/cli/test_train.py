@@ -84,6 +84,7 @@ def test_it_goes_on_with_what_the_folder_holds(
         (("--option", "scenario=moon"), "unknown scenario 'moon'"),
         (("--resume",), "holds no training to go on with"),
         (("--resume", "--varied", 2), "varied 2 is for a new training"),
+        (("--device", "moon"), "a device is cpu, cuda or another of torch's, or auto, got 'moon'"),
         (("--steps", "0"), "steps is at least 1, got 0"),
         (("--num-envs", "0"), "greater than or equal to 1"),
         (("--seed", "-1"), "seed is at least 0, got -1"),
@@ -155,6 +156,8 @@ def test_a_log_folder_is_the_zoo_s_and_numbered(
     assert status == 2 and "logs is for a new training: name the old --out" in err
     status, _, err = run("-i", "raw-coms-yaw", "-f", "logs")
     assert status == 2 and "drives nothing that remembers as raw-coms-yaw: --out" in err
+    status, _, err = run(*TINY, "--steps", 0, "-f", "logs")
+    assert status == 2 and "steps is at least 1" in err
     assert not list(tmp_path.glob("logs/*/*_3"))
 
 
