@@ -204,11 +204,14 @@ def distill_command(
     estimator: Annotated[
         str, typer.Option(help="What the policy reads: joint, or nothing but the sensors.")
     ] = "joint",
-    cars: Annotated[int, typer.Option(help="Of each lesson and round.", min=1)] = 6,
+    cars: Annotated[
+        int,
+        typer.Option(help="Of each contest and round; its varied lessons share as many.", min=1),
+    ] = 6,
     varied: Annotated[
         int,
         typer.Option(
-            min=0, help="Lessons of each contest with another car, camera delay and GPS outage."
+            min=0, help="Lessons of each contest with another car, late camera, wind and outages."
         ),
     ] = 0,
     rounds: Annotated[int, typer.Option(help="Of driving and learning.")] = 7,
