@@ -2,7 +2,8 @@
 
 Each shipped policy of `LEARNED` drives contests of its class on salted seeds, beside controllers on
 the same late sensors and the rungs of the ladder. Nobody learns of a condition: filters have the
-levels of the contest itself. Trainings varied some of the conditions; the others they never met.
+levels of the contest itself. Trainings varied some of the conditions, a few of them two more; the
+others nobody ever met.
 """
 
 from collections.abc import Mapping, Sequence

@@ -1,4 +1,4 @@
-"""The student of a distillation: its network, what it learns from, and one round of learning.
+"""The student of a distillation: its network, and one round of learning.
 
 The loss is what the error of an action adds to the cost of the rest of the drive, by the Riccati
 matrix of the teacher's design, over the cost of the episode: the score's logarithm, linearised.
@@ -11,20 +11,16 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from ...envs.backend.extras import extra
 from ...estimators.learned.memory import Cell, Memory
 from ...estimators.learned.network import Network
-from .traces.drives import CLIP, Drives, Scaling
+from .traces.drives import CLIP, Drives, Scaling, Single
 from .traces.layer import TraceLayer
 
 with extra("train", "distillation needs torch"):
     import torch
     from torch import nn
-
-Array = npt.NDArray[np.float64]
-Single = npt.NDArray[np.float32]
 
 WINDOW = 50  # steps through which the gradient goes back in time
 SAMPLES = 512  # steps of a batch without memory

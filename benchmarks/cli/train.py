@@ -87,7 +87,8 @@ def train_command(
         typer.Option("--trained-agent", "-i", help="Begin with an sb3 zip or a policy."),
     ] = None,
     varied: Annotated[
-        int, typer.Option(min=0, help="With a policy: each contest so often with another car (0).")
+        int,
+        typer.Option(min=0, help="With a policy: each contest so often, varied as in `distill`."),
     ] = 0,
     trust: Trust = False,
     out: Annotated[
@@ -147,12 +148,12 @@ def train_command(
     named = replace(task, scenarios=[]) if varied else task
     command = shlex.join([*words_of(named, steps), *given])
     command = f"{aim.command}; sideslip train --resume --steps {steps}" if resume else command
-    if log_folder is not None:
-        task.describe_for_zoo(folder, steps, eval_freq)
     console = Console()
     with TrainingBar(console, steps, disable=not progress) as bar:
         project = wandb_project_name if track else ""
         means = Means(eval_freq, device, tensorboard_log, bar.show, command, project)
+        if log_folder is not None:
+            task.describe_for_zoo(folder, steps, eval_freq)
         try:
             trained = train(task, steps, folder, resume, means, agent, trust)
         except Exception:

@@ -17,7 +17,7 @@ _MARKED = r"(?<=^<!-- tables of {} -->\n).*?(?=^<!-- end -->$)"
 
 
 def table_markdown(table: Table) -> str:
-    """A heading, the table, and its note."""
+    """A heading, the table, and its note in lines of 120."""
     head, *rows = (
         [text.replace("|", r"\|") for text in row] for row in (table.header, *table.cells)
     )

@@ -6,13 +6,22 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from sideslip.agents.learned.files import load_policy
 from sideslip.benchmarks import learned
 from sideslip.benchmarks.control.build import estimate_options
 from sideslip.benchmarks.control.cells import LEARNED, Cell
 from sideslip.benchmarks.control.contests import NOMINAL, PARAMETERS, contests
 from sideslip.benchmarks.control.episodes import NUMBERS, Driven
 from sideslip.benchmarks.distillation import VARIED, _changes
-from sideslip.benchmarks.learned import CONDITIONS, NEVER_MET, TRAINED, Found, chosen, scenario_in
+from sideslip.benchmarks.learned import (
+    CONDITIONS,
+    LATELY_MET,
+    NEVER_MET,
+    TRAINED,
+    Found,
+    chosen,
+    scenario_in,
+)
 from sideslip.envs.scenarios.manoeuvres import scenario_from
 
 
@@ -53,6 +62,15 @@ def test_what_training_met_is_what_varied_lessons_vary() -> None:
         for sensor in ("gps", "camera"):
             begins, ends = change.get(f"{sensor}_outage", (0.0, VARIED["out"][0]))
             assert VARIED["out"][0] <= ends - begins <= VARIED["out"][1]
+    assert {*NEVER_MET, *LATELY_MET} <= set(CONDITIONS) and not set(NEVER_MET) & set(LATELY_MET)
+    lately = {"camera_outage", "wind_force", "wind_start", "wind_length"}
+    assert {key for name in LATELY_MET for key in CONDITIONS[name]} == lately
+    for policies in LEARNED.values():
+        for estimator, name in policies:
+            met = str(load_policy(name).card.algorithm_options.get("scenarios"))
+            new = name in ("raw-coms-steering", "raw-coms-yaw")
+            assert new == ("camera_outage" in met) == ("wind_force" in met)
+            assert not (new and (estimator, name) == policies[0])  # of whom the verdict speaks
     rng = np.random.default_rng(0)
     varied = {key for change in _changes(20, rng) for key in change}
     for name in NEVER_MET:

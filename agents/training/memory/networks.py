@@ -13,11 +13,13 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ....envs.arguments import check_choice
+from ....envs.backend.extras import extra
 from ..traces.drives import Array, Drives, normalised
 from ..traces.mixing import whitening
 
-import torch  # isort: skip  # after ours, which say which extra is missing
-from torch import nn  # isort: skip
+with extra("train", "memories need torch"):
+    import torch
+    from torch import nn
 
 HIDDEN = (64, 64)  # of the layers behind a memory
 _LEAST = 1e-2  # deviation of a mix of inputs below which it is not scaled up further

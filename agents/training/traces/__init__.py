@@ -1,1 +1,2 @@
-"""Running means that a network remembers with: by torch, and as observations of an env."""
+"""Drives that students learn from, and running means that they remember with: by torch, and as
+observations of an env."""

@@ -8,12 +8,12 @@ import numpy as np
 import numpy.typing as npt
 
 from ....envs.task.observation import Entry
-from ....estimators.learned.memory import Array
 from .mixing import whitening
 
+Array = npt.NDArray[np.float64]
 Single = npt.NDArray[np.float32]
 
-CLIP = 8.0  # standard deviations of an input
+CLIP = 8.0  # of an input, scaled
 UNREAD = ("gps_X", "gps_Y", "gps_satellites")
 """Where the car is says nothing of how to hold it."""
 _LEAST = 1e-3  # variance, of what varies by 1, that a mixture of inputs has at least

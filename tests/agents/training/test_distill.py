@@ -175,7 +175,9 @@ def test_an_age_is_scaled_as_it_varies_while_packets_come() -> None:
     ages[:, :20], ages[:, 200:] = 10.0, np.arange(100)[:, None] * 0.01 + 0.17
     layout = [Entry(name, "-", -10.0, 10.0) for name in ("gps_age", "gyro")]
     obs = np.concatenate([ages, np.sin(ages)], axis=-1)
-    drives = Drives(obs, obs, obs, np.ones((1, 300), np.float32), np.eye(2), np.ones(1))
+    drives = Drives(
+        obs, obs, obs, np.ones((1, 300), np.float32), np.eye(2, dtype=np.float32), np.ones(1)
+    )
     z, plain = (
         normalised(obs, scaling.mean, scaling.scale)[0, :, 0]
         for scaling in (scaling_of([drives], layout, ("beta",), each) for each in (True, False))

@@ -156,8 +156,9 @@ def test_a_log_folder_is_the_zoo_s_and_numbered(
     assert status == 2 and "logs is for a new training: name the old --out" in err
     status, _, err = run("-i", "raw-coms-yaw", "-f", "logs")
     assert status == 2 and "drives nothing that remembers as raw-coms-yaw: --out" in err
-    status, _, err = run(*TINY, "--steps", 0, "-f", "logs")
-    assert status == 2 and "steps is at least 1" in err
+    for wrong in (("--steps", 0), ("--device", "moon"), ("--eval-freq", 0)):
+        status, _, err = run(*TINY, *wrong, "-f", "logs")
+        assert status == 2 and "error: " in err
     assert not list(tmp_path.glob("logs/*/*_3"))
 
 

@@ -34,6 +34,13 @@ def test_a_table_is_markdown() -> None:
     assert table_markdown(suite().tables[0]) == text
 
 
+def test_a_long_note_is_wrapped_between_words() -> None:
+    words = ["a-long-name-" * 3, "no", "camera", "from", "2", "to", "7", "s;"] * 6
+    table = Table("First", ("who",), [["c"]], " ".join(words))
+    lines = table_markdown(table).splitlines()[5:]
+    assert len(lines) > 2 and max(map(len, lines)) <= 120 and " ".join(lines).split() == words
+
+
 def test_only_what_stands_between_the_marks_changes(tmp_path: Path) -> None:
     page = tmp_path / "page.md"
     page.write_text(PAGE)
