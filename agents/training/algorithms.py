@@ -34,7 +34,7 @@ from .normalise import Scaling, Standardised  # first: it says which extra is mi
 
 from stable_baselines3.common.base_class import BaseAlgorithm  # isort: skip
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm  # isort: skip
-from stable_baselines3.common.utils import LinearSchedule  # isort: skip
+from stable_baselines3.common.utils import LinearSchedule, get_device  # isort: skip
 from stable_baselines3.common.vec_env import VecEnv  # isort: skip
 
 Settings = dict[str, Any]
@@ -189,3 +189,12 @@ def _schedule(name: str, value: Any) -> Any:
     if word not in ("", "lin") or not 0.0 < start < math.inf:
         raise ValueError(f"{name} is a positive number or lin_NUMBER, got {value!r}")
     return LinearSchedule(start, 0.0, 1.0) if word else start
+
+
+def check_device(name: str) -> None:
+    """ValueError for a name that is no device of torch's."""
+    try:
+        get_device(name)
+    except RuntimeError:
+        known = "a device is cpu, cuda or another of torch's, or auto"
+        raise ValueError(f"{known}, got {name!r}") from None

@@ -18,7 +18,7 @@ from ..learned.files import Policy, save_policy
 from ..rollout import cost_ratios, costs_of, drives_of
 from ..vec_env import zoo
 from ..vec_env.env import make_vec_env
-from .algorithms import algorithm_of, make_model, options_of, spread_of
+from .algorithms import algorithm_of, check_device, make_model, options_of, spread_of
 from .checkpoint import load_parameters, save_checkpoint
 from .export import network_from_sb3
 from .normalise import measured
@@ -29,12 +29,10 @@ from .task import Task
 from stable_baselines3.common.base_class import BaseAlgorithm  # isort: skip  # after ours, which
 from stable_baselines3.common.callbacks import BaseCallback  # isort: skip  # name a missing extra
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm  # isort: skip
-from stable_baselines3.common.utils import get_device  # isort: skip
 from stable_baselines3.common.vec_env import VecEnv  # isort: skip
 
 CHECKPOINT, CURVE = "checkpoint.safetensors", "curve.jsonl"
 POLICY, BEST, BEGUN_WITH = "policy.safetensors", "best_model.zip", "begun_with.safetensors"
-
 _MEASURED = 64  # environments whose observations make the scaling
 
 # No other seeds are as large: those of tests and of the calibration are below 2^63.
@@ -97,11 +95,7 @@ class Means:
     def __post_init__(self) -> None:
         if self.eval_freq < 1:
             raise ValueError(f"eval_freq is at least 1, got {self.eval_freq}")
-        try:
-            get_device(self.device)
-        except RuntimeError:
-            named = "a device is cpu, cuda or another of torch's, or auto"
-            raise ValueError(f"{named}, got {self.device!r}") from None
+        check_device(self.device)
 
 
 @dataclass(frozen=True)

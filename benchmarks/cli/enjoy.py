@@ -85,3 +85,16 @@ def _show_card(console: Console, policy: "Policy") -> None:
     for name, value in fields.items():
         table.add_row(name, escape(value if isinstance(value, str) else dumps(value)))
     console.print(table)
+
+
+def judged(file: Path, kind: str, episodes: int) -> Table:
+    """What a policy costs in each contest of its class; its card has it too."""
+    from ..distillation import judge
+
+    table = Table("contest", "in % of nominal", "adaptive-nmpc", "better", "fails")
+    for contest, found in judge(file, kind, episodes)["cost in % of nominal"].items():
+        own, rival = found["policy"], found["adaptive-nmpc"]
+        better, fails = found["better than adaptive-nmpc"][0], found["fails"]
+        numbers = f"{own[0]:.0f} [{own[1]:.0f}, {own[2]:.0f}]", f"{rival[0]:.0f}"
+        table.add_row(contest, *numbers, f"{100.0 * better:.0f} %", f"{100.0 * fails:.0f} %")
+    return table

@@ -15,6 +15,7 @@ from rich.table import Table
 from ... import __version__
 from ...agents.learned.files import Policy, load_policy
 from ...envs.sensors.slow import SENSOR_SETS
+from .enjoy import judged
 from .export import Trust
 from .names import check_env, complete
 from .output import (
@@ -163,7 +164,7 @@ def train_command(
     console.print(_table(trained))
     kind = load_policy(folder / POLICY).card.algorithm_options.get("class")
     if kind is not None:
-        console.print(_judged(folder / POLICY, kind, CONTESTS))
+        console.print(judged(folder / POLICY, kind, CONTESTS))
     else:
         costs = evaluation(evaluate(folder / POLICY, EPISODES))["cost"]
         shown = ", ".join(f"{name} {each['mean']:.4g}" for name, each in costs.items())
@@ -180,19 +181,6 @@ def _table(trained: "Trained") -> Table:
         numbers = f"{each.steps:,}", f"{each.cpu_seconds:.1f}", f"{each.cost:.4g}"
         start = "" if each.of_start is None else f"{each.of_start:.3f}"
         table.add_row(*numbers, f"{each.of_none:.3f}{mark}", start)
-    return table
-
-
-def _judged(file: Path, kind: str, episodes: int) -> Table:
-    """What a policy costs in each contest of its class; its card has it too."""
-    from ..distillation import judge
-
-    table = Table("contest", "in % of nominal", "adaptive-nmpc", "better", "fails")
-    for contest, found in judge(file, kind, episodes)["cost in % of nominal"].items():
-        own, rival = found["policy"], found["adaptive-nmpc"]
-        better, fails = found["better than adaptive-nmpc"][0], found["fails"]
-        numbers = f"{own[0]:.0f} [{own[1]:.0f}, {own[2]:.0f}]", f"{rival[0]:.0f}"
-        table.add_row(contest, *numbers, f"{100.0 * better:.0f} %", f"{100.0 * fails:.0f} %")
     return table
 
 
@@ -256,7 +244,7 @@ def distill_command(
         console.print(text, highlight=False)
 
     distill(card, lessons, course, target, show)
-    console.print(_judged(target, kind, episodes))
+    console.print(judged(target, kind, episodes))
     wrote(console, target)
 
 
