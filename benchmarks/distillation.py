@@ -94,9 +94,9 @@ def lessons_of(
 
     teacher: a rung, a controller of the matrix, which reads its filter there, or a policy, which
     reads the one of its card. cars: of each contest's lesson. varied: so many more, as `VARIED`
-    says, share as many cars; no filter and no teacher learns of it. seed: of what is drawn for
-    them. Raises ValueError for another name, or where that observation lacks what the teacher
-    needs.
+    says, share as many cars, rounded up; no filter and no teacher learns of it. seed: of what is
+    drawn for them. Raises ValueError for another name, or where that observation lacks what the
+    teacher needs.
     """
     from ..agents.training.distill import Lesson
 

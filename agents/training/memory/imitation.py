@@ -81,7 +81,7 @@ def imitated(
         drives.append(seen._replace(curvature=np.full((1, 1), weight, np.float32)))
         steps += int((seen.weights > 0.0).sum())
         if scaling is None:
-            mean, scale, _ = scaling_of(drives, cars.layout, lesson.teacher.needs, False)
+            mean, scale, _ = scaling_of(drives, cars.layout, lesson.teacher.needs, usual_ages=False)
             scaling = Scaling(mean, scale, np.eye(len(mean)))  # memories mix by themselves
             model.whiten(drives, mean, scale)
         last = i == course.rounds - 1

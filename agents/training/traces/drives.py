@@ -73,10 +73,11 @@ def scaling_of(
     names = [entry.name for entry in layout]
     there = np.isin(names, needs) if set(needs) <= set(names) else ~np.isin(names, UNREAD)
     mean, spread = x.mean(0, np.float64), x.std(0, dtype=np.float64)
-    for i in [i for i, name in enumerate(names) if usual_ages and name.endswith("_age")]:
-        soon, usual = np.percentile(x[:, i], (_SOON, _USUAL))
-        if usual > soon:
-            mean[i], spread[i] = usual, usual - soon
+    for i, name in enumerate(names):
+        if usual_ages and name.endswith("_age"):
+            soon, usual = np.percentile(x[:, i], (_SOON, _USUAL))
+            if usual > soon:
+                mean[i], spread[i] = usual, usual - soon
     scale = np.where(there & (spread > 1e-9), 1.0 / np.maximum(spread, 1e-9), 0.0)
     return Scaling(mean, scale, whitening(normalised(x, mean, scale), _LEAST))
 

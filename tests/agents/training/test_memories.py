@@ -102,7 +102,7 @@ def lesson(**camera: Any) -> Lesson:
 def test_inputs_are_whitened() -> None:
     mine = lesson()
     seen = [drive(mine, None, range(CARS), 0.3)]
-    mean, scale, _ = scaling_of(seen, mine.cars.layout, mine.teacher.needs, False)
+    mean, scale, _ = scaling_of(seen, mine.cars.layout, mine.teacher.needs, usual_ages=False)
     inputs = len(mine.cars.layout)
     model = make_memory("mlp", inputs, inputs - 1, 0)
     model.whiten(seen, mean, scale)
