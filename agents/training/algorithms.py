@@ -192,9 +192,11 @@ def _schedule(name: str, value: Any) -> Any:
 
 
 def check_device(name: str) -> None:
-    """ValueError for a name that is no device of torch's."""
+    """ValueError for a name that is no device of torch's, or one that is not at hand."""
     try:
-        get_device(name)
+        found = get_device(name)  # the CPU where there is no CUDA
     except RuntimeError:
         known = "a device is cpu, cuda or another of torch's, or auto"
         raise ValueError(f"{known}, got {name!r}") from None
+    if name.startswith("cuda") and found.type != "cuda":
+        raise ValueError(f"torch finds no CUDA device, got {name!r}; auto takes one if there is")

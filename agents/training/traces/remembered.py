@@ -55,12 +55,16 @@ class Remembered(VectorWrapper[Any, Any, Any, Any, Any]):
         self.observation_space = batch_space(self.single_observation_space, env.num_envs)
         self._network, self._state = network, np.zeros((env.num_envs, network.memory))
         self._mixing = mixing and Mixing(mixing.mean, mixing.mixing.astype(np.float32))
+        self._last = np.zeros(self.observation_space.shape or (), np.float32)
 
-    def reset(self, **arguments: Any) -> tuple[Any, dict[str, Any]]:
-        """The inner env's."""
-        obs, infos = self.env.reset(**arguments)
-        self._state[:] = 0.0
-        return self._read(obs, self._state), infos
+    def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        """The inner env's; rows that a `reset_mask` leaves out go on, and are not read twice."""
+        anew = np.array((options or {}).get("reset_mask", np.ones(self.num_envs, np.bool_)))
+        obs, infos = self.env.reset(seed=seed, options=options)
+        begun, found = np.zeros_like(self._state[anew]), self._last.copy()
+        found[anew] = self._read(obs[anew], begun)
+        self._state[anew], self._last = begun, found
+        return found, infos
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """The inner env's; `final_obs` of its infos too."""
@@ -75,7 +79,8 @@ class Remembered(VectorWrapper[Any, Any, Any, Any, Any]):
                 last[i] = each
             infos = infos | {"final_obs": last}
             self._state[over] = 0.0
-        return self._read(obs, self._state), rewards, terminated, truncated, infos
+        self._last = self._read(obs, self._state)
+        return self._last, rewards, terminated, truncated, infos
 
     def _read(self, obs: Any, state: Any) -> Any:
         """(N, k) float32; state (N, memory) is updated."""

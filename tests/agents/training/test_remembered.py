@@ -66,6 +66,20 @@ def test_an_observation_is_what_is_remembered_across_episodes(policy: Policy) ->
     assert env.reset(seed=5)[0] == pytest.approx(first, abs=1e-5)
 
 
+def test_a_row_that_is_not_reset_goes_on_with_its_memory(policy: Policy) -> None:
+    rows, mask = [Remembered(cars(3), policy.network) for _ in range(2)], np.arange(3) == 1
+    action = np.full((3, 1), 0.1, np.float32)
+    for env in rows:
+        env.reset(seed=5)
+        env.step(action)
+        before = env.step(action)[0]
+    first = rows[0].reset(seed=[None, 8, None], options={"reset_mask": mask})[0]
+    assert np.array_equal(first[~mask], before[~mask])
+    assert np.array_equal(first[mask], Remembered(cars(3), policy.network).reset(seed=7)[0][mask])
+    ours, theirs = (env.step(action)[0] for env in rows)
+    assert np.array_equal(ours[~mask], theirs[~mask]) and (ours[mask] != theirs[mask]).any()
+
+
 def test_mixed_and_back_a_network_is_the_same(policy: Policy) -> None:
     """And what is remembered in its own drives varies alike, mixed."""
     net = policy.network

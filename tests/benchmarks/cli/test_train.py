@@ -100,6 +100,14 @@ def test_a_mistake_is_one_line_that_names_it(
     assert not list(tmp_path.glob("**/*.safetensors"))
 
 
+def test_a_gpu_that_is_not_there_is_not_replaced_in_silence(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    status, _, err = run(*TINY, "--steps", 64, "--device", "cuda:0")
+    assert status == 2 and "torch finds no CUDA device, got 'cuda:0'" in " ".join(err.split())
+
+
 @pytest.mark.parametrize("missing", ["torch", "stable_baselines3"])
 def test_without_the_extra_the_command_names_it(
     run: Run, missing: str, monkeypatch: pytest.MonkeyPatch
