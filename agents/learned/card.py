@@ -54,8 +54,8 @@ class Card:
         object.__setattr__(self, "observation", tuple((name, unit) for name, unit in pairs))
         if len({name for name, _ in pairs}) != len(pairs):
             raise ValueError("observation names an entry twice")
-        check_names_no_code(str(self.env_id), str(self.estimator))
         check_types(Card, vars(self), "the card")
+        check_names_no_code(self.env_id, self.estimator, self.estimator_options)
         self.to_json()
 
     @classmethod
@@ -102,8 +102,10 @@ class Card:
             raise ValueError(f"the card holds what JSON has not: {error}") from None
 
 
-def check_names_no_code(env_id: str, estimator: str) -> None:
+def check_names_no_code(env_id: str, estimator: str, estimator_options: JsonMap) -> None:
     """ValueError where a file from elsewhere names code to be imported instead of what is there."""
+    if "estimator" in estimator_options:
+        raise ValueError("estimator_options holds an estimator, which is none of its options")
     if ":" in env_id:
         raise ValueError(
             f"env_id is that of a registered env, got {env_id!r}, which names a module: import it "

@@ -25,6 +25,13 @@ _LENGTH = struct.Struct("!I")
 _BLOCK = struct.Struct("!4sIIII")  # magic, batches, bytes, checksums of these and of estimates
 _ITEM = struct.Struct("!HH")  # which batch of the block, bytes of the datagram
 _MAGIC = b"BLOK"
+_SETUP = {
+    **dict.fromkeys(("estimator", "agent", "env"), str),
+    **dict.fromkeys(("options", "agent_options", "estimator_options"), dict),
+    "seed": int,
+    "patience": (int, type(None)),
+}
+"""What the setup of a session has, by type."""
 
 
 class Recorder:
@@ -76,9 +83,13 @@ class Block(NamedTuple):
 
 
 def read_setup(path: Path | str) -> dict[str, Any]:
-    """The setup of a session; ValueError for a file that is none."""
+    """The setup of a session; ValueError for a file that is none, or lacks some of it."""
     with open(path, "rb") as file:
-        return _setup(path, file)
+        setup = _setup(path, file)
+    wrong = [name for name, kind in _SETUP.items() if not isinstance(setup.get(name, ...), kind)]
+    if wrong:
+        raise ValueError(f"{path}: its setup lacks {', '.join(wrong)}, or has it of another type")
+    return setup
 
 
 def _setup(path: Path | str, file: Any) -> dict[str, Any]:

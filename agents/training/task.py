@@ -70,7 +70,7 @@ class Task:
     @property
     def around(self) -> dict[str, Any] | None:
         """Arguments of `EstimateObservation`, None without an estimator."""
-        return {"estimator": self.estimator} | self.estimator_options if self.estimator else None
+        return self.estimator_options | {"estimator": self.estimator} if self.estimator else None
 
     def options(self, num_envs: int) -> dict[str, Any]:
         """Options of a vector env of so many rows."""

@@ -210,7 +210,7 @@ def task_in(folder: str | Path, **arguments: Any) -> Task:
         raise ValueError(f"{path}: the checkpoint's task lacks {', '.join(missing)}")
     task = made_of(Task, saved, f"{path}: the task")
     try:
-        check_names_no_code(task.env_id, task.estimator)
+        check_names_no_code(task.env_id, task.estimator, task.estimator_options)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
     for name, value in arguments.items():

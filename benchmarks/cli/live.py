@@ -247,6 +247,7 @@ def _relay(
 
 def _replay(path: Path, asked: dict[str, Any], trust: bool, json: Path | None) -> None:
     from ...agents import AGENTS
+    from ...agents.learned.card import check_names_no_code
     from ...agents.live.session import read_setup, replay
     from ...estimators.filters import FILTERS
 
@@ -254,6 +255,8 @@ def _replay(path: Path, asked: dict[str, Any], trust: bool, json: Path | None) -
     for kind, known in (("estimator", FILTERS), ("agent", AGENTS)):
         if setup.get(kind) != asked[kind]:  # a file's text may not choose what code is run
             check_choice(f"{kind} in {path}, name it in the command to run it:", setup[kind], known)
+    unasked = "" if setup["env"] == asked["env"] else setup["env"]
+    check_names_no_code(unasked, "", setup["estimator_options"])
     onboard = _onboard(asked | setup, trust)
     found = replay(path, onboard, setup["patience"])
     same = "those of the session bit for bit" if found.same else "NOT those of the session"

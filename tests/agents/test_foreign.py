@@ -140,3 +140,6 @@ def test_a_policys_card_names_no_code() -> None:
             Card(VISION, (("gyro", "rad/s"),), 10, "zero-slip", estimator=name)
     with pytest.raises(ValueError, match="env_id is that of a registered env, got 'evil:Car-v0'"):
         Card("evil:Car-v0", (("gyro", "rad/s"),), 10, "zero-slip")
+    hidden = {"estimator": "evil.py"}
+    with pytest.raises(ValueError, match="estimator_options holds an estimator"):
+        Card(VISION, (("gyro", "rad/s"),), 10, "zero-slip", {}, "dakf", hidden)

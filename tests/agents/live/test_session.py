@@ -21,7 +21,11 @@ from sideslip.agents.live.session import (
 )
 from tests.agents.live.both_ends import SEED, STEERING, contestant, drive
 
-SETUP = {"estimator": "dakf", "agent": "lqr", "patience": None}
+SETUP: dict[str, Any] = {
+    **{"estimator": "dakf", "agent": "lqr", "env": "sideslip/YawGps-v0"},
+    **dict.fromkeys(("options", "agent_options", "estimator_options"), {}),
+    **{"seed": SEED, "patience": None},
+}
 
 
 def onboard() -> Onboard:
@@ -94,6 +98,17 @@ def test_a_block_that_somebody_made_up_ends_the_replay(tmp_path: Path, items: by
     with path.open("ab") as file:
         file.write(_BLOCK.pack(_MAGIC, 2, len(items), zlib.crc32(items), 0) + items)
     assert list(blocks_of(path)) == []
+
+
+@pytest.mark.parametrize(
+    ("change", "what"), [({"agent": 3}, "agent"), ({"patience": "long"}, "patience"), ({}, "seed")]
+)
+def test_what_a_setup_lacks_is_named(tmp_path: Path, change: Any, what: str) -> None:
+    path = tmp_path / "a.session"
+    setup = SETUP | change if change else {k: v for k, v in SETUP.items() if k != "seed"}
+    Recorder(path, setup).close()
+    with pytest.raises(ValueError, match=f"its setup lacks {what}, or has it of another type"):
+        read_setup(path)
 
 
 def test_a_session_is_never_overwritten(tmp_path: Path) -> None:

@@ -44,6 +44,10 @@ def of(**change: object) -> dict[str, object]:
         (of(reads=3), ": the task: reads is 3, not list"),
         (of(algo="dqn"), ": the task: unknown algorithm 'dqn'"),
         (of(estimator="evil.py"), ": estimator is a name, got the entry point 'evil.py'"),
+        (
+            of(estimator="dakf", estimator_options={"estimator": "evil.py"}),
+            ": estimator_options holds an estimator",
+        ),
         (of(env_id="evil:Car-v0"), ": env_id is that of a registered env, got 'evil:Car-v0'"),
     ],
 )

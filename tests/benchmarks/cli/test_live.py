@@ -6,6 +6,7 @@ import socket
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -58,15 +59,30 @@ def test_ctrl_c_ends_with_the_summary_and_a_whole_session(run: Run, tmp_path: Pa
     assert status == 0 and "those of the session bit for bit" in out
 
 
-def test_a_session_may_not_choose_code(run: Run, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"estimator": "mine.py:Mine"}, "name it in the command"),
+        ({"agent": "mine.py:Mine"}, "name it in the command"),
+        ({"env": "mine:Car-v0"}, "'mine:Car-v0', which names a module"),
+        ({"env": "mine:Car-v0", "options": {"env": "mine:Car-v0"}}, "which names a module"),
+        ({"estimator_options": {"estimator": "mine.py:Mine"}}, "holds an estimator"),
+    ],
+)
+def test_a_session_may_not_choose_code(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: Any, said: str
+) -> None:
     from sideslip.agents.live.session import Recorder
 
-    mine, session = tmp_path / "mine.py", tmp_path / "a.session"
-    mine.write_text("raise SystemExit('it ran')\n")
-    setup = {"estimator": f"{mine}:Mine", "agent": "none", "patience": None}
-    Recorder(session, setup).close()
+    session = tmp_path / "a.session"
+    (tmp_path / "mine.py").write_text("raise SystemExit('it ran')\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    setup = dict.fromkeys(("options", "agent_options", "estimator_options"), {})
+    setup |= {"estimator": "dakf", "agent": "none", "env": "sideslip/YawGps-v0"}
+    Recorder(session, setup | {"seed": 0, "patience": None} | change).close()
     status, _, err = run("live", "--replay", session)
-    assert status == 2 and "name it in the command" in err and "it ran" not in err
+    assert status == 2 and said in err and "it ran" not in err
 
 
 @pytest.mark.parametrize(
