@@ -25,7 +25,7 @@ class EnvFacts:
 
     layout: of an observation. nominal: the vehicle as controllers know it. full_scale: N m of
     the action 1. authority: rad of added steering of the action 1. control_period: ticks.
-    reference: of `envs.reference.REFERENCES`. width: of an action.
+    reference: of `envs.task.reference.REFERENCES`. width: of an action.
     """
 
     layout: tuple[Entry, ...]

@@ -14,7 +14,7 @@ from .. import __version__
 from ..agents.rollout import Rollout, rollout
 from ..envs.record import Array
 from ..estimators.analysis.bound import bound
-from .harness.drives import SETTLED, facts_of
+from .harness.drives import SETTLED, filter_arguments
 from .harness.parallel import chunked, run_cases
 from .harness.results import Row, Suite, Table
 from .harness.stats import Estimate, interval, ratio_of_roots, root_mean
@@ -115,7 +115,7 @@ def measure(case: Seeds) -> Measured:
             cost[i, j] = (time.process_time() - start) / len(late) * 1e6
             traces[label] = estimates["beta"]
             squares[i, j] = np.mean((traces[label] - drive.log.truth["beta"])[late] ** 2)
-        std = bound(record=drive.log.record, **facts_of(base) | {"vehicle": base.vehicle})
+        std = bound(record=drive.log.record, **filter_arguments(base) | {"vehicle": base.vehicle})
         best[i] = np.mean(std[late] ** 2)
         if seed == 0:
             example = (drive, traces)

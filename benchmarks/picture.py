@@ -65,7 +65,7 @@ def write_picture(path: str | Path, suites: Sequence[Suite]) -> None:
                 _limit(axis, 1e3 * row.value / over[row.estimator])
                 break
     with whole(path) as file:
-        figure.savefig(file, format="png", dpi=110)
+        figure.savefig(file, format=Path(path).suffix[1:] or "png", dpi=110)
 
 
 def _shown(row: Row) -> bool:

@@ -22,11 +22,11 @@ class Card:
 
     env_id, env_options: of `gym.make`. estimator, estimator_options: of `EstimateObservation`
     around it, "" for none. observation: (name, unit) of each entry that the network takes.
-    control_period: ticks. reference: of `envs.reference.REFERENCES`, by which it was judged.
-    algorithm, algorithm_options: how it was trained. command: the line that
-    made it. seeds: by purpose ("training", ...). steps: of the environment. cpu_seconds: of the
-    training. sideslip: the version. evaluation: of `sideslip.benchmarks.enjoy`: seeds, and mean
-    costs of the policy, of none and of the best classical line on them.
+    control_period: ticks. reference: of `envs.task.reference.REFERENCES`, by which it was judged.
+    algorithm, algorithm_options: how it was trained. command: the line that made it. seeds: by
+    purpose ("training", ...). steps: of the environment. cpu_seconds: of the training. sideslip:
+    the version. evaluation: of `benchmarks.policies.evaluation`: seeds, and mean costs of the
+    policy, of none and of the best classical line on them.
 
     Raises ValueError for a value of another type, or one that JSON has not.
     """

@@ -9,7 +9,7 @@ Network byte order: a header of 20 bytes, `count` doubles and, behind the estima
 | 5 | kind, of `Kind` |
 | 6-7 | count, the doubles that follow |
 | 8-11 | sequence number: of this sender's datagrams of this kind, modulo 2^32 |
-| 12-19 | stamp, us of the inertial sender's clock, int64, not negative; 0: of another clock |
+| 12-19 | stamp, us of the inertial sender's clock, int64, 0 to 2^53; 0: of another clock |
 
 FIELDS names the doubles of each kind, in SI units. A change of any of it is another VERSION.
 """
@@ -27,6 +27,7 @@ MAGIC, VERSION = b"SLIP", 1
 HEADER = struct.Struct("!4sBBHIq")
 MOST = 1400  # bytes: fits a frame of Ethernet
 LIMIT = 1e7  # the largest magnitude of any value, SI
+LATEST = 2**53  # us: 285 years, and a whole number as a double too
 LONGEST_AGE = 10.0  # s, of a slow sensor's sample
 STAMP = 1000  # us a tick
 
@@ -125,7 +126,8 @@ def decode(data: bytes) -> Message | Bad:
     values = struct.unpack_from(f"!{count}d", data, HEADER.size)
     if not all(map(math.isfinite, values)):
         return Bad.NOT_FINITE
-    if stamp < 0 or (kind != Kind.STATUS and any(abs(value) > LIMIT for value in values)):
+    far = kind != Kind.STATUS and any(abs(value) > LIMIT for value in values)
+    if far or not 0 <= stamp <= LATEST:
         return Bad.RANGE
     if kind in SENSORS and not 0.0 <= values[-2] <= LONGEST_AGE:
         return Bad.RANGE

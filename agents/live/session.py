@@ -25,7 +25,7 @@ _LENGTH = struct.Struct("!I")
 _BLOCK = struct.Struct("!4sIIII")  # magic, batches, bytes, checksums of these and of estimates
 _ITEM = struct.Struct("!HH")  # which batch of the block, bytes of the datagram
 _MAGIC = b"BLOK"
-_SETUP = {
+_SETUP: dict[str, Any] = {
     **dict.fromkeys(("estimator", "agent", "env"), str),
     **dict.fromkeys(("options", "agent_options", "estimator_options"), dict),
     "seed": int,

@@ -180,6 +180,8 @@ class Other:
 
     def __exit__(self, *_: object) -> None:
         self._process.kill()
+        self._process.join()
+        self._pipe.close()
 
 
 def _other(

@@ -110,12 +110,23 @@ def settings_of(algo: str, env_id: str, file: str | Path | None = None) -> Setti
     return dict(found)
 
 
+def _default(arguments: Mapping[str, inspect.Parameter], name: str) -> Any:
+    """Of an option, or a number of those that are a training's own and numbers."""
+    if name in arguments:
+        return arguments[name].default
+    return 0 if name in ("n_timesteps", "n_envs") else None
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
 def check_settings(algo: str, settings: Any) -> None:
     """ValueError for settings that the algorithm has not, or that say code instead of a value."""
     if not isinstance(settings, Mapping):
         raise ValueError(f"settings are {{name: value}}, got {settings!r}")
-    arguments = set(inspect.signature(algorithm_of(algo).load()).parameters)
-    known = sorted((arguments - _OURS) | set(_OF_TRAINING))
+    arguments = inspect.signature(algorithm_of(algo).load()).parameters
+    known = sorted((arguments.keys() - _OURS) | set(_OF_TRAINING))
     for name, value in settings.items():
         if name not in known:
             raise ValueError(f"unknown option {name!r} of {algo}; known: {', '.join(known)}")
@@ -123,6 +134,9 @@ def check_settings(algo: str, settings: Any) -> None:
             raise ValueError(f"{name} is {{name: value}}, which is no code to run, got {value!r}")
         if name in _SCHEDULED:
             _schedule(name, value)
+        elif isinstance(value, str) and _is_number(_default(arguments, name)):
+            hint = "; YAML reads 2e6 as text, 2.0e+6 as a number" if "e" in value else ""
+            raise ValueError(f"{name} is a number, got {value!r}{hint}")
     kwargs = settings.get("policy_kwargs", {})
     if "activation_fn" in kwargs and algorithm_of(algo).on_tensors:
         raise ValueError(f"the layers of {algo} are of silu: it has no activation_fn")

@@ -24,6 +24,7 @@ from ...estimators.vector.estimate import EstimateObservation
 from ..controllers.base import NoControl
 from ..controllers.lqr import Lqr
 from ..rollout import steps_of
+from .traces.mixing import scale_of
 
 import torch  # isort: skip  # after ours, which say which extra is missing
 
@@ -34,7 +35,7 @@ FIRST = (("lqr", "fusion"), ("none", "fusion"), ("shaken", "fusion"), ("lqr", "v
          ("shaken", "gps"))  # fmt: skip
 SECOND = (("lqr", "fusion"), ("lqr", "vision"), ("lqr", "gps"))
 """Who drives with which slow sensors, on the filter, then on the correction."""
-TRAINING, HELD_OUT = 2**67, 2**68  # no other seeds are as large
+TRAINING, HELD_OUT = 2**67, 2**68  # seeds; `keeper` and `distill` have others
 _SEEDS = 2**40  # of a training
 EVERY = 10  # env-steps from one sample to the next
 LARGEST = 0.5  # rad: a car that slips more is lost, and nothing to learn from
@@ -127,7 +128,7 @@ def train_correction(
     blank = Correction(card, Network(*plain, [none], [np.zeros(2)], "relu", clip=np.inf))
     seen = samples(blank, drives, FIRST, TRAINING + first, episodes)
     mean, spread = seen.inputs.mean(0, np.float64), seen.inputs.std(0, dtype=np.float64)
-    scale = np.where(spread > 1e-9, 1.0 / np.maximum(spread, 1e-9), 0.0)
+    scale = scale_of(spread)
     np.subtract(seen.inputs, mean.astype(np.float32), out=seen.inputs)
     np.clip(seen.inputs * scale.astype(np.float32), -CLIP, CLIP, out=seen.inputs)
     report("the first network")

@@ -22,11 +22,12 @@ from ..learned.policy import Learned
 from ..rollout import FLOOR
 from .student import LONGER, Course, Student, fitted
 from .traces.drives import Drives, Scaling, Single, normalised, scaling_of
+from .traces.mixing import scale_of
 
 import torch  # isort: skip  # after ours, which say which extra is missing
 
-DISTILLING = 2**69  # no other seeds are as large
-_SEEDS = 2**40  # of a training
+DISTILLING = 2**69  # no other seeds are as large: `keeper`, `corrections`
+SEEDS = 2**40  # of a training
 _MEMORY = 0.95  # share of the noise left after a step
 
 
@@ -131,17 +132,20 @@ def distill(
     card: of what the lessons' cars are; the training's numbers are filled in. path: ends in
     `.safetensors`. report: called after each round. The same numbers give the same bits.
 
-    Raises ValueError for no lesson, for a teacher whose cars are others than the student's, and
+    Raises ValueError for no lesson, for a course that tells where the student sees all that the
+    teacher reads, for a teacher whose cars are others than the student's, and
     FloatingPointError, with the step, where the loss or the weights are not finite: the file then
     holds the round before.
     """
     if not lessons:
         raise ValueError("no lessons: there is nothing to learn from")
+    if course.told and not _unseen(lessons[0]):
+        raise ValueError("nothing is left to be told: the student sees all that its teacher reads")
     torch.set_num_threads(1)
     torch.manual_seed(course.seed)
     begun, target, steps = time.process_time(), Path(path), 0
     cars = lessons[0].cars
-    seeds = itertools.count(DISTILLING + course.seed * _SEEDS, cars.num_envs)
+    seeds = itertools.count(DISTILLING + course.seed * SEEDS, cars.num_envs)
     width, unseen = cars.single_action_space.shape[0], len(_unseen(lessons[0]))
     model = Student(len(cars.layout), width, course, unseen)
     policy: Policy | None = None
@@ -161,8 +165,7 @@ def distill(
             model.whiten(fresh, scaling)
             usual = [float(np.median(each.costs)) for each in fresh]
             told = np.concatenate([each.told[each.weights > 0.0] for each in fresh])
-            middle, spread = told.mean(0), told.std(0)
-            scale = np.where(spread > 1e-9, 1.0 / np.maximum(spread, 1e-9), 0.0)
+            middle, scale = told.mean(0), scale_of(told.std(0))
         drives += [each._replace(told=normalised(each.told, middle, scale)) for each in fresh]
         epochs = course.epochs * (LONGER if i == course.rounds - 1 else 1)
         loss = fitted(model, drives, scaling, course, epochs)

@@ -35,7 +35,7 @@ CHECKPOINT, CURVE = "checkpoint.safetensors", "curve.jsonl"
 POLICY, BEST, BEGUN_WITH = "policy.safetensors", "best_model.zip", "begun_with.safetensors"
 _MEASURED = 64  # environments whose observations make the scaling
 
-# No other seeds are as large: those of tests and of the calibration are below 2^63.
+# Seeds of tests and of the calibration are below 2^63, those of `corrections` and `distill` beyond.
 _WEIGHING, _EVALUATION, _SCALING, _TRAINING = 2**63, 2**64, 2**65, 2**66
 _ROOM = 2**40  # seeds of a training: it takes those from its steps on when it starts or goes on
 

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...envs.backend.extras import extra
-from ..rollout import FLOOR, steps_of
+from ..rollout import FLOOR, drives_of
 from ..vec_env.env import Observations, make_native_env
 from .task import Task
 
@@ -38,10 +38,7 @@ def weights_of(task: Task, first: int) -> Array:
         return np.ones(1)
     rows = _ALONE * k
     env = make_native_env(task.env_id, rows, None, task.options(rows))
-    costs, steps = np.zeros(rows), -np.ones(rows)  # the first one is the reset
-    for step in steps_of(env, None, [first + i for i in range(rows)]):
-        costs -= np.where(step.running, step.reward, 0.0)
-        steps += step.running
+    costs, steps = drives_of(env, None, range(first, first + rows))
     return alike(np.array([costs[i::k].sum() / steps[i::k].sum() for i in range(k)]))
 
 

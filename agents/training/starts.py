@@ -46,7 +46,7 @@ def start_of(path: str | Path, width: int, trust: bool = False) -> Start:
     Raises what `check_zip` raises; PermissionError for such a pickle without trust.
     """
     file = Path(path)
-    check_zip(file, trust=True)
+    check_zip(file)
     try:
         _, found, variables = load_from_zip_file(file, load_data=False, device="cpu")
         parameters: dict[str, Any] = found

@@ -90,7 +90,7 @@ def train(
             if is_policy(str(trained_agent)):
                 trained_agent = load_policy(trained_agent)
             else:
-                check_zip(Path(trained_agent), trust=True)
+                check_zip(Path(trained_agent))
     if how.tensorboard_log is not None and find_spec("tensorboard") is None:
         raise ModuleNotFoundError("a log for TensorBoard needs it: pip install tensorboard")
     tracked = _Tracked(how.track, Path(folder).name, asdict(task)) if how.track else None

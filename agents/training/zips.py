@@ -48,7 +48,7 @@ def policy_from_zip(
     `network_from_sb3` refuses, ModuleNotFoundError without stable-baselines3.
     """
     file = Path(path)
-    check_zip(file, trust)
+    check_trusted(file, trust)
     content, weights = _read(file)
     policy = _built(file, content, weights)
     frames = _frames(file, policy.observation_space, facts_of(env).layout)
@@ -78,7 +78,7 @@ def export_zip(
     env_id, env_options, estimator: what it was trained on. command: for the card. Raises what
     `policy_from_zip` and `save_policy` raise.
     """
-    check_zip(Path(path), trust)
+    check_trusted(Path(path), trust)
     if Path(target).suffix != ENDING:
         raise ValueError(f"a policy's file is NAME{ENDING}, got {target}")
     options = dict(env_options or {})
@@ -104,12 +104,21 @@ def normaliser_of(path: Path, normalise: str | Path | None = None) -> Path | Non
     return next((file for file in beside if file.is_file()), None)
 
 
-def check_zip(file: Path, trust: bool) -> None:
-    """What can be known of a file before anything in it is unpickled.
+def check_trusted(file: Path, trust: bool) -> None:
+    """PermissionError for a zip that is to be unpickled without trust; raises what `check_zip`
+    does, too."""
+    check_zip(file)
+    if not trust:
+        raise PermissionError(
+            f"{file} holds pickles: reading them runs whatever code its maker put there. If you "
+            f"trust it, say --trust (trust=True); `sideslip export {file} --trust` makes a file "
+            "of it that cannot run code"
+        )
 
-    Raises FileNotFoundError, ValueError for what is no zip of stable-baselines3, PermissionError
-    without trust.
-    """
+
+def check_zip(file: Path) -> None:
+    """What can be known of a file before anything in it is read: FileNotFoundError, ValueError for
+    what is no zip of stable-baselines3."""
     if not file.is_file():
         raise FileNotFoundError(f"{file}: {'a folder' if file.is_dir() else 'no such file'}")
     try:
@@ -121,12 +130,6 @@ def check_zip(file: Path, trust: bool) -> None:
         names = " and ".join(sorted(missing))
         raise ValueError(
             f"{file} is no zip of stable-baselines3, or is cut short: it holds no {names}"
-        )
-    if not trust:
-        raise PermissionError(
-            f"{file} holds pickles: reading them runs whatever code its maker put there. If you "
-            f"trust it, say --trust (trust=True); `sideslip export {file} --trust` makes a file "
-            "of it that cannot run code"
         )
 
 

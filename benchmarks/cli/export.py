@@ -50,6 +50,7 @@ def export_command(
     console, scaled = Console(soft_wrap=True), normaliser_of(zipped, normalise)
     console.print(
         f"network: {sizes_of(policy.network)}; observations normalised by: {scaled or 'nothing'}",
+        markup=False,
         highlight=False,
     )
     wrote(console, target)

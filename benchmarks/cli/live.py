@@ -159,9 +159,6 @@ def _live(
         onboard = _onboard(setup, ends.trust)
         setup["env"] = onboard.base.spec.id
         loop = Loop(onboard, Assembler(patience), port, ends.publish, step=ends.step)
-        if record is not None:
-            loop.recorder = Recorder(record, setup | {"patience": patience})
-            stack.callback(loop.recorder.close)
         if ends.page is not None or console.is_terminal:
             title = f"{setup['estimator']}, {setup['agent']}"
             viewer = stack.enter_context(Viewer(title, ends.page, console.is_terminal))
@@ -177,6 +174,9 @@ def _live(
             source, latency = ends.receiver
             relay = Relay(source, stack.enter_context(Port()), port.address, latency, ends.speed)
             Thread(target=relay.run, args=(lambda: bool(loop.ended),), daemon=True).start()
+        if record is not None:  # last: where something is wrong before, no file is left
+            loop.recorder = Recorder(record, setup | {"patience": patience})
+            stack.callback(loop.recorder.close)
         console.print(f"listening on {port.address[0]}:{port.address[1]}")
         if other is not None:
             other.go()

@@ -100,6 +100,7 @@ def show_episode(
         f"{drive.log.name}: {drive['t'][-1]:.2f} s, cost {drive.cost:.4g}, "
         f"RMS slip {1e3 * np.sqrt(np.mean(slip**2)):.2f} mrad, "
         f"peak {1e3 * np.max(np.abs(slip)):.2f} mrad" + (", FAILED" if drive.failed else ""),
+        markup=False,
         highlight=False,
     )
     if plot is not None:

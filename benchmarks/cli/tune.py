@@ -154,7 +154,7 @@ def tune_controller(
         except ValueError as error:
             if kind:
                 raise
-            console.print(f"{name} in {each} was left out: {error}", highlight=False)
+            console.print(f"{name} in {each} was left out: {error}", markup=False, highlight=False)
             continue
         print_suite(console, controllers.suite_of(task, found))
         for path in filter(None, tables):

@@ -1,15 +1,13 @@
 """A cell's cars: the vector env with its estimator, and the controller that drives them all."""
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from itertools import islice
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
-import numpy.typing as npt
-from gymnasium.vector import VectorEnv, VectorWrapper
-from gymnasium.vector.utils import batch_space
+from gymnasium.vector import VectorEnv
 
 from ...agents import make_agent
 from ...agents.learned.files import is_policy, load_policy
@@ -18,11 +16,11 @@ from ...agents.rungs import CURVED, FILTER, GRIP, STEER_WEIGHT, levels_of, make_
 from ...envs.arguments import brief
 from ...envs.scenarios.manoeuvres import scenario_from
 from ...envs.sensors.slow import SENSOR_SETS
-from ...envs.task.observation import Entry
 from ...estimators.design.models import TYRES
 from ...estimators.filters import FILTERS
 from ...estimators.learned.files import load_correction
 from ...estimators.vector.estimate import EstimateObservation
+from ...estimators.vector.truth import TruthObservation
 from ..harness.drives import quietly
 from .cells import ADAPTIVE, REFERENCE_CONTROLLER, REFERENCE_FILTER, SETUPS, TRUTH, Cell
 from .contests import STEERING
@@ -31,36 +29,6 @@ STEPS = 200  # of a decision's time
 
 _PUSHES = ("force_sd", "moment_sd")
 _DISTURBANCES = {"forces": ("F_d", "N_d"), "walk": ("d1", "d2"), "walk-all": ("d1", "d2")}
-
-
-class TrueState(VectorWrapper[Any, Any, Any, Any, Any]):
-    """The true beta and gamma as `beta_hat` and `gamma_hat`: an estimator without error."""
-
-    def __init__(self, env: VectorEnv[Any, Any, Any]) -> None:
-        super().__init__(env)
-        inner: tuple[Entry, ...] = env.layout  # type: ignore[attr-defined]
-        self.layout = (
-            *inner,
-            Entry("beta_hat", "rad", -np.pi, np.pi),
-            Entry("gamma_hat", "rad/s", -20.0, 20.0),
-        )
-        low, high = np.array([entry[2:] for entry in self.layout]).T.astype(np.float32)
-        self.single_observation_space = gym.spaces.Box(low, high, dtype=np.float32)
-        self.observation_space = batch_space(self.single_observation_space, env.num_envs)
-
-    def _joined(self, obs: Any, infos: Mapping[str, Any]) -> npt.NDArray[np.float32]:
-        truth = np.stack([infos["beta"], infos["gamma"]], axis=1)
-        return np.hstack([obs, np.clip(truth, [-np.pi, -20.0], [np.pi, 20.0])]).astype(np.float32)
-
-    def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
-        """Reset the rows and append their truth."""
-        obs, infos = self.env.reset(seed=seed, options=options)
-        return self._joined(obs, infos), infos
-
-    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """One step of all rows, with their truth."""
-        obs, rewards, terminated, truncated, infos = self.env.step(actions)
-        return self._joined(obs, infos), rewards, terminated, truncated, infos
 
 
 def outputs_for(estimator: str) -> tuple[str, ...]:
@@ -146,7 +114,7 @@ def make_cars(cell: Cell, cars: int) -> tuple[VectorEnv[Any, Any, Any], Any]:
         return make_rung(cell.rung, contest.env_id, cars, options=cell.best, **options)
     env: Any = gym.make_vec(contest.env_id, num_envs=cars, **options)
     if cell.estimator == TRUTH:
-        env = TrueState(env)
+        env = TruthObservation(env, (), ("beta", "gamma"))
     elif cell.estimator:
         source = cell.objects.get("estimator", name_of(cell.estimator))
         env = quietly(EstimateObservation, env, source, **estimate_options(cell))

@@ -10,7 +10,7 @@ import gymnasium as gym
 
 from ...agents import AGENTS
 from ...agents.learned.files import ZIP, is_policy, load_policy, shipped
-from ...agents.training.zips import check_zip
+from ...agents.training.zips import check_trusted
 from ...agents.tuned import tuned
 from ...envs.arguments import check_choice
 from ...envs.scenarios.manoeuvres import scenario_from
@@ -71,7 +71,7 @@ class Pair:
             elif known is AGENTS and is_policy(each):
                 load_policy(each)
             elif known is AGENTS and each.endswith(ZIP):
-                check_zip(Path(each), self.trust)
+                check_trusted(Path(each), self.trust)
             elif each not in ("", TRUTH, *SETUPS) and ":" not in each:
                 known.load(each, shipped() if known is AGENTS else SETUPS)
 

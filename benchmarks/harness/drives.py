@@ -9,6 +9,7 @@ import gymnasium as gym
 
 from ...envs.record import Log
 from ...estimators.estimates import UnobservableWarning
+from ...estimators.wrappers.arguments import setup_of
 from ...estimators.wrappers.estimate import EstimateObservation
 
 T = TypeVar("T")
@@ -24,14 +25,9 @@ class Drive:
     facts: dict[str, Any]
 
 
-def facts_of(base: Any) -> dict[str, Any]:
-    """Nominal vehicle, slow sensors, dt (s) and held speed (m/s) of an env's running episode."""
-    return {
-        "vehicle": base.nominal,
-        "sensors": base.slow_sensors,
-        "dt": base.dt,
-        "speed": base.held_speed,
-    }
+def filter_arguments(base: Any) -> dict[str, Any]:
+    """What `make_estimator` takes of an env's running episode: `Setup`, and dt in s."""
+    return setup_of(base)._asdict() | {"dt": base.dt}
 
 
 def quietly(make: Callable[..., T], *args: Any, **options: Any) -> T:

@@ -20,7 +20,7 @@ from ...estimators.estimator import Estimator
 from ...estimators.filters import FILTERS
 from ...estimators.make import ESTIMATORS, make_estimator
 from ..estimation import EXPERIMENTS
-from ..harness.drives import SETTLED, Drive, facts_of, quietly
+from ..harness.drives import SETTLED, Drive, filter_arguments, quietly
 from ..harness.parallel import run_cases
 from ..harness.stats import root_mean
 
@@ -172,7 +172,7 @@ def _fitting(
             for scenario in scenarios:
                 env: gym.Env[Any, Any] = gym.make(name, scenario=scenario)
                 env.reset(seed=FIRST_SEED)
-                facts = facts_of(env.unwrapped)
+                facts = filter_arguments(env.unwrapped)
                 filter_ = build(estimator, facts, {**_unstable(estimator), **held})
         except ValueError as error:
             refused.setdefault(str(error), name)
@@ -186,7 +186,7 @@ def drives_of(case: tuple[str, str, tuple[int, ...]]) -> list[Drive]:
     """The drives of (env id, scenario, seeds)."""
     env_id, scenario, seeds = case
     env: gym.Env[Any, Any] = gym.make(env_id, scenario=scenario, control_period=1)
-    return [Drive(rollout(env, seed=seed).log, facts_of(env.unwrapped)) for seed in seeds]
+    return [Drive(rollout(env, seed=seed).log, filter_arguments(env.unwrapped)) for seed in seeds]
 
 
 def simulate(

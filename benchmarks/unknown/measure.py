@@ -16,7 +16,7 @@ from ...envs.record import FAST, Array, Log, Record, concatenate
 from ...envs.vehicle.vehicle import Vehicle
 from ...estimators.analysis.bound import Change, Gust, bound
 from ...estimators.make import make_estimator
-from ..harness.drives import facts_of, quietly
+from ..harness.drives import filter_arguments, quietly
 from ..harness.parallel import chunked, run_cases
 from .conditions import LINEAR, TRUE, Condition
 
@@ -155,7 +155,7 @@ def _levels(scenario: Any) -> dict[str, Any]:
 
 
 def _filters(what: Condition, base: Any, log: Log) -> dict[str, Any]:
-    facts, made = facts_of(base) | {"slow": list(log.slow)}, {}
+    facts, made = filter_arguments(base) | {"slow": list(log.slow)}, {}
     for label, (name, options) in what.all_filters.items():
         known = facts | (
             {"vehicle": base.vehicle} | _levels(base.scenario) if label == TRUE else {}
@@ -175,5 +175,9 @@ def _bound(base: Any, log: Log, cars: tuple[Vehicle, Vehicle], gyro_late: float 
         passing["gust"] = Gust(
             spread_of(scene, "wind_force"), scene.wind_arm, scene.wind_start, end
         )
-    facts = facts_of(base) | {"vehicle": cars[0], "latency": {"gyro": gyro_late}} | _levels(scene)
+    facts = (
+        filter_arguments(base)
+        | {"vehicle": cars[0], "latency": {"gyro": gyro_late}}
+        | _levels(scene)
+    )
     return bound(record=log.record, **facts, **passing)

@@ -17,7 +17,7 @@ from ...envs.record import FAST, PACKET, Array, Log
 from ...envs.vehicle.vehicle import Vehicle
 from ...estimators.design.levels import DISTURBANCE, NOISE
 from ...estimators.make import make_estimator
-from ..harness.drives import SETTLED, facts_of, quietly
+from ..harness.drives import SETTLED, filter_arguments, quietly
 from .conditions import CAMERA, LINEAR, MIX
 from .measure import drive_and_bound
 
@@ -99,7 +99,7 @@ def race(case: tuple[float, int]) -> Array:
     delay, seed = case
     env: Any = gym.make(CAMERA, scenario=LINEAR | MIX | {"camera_delays": (delay,)})
     log, std = drive_and_bound(env, seed)
-    facts = facts_of(env.unwrapped)
+    facts = filter_arguments(env.unwrapped)
     ours = quietly(make_estimator, "joint", **facts)
     ours.run(log)  # compiled, and its memory warm
     rival = FilterPy(facts["vehicle"], facts["speed"], facts["dt"])

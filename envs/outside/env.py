@@ -81,7 +81,7 @@ class PlantEnv(StabilityEnv):
 
 
 class OutsideEnv(PlantEnv):
-    """`StabilityEnv` whose truth is a model of `sideslip.envs.outside.OUTSIDE_PLANTS`.
+    """`StabilityEnv` whose truth is a model of `sideslip.envs.outside.plants.OUTSIDE_PLANTS`.
 
     Action, observation, record, reward, info and options of reset are those of `StabilityEnv`; a
     plant whose state is no longer finite ends the episode as "not-finite". Needs the extra

@@ -14,8 +14,8 @@ from .scene import AHEAD, Scene
 from .trace import MOMENT
 
 BLUE, ORANGE = PALETTE[0], PALETTE[1]
-ASPHALT, GRASS, PAINT, FAINT, SOFT = "#D9DCE0", "#E2E9DA", "#FFFFFF", "#AEB4BA", "#6B7177"
-ROOF, TYRE = "#FFFFFF", "#23272B"
+ASPHALT, GRASS, PAINT, SOFT = "#D9DCE0", "#E2E9DA", "#FFFFFF", "#6B7177"
+TYRE = "#23272B"
 CAR, SCALES = 96.0, (22.0, 30.0)  # pixels of a car's length, and of a metre at least and at most
 LANE = 1.75  # m to either side of the centre line, where the scenario sets no limit
 OVERHANG = 1.62  # length of a car in wheelbases

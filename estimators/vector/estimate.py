@@ -106,7 +106,11 @@ class EstimateObservation(
             raise ResetNeeded(
                 "reset all rows first: no step succeeded since then, or none was made"
             )
-        obs, infos = self.env.reset(seed=seed, options=options)
+        try:
+            obs, infos = self.env.reset(seed=seed, options=options)
+        except (TypeError, ValueError):
+            self._keep(before)
+            raise
         self._ended = np.zeros(self.num_envs, np.bool_) if before is None else before & ~rows
         self._restart(rows)
         self._observe(self._records.newest(), obs, infos, rows, self._out)
@@ -122,8 +126,7 @@ class EstimateObservation(
         try:
             obs, rewards, terminated, truncated, infos = self.env.step(actions)
         except ValueError:
-            if isinstance(self._records, BatchedRecords):  # it refuses before it steps any row
-                self._ended = before
+            self._keep(before)
             raise
         ended = np.logical_or(terminated, truncated)
         if not self._same_step:
@@ -135,6 +138,11 @@ class EstimateObservation(
         self._observe(self._records.newest(), obs, infos, everyone, self._out)
         self._ended = ended
         return self._out.copy(), rewards, terminated, truncated, infos
+
+    def _keep(self, before: Mask | None) -> None:
+        """After what the inner env refused: a `Batched` one does before it moves any row."""
+        if isinstance(self._records, BatchedRecords):
+            self._ended = before
 
     def get_state(self) -> dict[str, Any]:
         """A snapshot of env and estimators that `set_state` continues from, bit for bit.

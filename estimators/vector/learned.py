@@ -42,6 +42,11 @@ def correct_batch(
         take_back(f[0], net, row)
 
 
+def _base(build: Build, setup: Setup) -> Any:
+    """The filter inside of a learned estimator, by a name that pickle finds."""
+    return build(setup).inner.base  # type: ignore[union-attr]
+
+
 class LearnedBatch(BatchEstimator):
     """N learned estimators of one correction; `filters` are their filters' records.
 
@@ -53,7 +58,7 @@ class LearnedBatch(BatchEstimator):
     ) -> None:
         self.first: Learned = first.inner  # type: ignore[assignment]
         self.memory = np.zeros((len(setups), len(self.first.memory)))
-        super().__init__(first.name, setups, dt, lambda each: build(each).inner.base)  # type: ignore[union-attr]
+        super().__init__(first.name, setups, dt, functools.partial(_base, build))
 
     def __getitem__(self, i: int) -> Any:
         own = copy.copy(self.first)

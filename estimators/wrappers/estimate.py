@@ -21,7 +21,10 @@ _MAY_STAND_BETWEEN = (PassiveEnvChecker, OrderEnforcing, TimeLimit)
 # stable-baselines3's make_vec_env and rl-zoo put it directly around the environment. It only counts
 # and is known by name: this module loads nothing of theirs.
 _MONITOR = ("stable_baselines3.common.monitor", "Monitor")
-_OFFERED = ("rows", "ticks_done", "packets", "delivered", "slow_sensors", "nominal", "layout")
+_OFFERED = (
+    *("rows", "ticks_done", "packets", "delivered", "slow_sensors", "nominal", "layout", "dt"),
+    "annotate",
+)
 
 
 class EstimateObservation(

@@ -25,5 +25,7 @@ def test_a_score_over_a_part_of_a_tiers_contests_is_marked(tmp_path: Path) -> No
     assert in_part(rows, "tier 2a") == {"model-following"}
     assert in_part(rows, "tier 1") == set()
     pytest.importorskip("matplotlib")
-    write_picture(tmp_path / "bench.png", [Suite("control", "Who", "How", rows)])
-    assert (tmp_path / "bench.png").stat().st_size > 10_000
+    for ending, head in (("png", b"\x89PNG"), ("pdf", b"%PDF"), ("svg", b"<?xml")):
+        path = tmp_path / f"bench.{ending}"
+        write_picture(path, [Suite("control", "Who", "How", rows)])
+        assert path.stat().st_size > 10_000 and path.read_bytes().startswith(head)

@@ -55,6 +55,12 @@ def test_everybody_drives_the_same_seeds_which_the_weights_make(tmp_path: Path) 
     assert enjoy(str(path), 3, seed=7).seeds == [7, 8, 9]
 
 
+def test_a_policy_may_not_be_called_what_it_is_held_against(tmp_path: Path) -> None:
+    path = a_file(tmp_path).rename(tmp_path / "none.safetensors")
+    with pytest.raises(ValueError, match="is called 'none', as what it is held against"):
+        enjoy(str(path), 1)
+
+
 def test_the_evaluation_goes_into_the_card_and_leaves_the_weights(tmp_path: Path) -> None:
     path = a_file(tmp_path)
     before = load_policy(path)

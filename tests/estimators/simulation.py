@@ -1,7 +1,7 @@
 """The linear car of the papers' small-angle simulations, exactly, for the estimators' tests.
 
-Inputs and disturbances are held over a tick, so the zero-order hold of `envs.linear` is exact. The
-body rolls with the lateral acceleration and does not act back: double-layer-gps (3)-(5).
+Inputs and disturbances are held over a tick, so the zero-order hold of `envs.vehicle.linear` is
+exact. The body rolls with the lateral acceleration and does not act back: double-layer-gps (3)-(5).
 """
 
 import math

@@ -11,14 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from ..distill import DISTILLING, Lesson, Round, drive
+from ..distill import DISTILLING, SEEDS, Lesson, Round, drive
 from ..student import LONGER, Course, fitted
 from ..traces.drives import Array, Drives, Scaling, Single, normalised, scaling_of
 from .networks import Memory, make_memory
 
 import torch  # isort: skip  # after ours, which say which extra is missing
-
-_SEEDS = 2**40  # of a training
 
 
 class Remembering:
@@ -71,7 +69,7 @@ def imitated(
     torch.set_num_threads(1)
     torch.manual_seed(course.seed)
     model = make_memory(name, len(names), fresh[0], late)
-    seeds = itertools.count(DISTILLING + course.seed * _SEEDS, cars.num_envs)
+    seeds = itertools.count(DISTILLING + course.seed * SEEDS, cars.num_envs)
     drives: list[Drives] = []
     agent, steps = None, 0
     scaling: Scaling | None = None

@@ -45,9 +45,11 @@ class Prepared(VectorWrapper[Any, Any, Any, Any, Any]):
         self.observation_space = batch_space(self.single_observation_space, env.num_envs)
         self._last = np.full((3, env.num_envs), AGE_CAP)  # offset, its rate, age of the picture
 
-    def reset(self, **arguments: Any) -> tuple[Single, dict[str, Any]]:
-        """The inner env's."""
-        obs, infos = self.env.reset(**arguments)
+    def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Single, dict[str, Any]]:
+        """The inner env's, of all rows; ValueError for some of them."""
+        if "reset_mask" in (options or {}):
+            raise ValueError("rates of the lateral offset begin together: reset all rows at once")
+        obs, infos = self.env.reset(seed=seed, options=options)
         return self._read(obs), infos
 
     def step(self, actions: Any) -> tuple[Single, Any, Any, Any, dict[str, Any]]:

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ....envs.task.observation import Entry
-from .mixing import whitening
+from .mixing import scale_of, whitening
 
 Array = npt.NDArray[np.float64]
 Single = npt.NDArray[np.float32]
@@ -78,7 +78,7 @@ def scaling_of(
             soon, usual = np.percentile(x[:, i], (_SOON, _USUAL))
             if usual > soon:
                 mean[i], spread[i] = usual, usual - soon
-    scale = np.where(there & (spread > 1e-9), 1.0 / np.maximum(spread, 1e-9), 0.0)
+    scale = np.where(there, scale_of(spread), 0.0)
     return Scaling(mean, scale, whitening(normalised(x, mean, scale), _LEAST))
 
 

@@ -15,7 +15,7 @@ from ....estimators.analysis.bound import bound
 from ....estimators.design.tunings import read_tunings
 from ....estimators.estimator import Estimator
 from ....estimators.make import make_estimator
-from ...harness.drives import SETTLED, facts_of, quietly
+from ...harness.drives import SETTLED, filter_arguments, quietly
 from ...harness.parallel import chunked
 from .claim import Array, Example, Measured
 from .simulations import CHUNK, FIRST, Numbers, rms, stacked
@@ -45,7 +45,7 @@ class Filter:
 
 def filters_for(filters: Sequence[Filter], base: Any) -> dict[str, Estimator]:
     """The filters by label, tuned for their papers and built for the running episode of an env."""
-    cars, facts = {"nominal": base.nominal, "true": base.vehicle}, facts_of(base)
+    cars, facts = {"nominal": base.nominal, "true": base.vehicle}, filter_arguments(base)
     found = {}
     for each in filters:
         options = {**facts, "vehicle": cars[each.vehicle]}
@@ -105,7 +105,9 @@ class Estimation:
                 curves[label] = {name: estimates[name] for name in estimates.names}
                 numbers |= _errors(label, curves[label], truth, drive.log, base.scenario)
             if self.bound:
-                std = bound(record=drive.log.record, **facts_of(base) | {"vehicle": base.vehicle})
+                std = bound(
+                    record=drive.log.record, **filter_arguments(base) | {"vehicle": base.vehicle}
+                )
                 numbers["bound", "beta"] = _settled_rms(std, drive.log)
             lines.append(numbers)
             if seed == FIRST:

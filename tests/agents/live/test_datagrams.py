@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from sideslip.agents.live.datagrams import (
     FIELDS,
     HEADER,
+    LATEST,
     LIMIT,
     MOST,
     SENSORS,
@@ -34,7 +35,7 @@ SOUND = inertial(7).data
 @given(
     st.sampled_from([Kind.INERTIAL, Kind.CONTROL, Kind.END, Kind.STATUS, *SENSORS]),
     st.integers(0, 2**32 - 1),
-    st.integers(0, 2**63 - 1),
+    st.integers(0, LATEST),
     st.data(),
 )
 def test_a_message_comes_back(kind: Kind, sequence: int, stamp: int, data: st.DataObject) -> None:
@@ -75,6 +76,7 @@ def changed(at: int, *new: int) -> bytes:
         (inertial(0, gyro=math.inf).data, Bad.NOT_FINITE),
         (inertial(0, gyro=2 * LIMIT).data, Bad.RANGE),
         (inertial(-1, 0).data, Bad.RANGE),
+        (encode(Kind.INERTIAL, 0, 2**63 - 1, [0.0] * len(FIELDS[Kind.INERTIAL])), Bad.RANGE),
         (camera(0, age=-0.01).data, Bad.RANGE),
         (camera(0, age=11.0).data, Bad.RANGE),
     ],

@@ -23,7 +23,7 @@ from tests.agents.live.both_ends import SEED, STEERING, contestant, drive
 
 SETUP: dict[str, Any] = {
     **{"estimator": "dakf", "agent": "lqr", "env": "sideslip/YawGps-v0"},
-    **dict.fromkeys(("options", "agent_options", "estimator_options"), {}),
+    **{key: {} for key in ("options", "agent_options", "estimator_options")},
     **{"seed": SEED, "patience": None},
 }
 

@@ -172,6 +172,8 @@ MEANT = "default: {policy: MlpPolicy, n_timesteps: 9, n_envs: 1"
         (MEANT + ', policy_kwargs: "dict(net_arch=[9])"}', "policy_kwargs is {name: value}"),
         (MEANT + ", learning_rate: lin_x}", "learning_rate is a positive number or lin_NUMBER"),
         (MEANT + ", learning_rate: -1.0}", "learning_rate is a positive number or lin_NUMBER"),
+        (MEANT + ", n_steps: 2e3}", "n_steps is a number, got '2e3'; YAML reads 2e6 as text"),
+        ("default: {n_envs: 1e2}", "n_envs is a number, got '1e2'"),
         ("default: {n_envs: 1}", "default: no n_timesteps, policy"),
         ("default: 3", "settings are {name: value}, got 3"),
         ("other: {n_envs: 1}", f"has no settings of {VISION}, and no 'default'"),

@@ -1,7 +1,10 @@
 """Training of a correction: what it learns from, that it learns, and that a seed decides all."""
 
+import functools
+import pickle
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -10,13 +13,17 @@ from sideslip.agents.training.corrections import (
     FIRST,
     HELD_OUT,
     TRAINING,
+    Samples,
     judged,
     quality_of,
     samples,
     train_correction,
 )
 from sideslip.benchmarks.control.seeds import tuning_seeds
+from sideslip.estimators.learned.correction import learned
 from sideslip.estimators.learned.files import CorrectionCard
+from sideslip.estimators.learned.kernel import stack_at
+from sideslip.estimators.vector.estimate import EstimateObservation
 from tests.estimators.learned.test_correction import READ, correction
 
 CARD = CorrectionCard(base="exact-kf", states=READ)
@@ -42,7 +49,6 @@ def test_a_seed_gives_the_same_bits_and_another_one_others() -> None:
 
 
 def test_samples_are_what_the_kernel_read_and_the_filters_error() -> None:
-    """The network by NumPy on a sample's inputs is what the kernel added there."""
     made, (env_id, options) = correction(), DRIVE
     seen = samples(made, [(env_id, options)], [("none", "fusion")], 5, 3)
     assert seen.inputs.shape == (len(seen.errors), CARD.inputs) and len(seen.errors) > 60
@@ -50,6 +56,33 @@ def test_samples_are_what_the_kernel_read_and_the_filters_error() -> None:
     assert np.abs(seen.inputs).max() <= 3.0  # its clip
     assert (deviations > 0.0).all() and np.isfinite(errors).all()
     assert np.abs(seen.errors).max() < 0.1
+
+
+def test_the_kernel_adds_what_the_network_does() -> None:
+    made, (env_id, options) = correction(), DRIVE
+    factory = functools.partial(learned, file=made)
+    env: Any = gym.make_vec(env_id, num_envs=3, sensors="fusion", **options)
+    env = EstimateObservation(env, factory, outputs=["beta"], std=False)
+    batch, added = env.estimator, []
+    env.reset(seed=5)
+    for _ in range(40):
+        obs, *_ = env.step(np.full((3, 1), 0.2, np.float32))
+        net = batch.first.net
+        stack = batch.memory[:, stack_at(net) : stack_at(net) + int(net.sizes[0])]
+        seen = Samples(stack.astype(np.float32), batch.filters[:, 0].x[:, net.beta])
+        added.append(float(np.abs(judged(made, seen)[0] - seen.errors).max()))
+        estimate = seen.errors + (seen.errors - judged(made, seen)[0])
+        assert obs[:, -1] == pytest.approx(estimate, abs=1e-6)
+    assert max(added) > 1e-4
+
+
+def test_a_learned_batch_is_pickled_whole() -> None:
+    env_id, options = DRIVE
+    env: Any = EstimateObservation(gym.make_vec(env_id, 2, **options), "learned-joint")
+    env.reset(seed=5)
+    again = pickle.loads(pickle.dumps(env.estimator))
+    assert np.array_equal(again.memory, env.estimator.memory)
+    assert again.filters.tobytes() == env.estimator.filters.tobytes()
 
 
 def test_nobody_else_has_its_seeds() -> None:

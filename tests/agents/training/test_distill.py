@@ -104,6 +104,13 @@ def test_the_network_is_torchs(cells: int) -> None:
     assert np.abs(ours - theirs).max() < 1e-6 < np.abs(np.diff(ours, axis=1)).max()
 
 
+def test_with_nothing_left_to_be_told_no_drive_is_made(tmp_path: Path) -> None:
+    _, twins, teacher = lesson()
+    course, path = replace(COURSE, told=0.5), tmp_path / "student.safetensors"
+    with pytest.raises(ValueError, match="nothing is left to be told"):
+        distill(Card.of(ID, OPTIONS), [Lesson(twins, twins, teacher)], course, path)
+
+
 def test_what_is_told_is_what_the_teacher_reads_and_the_student_does_not_see() -> None:
     """On seeds that it has not seen, the cells know the yaw rate, which so short a training shows
     them; the policy's file has nothing of it."""

@@ -120,6 +120,8 @@ def test_the_offset_becomes_the_rate_between_two_pictures_and_is_forgotten_at_a_
     theirs = [entry.name for entry in base.layout]
     assert not any(each.startswith(("accel", "wheel", "roll")) for each in ours)
     assert cars.observation_space.shape == (2, len(ours))
+    with pytest.raises(ValueError, match="reset all rows at once"):
+        cars.reset(options={"reset_mask": np.arange(2) == 1})
     x, y = cars.reset(seed=0)[0], plain.reset(seed=0)[0]
     rates, pictures = [], []
     for step in range(120):  # into the next episode

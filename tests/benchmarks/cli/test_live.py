@@ -78,7 +78,7 @@ def test_a_session_may_not_choose_code(
     (tmp_path / "mine.py").write_text("raise SystemExit('it ran')\n")
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
-    setup = dict.fromkeys(("options", "agent_options", "estimator_options"), {})
+    setup: dict[str, Any] = {key: {} for key in ("options", "agent_options", "estimator_options")}
     setup |= {"estimator": "dakf", "agent": "none", "env": "sideslip/YawGps-v0"}
     Recorder(session, setup | {"seed": 0, "patience": None} | change).close()
     status, _, err = run("live", "--replay", session)

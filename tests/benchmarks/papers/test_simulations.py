@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sideslip.agents.rollout import rollout
-from sideslip.benchmarks.harness.drives import SETTLED, facts_of, quietly
+from sideslip.benchmarks.harness.drives import SETTLED, filter_arguments, quietly
 from sideslip.benchmarks.harness.parallel import chunked
 from sideslip.benchmarks.papers.ledger.controllers import Following, Slip
 from sideslip.benchmarks.papers.ledger.filters import (
@@ -84,7 +84,7 @@ def test_claims_are_judged_with_the_papers_tuning() -> None:
     """What a figure's own tuning has of dakf is in its filter, and is not the package's."""
     env: Any = gym.make("sideslip/YawGps-v0", scenario="dakf-fig6")
     env.reset(seed=0)
-    facts = facts_of(env.unwrapped)
+    facts = filter_arguments(env.unwrapped)
     (ours,) = filters_for([Filter("dakf", "dakf")], env.unwrapped).values()
     package = quietly(make_estimator, "dakf", **facts)
     wanted = quietly(make_estimator, "dakf", **facts, **tuned_for_paper("dakf"))

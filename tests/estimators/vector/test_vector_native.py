@@ -82,6 +82,27 @@ def test_masks_and_other_scenarios_tell_the_filters(mode: str) -> None:
     assert drive(alone, together, 30) > 3
 
 
+@pytest.mark.parametrize(
+    "options",
+    [{"reset_mask": [True, False]}, {"scenario": "moon"}, {"frction": 0.5}],
+    ids=["a list as mask", "no such scenario", "no such option"],
+)
+def test_after_a_reset_that_is_refused_everything_is_as_it_was(options: Any) -> None:
+    pairs = [EstimateObservation(gym.make_vec(VISION, 2), "exact-kf") for _ in range(2)]
+    told = np.full((2, 1), 0.1, np.float32)
+    for env in pairs:
+        env.reset(seed=1)
+        env.step(told)
+    with pytest.raises((TypeError, ValueError)):
+        pairs[0].reset(options=options)
+    for step in range(5):
+        ours, theirs = (env.step(told * step)[0] for env in pairs)
+        assert ours.tobytes() == theirs.tobytes()
+    mask = {"reset_mask": np.array([True, False])}
+    one, other = (env.reset(seed=3, options=dict(mask))[0] for env in pairs)
+    assert one.tobytes() == other.tobytes()
+
+
 def test_rows_of_different_scenarios_have_their_own_filters() -> None:
     """Each row has the bits of the single env, wrapped and reset alone."""
     layer: dict[str, Any] = {"estimator": "multirate-kf"}

@@ -12,7 +12,7 @@ from gymnasium.envs.registration import EnvSpec
 
 from sideslip.agents import make_agent
 from sideslip.agents.rollout import rollout
-from sideslip.benchmarks.harness.drives import Drive, facts_of
+from sideslip.benchmarks.harness.drives import Drive, filter_arguments
 from sideslip.benchmarks.tuning.task import make_task, squares
 from sideslip.envs import COMS
 from sideslip.estimators import (
@@ -233,7 +233,7 @@ def test_it_can_be_tuned() -> None:
     assert (task.unit, task.env_id) == ("rad", VISION)
     log = rollout(gym.make(VISION, **FIG7), seed=3, options={"duration": 2.2}).log
     base: Any = gym.make(VISION, **FIG7).unwrapped
-    drives = [Drive(log, facts_of(base))]
+    drives = [Drive(log, filter_arguments(base))]
     assert squares(task, drives, {"gyro": 0.005}) < squares(task, drives, {"gyro": 1.0})
     with pytest.raises(ValueError, match="has no process noise to search; name the options"):
         make_task(UKF, "tie-vision-fig7", seeds=1)

@@ -1,11 +1,14 @@
 """What the suites measure: the papers' claims that are built so far, on few seeds."""
 
+from typing import Any
+
 import gymnasium as gym
 import numpy as np
 import pytest
 
 from sideslip.benchmarks import estimation
 from sideslip.benchmarks.harness.parallel import run_cases
+from sideslip.benchmarks.papers.ledger.filters import filters_for
 
 
 def _ratio(squares: np.ndarray, of: int, to: int) -> float:
@@ -38,6 +41,9 @@ def test_exact_filter_of_the_true_model_is_at_the_bound() -> None:
 
 
 @pytest.mark.parametrize("experiment", estimation.EXPERIMENTS)
-def test_an_experiment_names_what_exists(experiment: estimation.Experiment) -> None:
-    env = gym.make(experiment.env_id, scenario=experiment.scenario)
-    assert env.unwrapped.held_speed == pytest.approx(25 / 3.6)  # type: ignore[attr-defined]
+def test_an_experiments_filters_exist_at_its_speed(experiment: estimation.Experiment) -> None:
+    base: Any = gym.make(experiment.env_id, scenario=experiment.scenario).unwrapped
+    assert base.held_speed == pytest.approx(25 / 3.6)
+    made = filters_for(experiment.filters, base)
+    assert list(made) == [each.label for each in experiment.filters]
+    assert {"exact-kf", "joint"} < {each.name for each in made.values()}
