@@ -7,12 +7,12 @@ both drive seeds on which nothing was chosen. What the evaluations cost is not c
 """
 
 import json
-import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+import typer
 from rich.console import Console
 from rich.table import Table
 
@@ -23,6 +23,7 @@ from ..agents.rungs import NOMINAL, make_rung
 from ..agents.training.keeper import CURVE, POLICY, evaluation_seeds
 from ..agents.training.train import Task, task_in
 from ..envs.record import Array
+from .harness.errors import one_line
 from .harness.stats import geometric_mean, interval, ratio_of_means, won
 
 EPISODES = 4096
@@ -111,7 +112,14 @@ def _curve(folder: Path, nominal: float) -> list[tuple[float, float]]:
     return [(line["cpu_seconds"], line["cost"] / nominal) for line in lines]
 
 
+def main(
+    folders: Annotated[list[Path], typer.Argument(help="Of trainings of one task.")],
+) -> None:
+    """Print how soon trainings reach nominal's cost, and what they cost on further seeds."""
+    for found in (table_of, further):
+        Console().print(found(folders))
+
+
 if __name__ == "__main__":
-    console = Console()
-    console.print(table_of(sys.argv[1:]))
-    console.print(further(sys.argv[1:]))
+    with one_line():
+        typer.run(main)

@@ -21,6 +21,7 @@ from .control.ladder import yardsticks
 from .control.run import measure
 from .control.seeds import seeds_of_contests
 from .control.tables import rows_of, standings
+from .harness.errors import one_line
 from .harness.results import Row, read_json, write_json, write_text
 
 ROWS, README = Path("docs/control.json"), Path("README.md")
@@ -147,4 +148,5 @@ def main(
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    with one_line():
+        typer.run(main)

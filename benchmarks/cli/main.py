@@ -1,11 +1,9 @@
 """The command line: all commands, and `list`, `run` and `bench` themselves."""
 
-import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
-from gymnasium.error import Error as GymnasiumError
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -13,6 +11,7 @@ from rich.table import Table
 from ... import __version__
 from ...envs.arguments import check_choice
 from ..harness.engines import PROCESSES, engine
+from ..harness.errors import one_line
 from ..report.page import check_page, write_page
 from ..suites import SUITES, Request, run_suites
 from .calibrate import calibrate_command
@@ -56,21 +55,10 @@ Options = list[str] | None
 Jobs = Annotated[int | None, typer.Option("--jobs", "-j", min=1, help="Processes.")]
 
 
-_OF_USERS = (
-    ValueError, TypeError, ModuleNotFoundError, OSError, RecursionError, GymnasiumError,
-    FloatingPointError,
-)  # fmt: skip
-
-
 def main() -> None:
     """Entry point of `sideslip`; a user's error is one line and exit status 2."""
-    try:
+    with one_line():
         app()
-    except _OF_USERS as error:
-        Console(stderr=True, soft_wrap=True).print(
-            "[bold red]error:[/]", escape(str(error)), highlight=False
-        )
-        sys.exit(2)
 
 
 def _version(shown: bool) -> None:

@@ -1,6 +1,8 @@
 """Trainings over nominal's cost on the same seeds; what cannot be compared is refused."""
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -99,3 +101,17 @@ def test_what_cannot_be_compared_is_refused(folder: Path, tmp_path: Path) -> Non
             table_of([tmp_path / each for each in two])
     with pytest.raises(FileNotFoundError, match="holds no training"):
         table_of([tmp_path])
+
+
+@pytest.mark.parametrize(
+    ("module", "arguments", "said"),
+    [
+        ("curves", ("nowhere",), "nowhere holds no training to go on with"),
+        ("curves", (), "Missing argument"),
+        ("readme", ("nowhere.json",), "nowhere.json"),
+    ],
+)
+def test_a_mistake_is_no_traceback(module: str, arguments: tuple[str, ...], said: str) -> None:
+    command = [sys.executable, "-m", f"sideslip.benchmarks.{module}", *arguments]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 2 and said in done.stderr and "Traceback" not in done.stderr
