@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from .backend.decorators import jit
+from .backend.decorators import jit, plain
 from .backend.primitives import floor
 
 TICK = 0.001
@@ -19,6 +19,9 @@ def whole_ticks(seconds: Any) -> Any:
 NEVER = -1.0
 
 
+_whole_ticks = plain(whole_ticks)
+
+
 def ticks(seconds: float) -> float:
-    """Whole ticks of a time in seconds."""
-    return float(round(seconds / TICK))
+    """`whole_ticks` without the compiler."""
+    return float(_whole_ticks(seconds))
