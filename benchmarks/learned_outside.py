@@ -108,7 +108,7 @@ def run(
 ) -> Suite:
     """Every class of `KINDS` on every model.
 
-    episodes: of each. quick: the drift model alone. keep: of no use here, nothing is kept. Raises
+    episodes: of each. quick: the drift model alone. The rest is of `control.run.measure`. Raises
     ValueError with the reason where somebody cannot drive.
     """
     suite = Suite(NAME, "Learned policies in cars that are not ours", _TEXT)
@@ -123,7 +123,7 @@ def run(
         for who in contestants(kind)
     ]
     seeds = seeds_of_contests(salt_of(), episodes)
-    results = measure(cells, seeds, jobs=jobs, console=console, by=drive, title=NAME)
+    results = measure(cells, seeds, jobs=jobs, console=console, keep=keep, by=drive, title=NAME)
     found = [
         Found(kind, {each: [everybody(results, outside(kind, each), each)] for each in models})
         for kind in KINDS

@@ -2,6 +2,7 @@
 
 import contextlib
 import hashlib
+import inspect
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
@@ -51,7 +52,7 @@ def measure(
     """Drive every cell on its contest's seeds, slow ones on the first of them.
 
     keep: a folder in which finished cases stay, so that a run that was stopped goes on. by: what
-    drives a chunk instead of `drive`, without that folder. title: of the progress bar.
+    drives a chunk instead of `drive`. title: of the progress bar.
     """
     if not cells:
         return Results()
@@ -63,8 +64,8 @@ def measure(
         for cell, mine in asked.items()
         if first < len(mine)
     ]
-    cached = CachedDrive(keep and keep.absolute())  # a worker of a cluster runs elsewhere
-    driven = run_cases(by or cached, chunks, title, jobs, console)
+    cached = CachedDrive(keep and keep.absolute(), by)  # a worker of a cluster runs elsewhere
+    driven = run_cases(cached, chunks, title, jobs, console)
     parts: dict[Cell, list[Driven]] = {}
     for chunk, each in zip(chunks, driven, strict=True):
         parts.setdefault(chunk.cell, []).append(each)
@@ -84,29 +85,34 @@ def _joined(parts: list[Driven]) -> Driven:
 class CachedDrive:
     """`drive` that looks in a folder first and leaves its result there; None caches nothing.
 
-    Results of other sources, plant and matrix included, or of a policy's other weights, are not
-    taken for ours.
+    by: what drives instead. Results of other sources, plant and matrix included, or of a policy's
+    other weights, are not taken for ours.
     """
 
     folder: Path | None
+    by: Callable[[Chunk], Driven] | None = None
 
     def __call__(self, chunk: Chunk) -> Driven:
         """The chunk's result, from the folder if it is there."""
         if self.folder is None:
-            return drive(chunk)
+            return self._drive(chunk)
         path = self._path(chunk)
-        found = read_case(path, chunk)
+        found = read_case(path, chunk, entire=self.by is None)
         if found is not None:
             return found
-        driven = drive(chunk)
+        driven = self._drive(chunk)
         if not driven.error:  # an error is worth another try
             write_case(path, driven)
         return driven
 
+    def _drive(self, chunk: Chunk) -> Driven:
+        return drive(chunk) if self.by is None else self.by(chunk)
+
     def _path(self, chunk: Chunk) -> Path:
         assert self.folder is not None
         weights = stamp(chunk.cell.controller)
-        text = json.dumps([sources(), weights, chunk.cell.rung, asdict(chunk)], sort_keys=True)
+        own = "" if self.by is None else Path(inspect.getfile(self.by)).read_text()
+        text = json.dumps([sources(), own, weights, chunk.cell.rung, asdict(chunk)], sort_keys=True)
         return self.folder / f"{hashlib.sha256(text.encode()).hexdigest()[:_LENGTH]}.npz"
 
 
@@ -126,8 +132,9 @@ def sources() -> str:
     return digest.hexdigest()
 
 
-def read_case(path: Path, chunk: Chunk) -> Driven | None:
-    """The chunk's result; None where the file is absent, damaged or another chunk's."""
+def read_case(path: Path, chunk: Chunk, entire: bool = True) -> Driven | None:
+    """The chunk's result; None where the file is absent, damaged or another chunk's. entire: with
+    all numbers, and the series that the chunk keeps."""
     shapes: dict[str, tuple[int, ...]] = {
         "numbers": (len(chunk.seeds), len(NUMBERS)),
         "seconds": (),
@@ -135,17 +142,20 @@ def read_case(path: Path, chunk: Chunk) -> Driven | None:
     try:
         with np.load(path, allow_pickle=False) as found:
             arrays = dict(found)
-        if chunk.keep:
+        if chunk.keep and entire:
             shapes["series"] = len(arrays["series"]), 1 + len(SIGNALS)
-        if not all(_fits(arrays[name], shape) for name, shape in shapes.items()):
+        if not all(_fits(arrays[name], shape, entire) for name, shape in shapes.items()):
             return None
     except Exception:  # whatever NumPy, zipfile and zlib find wrong with it
         return None
     return Driven(arrays["numbers"], float(arrays["seconds"]), arrays.get("series"))
 
 
-def _fits(array: npt.NDArray[Any], shape: tuple[int, ...]) -> bool:
-    return array.dtype == np.float64 and array.shape == shape and bool(np.isfinite(array).all())
+def _fits(array: npt.NDArray[Any], shape: tuple[int, ...], entire: bool) -> bool:
+    """Whether these are numbers of that shape, all of them, or all of some columns."""
+    there = np.isfinite(array).all(axis=0)
+    found = there.all() if entire else there.any()
+    return array.dtype == np.float64 and array.shape == shape and bool(found)
 
 
 def write_case(path: Path, driven: Driven) -> None:

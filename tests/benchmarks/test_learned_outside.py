@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from sideslip.benchmarks.control.build import estimate_options
 from sideslip.benchmarks.control.cells import ADAPTIVE, LEARNED, Cell
 from sideslip.benchmarks.control.contests import NOMINAL, PARAMETERS, contests
 from sideslip.benchmarks.control.episodes import NUMBERS, Chunk, Driven
+from sideslip.benchmarks.control.run import CachedDrive, measure
 from sideslip.benchmarks.harness.drives import make_env
 from sideslip.benchmarks.learned import Found, contestants
 from sideslip.benchmarks.learned_outside import KINDS, MANOEUVRE, OUTSIDE_ID, drive, outside
@@ -47,6 +49,24 @@ def test_designers_have_the_outside_car_and_its_actuators_are_the_class_s() -> N
         assert env.action_space.shape == (width,)
         assert env.unwrapped.nominal.mass == outside_vehicle().mass
         assert env.unwrapped.nominal.friction == 0.65
+
+
+def test_a_finished_case_is_found_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Though it has neither series nor all numbers; by another driver it is another case."""
+    cell, driven = Cell(outside("car-yaw", "drift"), "", NOMINAL), list[Chunk]()
+
+    def drive_it(chunk: Chunk) -> Driven:
+        driven.append(chunk)
+        numbers = np.full((len(chunk.seeds), len(NUMBERS)), np.nan)
+        numbers[:, NUMBERS.index("cost")] = 0.5
+        return Driven(numbers, 1.0)
+
+    for _ in range(2):
+        found = measure([cell], (3, 4), jobs=1, keep=tmp_path, by=drive_it).found[cell]
+        assert found.costs.tolist() == [0.5, 0.5]
+    assert len(driven) == 1
+    chunk = Chunk(cell, (3, 4))
+    assert CachedDrive(tmp_path, drive_it)._path(chunk) != CachedDrive(tmp_path, drive)._path(chunk)
 
 
 def test_a_drive_costs_what_the_single_car_s_costs() -> None:
