@@ -1,5 +1,6 @@
 """The episode loop, and an episode as a table of every signal with its unit."""
 
+import contextlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from io import BytesIO
@@ -210,7 +211,8 @@ def rollout(
     env: an environment or its id. agent, options: of `steps_of`; seed: of the reset.
     """
     if isinstance(env, str):
-        env = gym.make(env)
+        with contextlib.closing(gym.make(env)) as made:
+            return rollout(made, agent, seed, options)
     base: Any = env.unwrapped
     layout = env.get_wrapper_attr("layout")
     rows, records = [], []

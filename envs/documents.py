@@ -36,6 +36,15 @@ def read_document(source: "str | os.PathLike[str]", what: str) -> dict[str, Any]
     another ending, and a file that is no TOML or JSON or holds no mapping.
     """
     path = Path(source)
+    values = _parsed(path, what)
+    base = _base_beside(path, values)
+    if base is not None:
+        _check_ends(path, base, what)
+        values["base"] = str(base)
+    return values
+
+
+def _parsed(path: Path, what: str) -> dict[str, Any]:
     kind = path.suffix.lower()
     if kind not in ENDINGS:
         raise ValueError(f"{path}: the file of a {what} ends in {' or '.join(ENDINGS)}")
@@ -55,12 +64,24 @@ def read_document(source: "str | os.PathLike[str]", what: str) -> dict[str, Any]
         raise ValueError(f"{path}: expected a mapping of names to values")
     if not values:
         raise ValueError(f"{path}: the file holds nothing")
-    base = values.get("base")
-    if isinstance(base, str) and (path.parent / base).is_file():
-        if (path.parent / base).samefile(path):
-            raise ValueError(f"{path}: its base is the file itself")
-        values["base"] = str(path.parent / base)
     return values
+
+
+def _base_beside(path: Path, values: Mapping[str, Any]) -> Path | None:
+    """The file beside a file that it names under `base`."""
+    base = values.get("base")
+    found = path.parent / base if isinstance(base, str) else None
+    return found if found is not None and found.is_file() else None
+
+
+def _check_ends(path: Path, base: Path | None, what: str) -> None:
+    """ValueError where a file's base, or the base of that, leads back to one of them."""
+    seen = {path.resolve()}
+    while base is not None:
+        if base.resolve() in seen:
+            raise ValueError(f"{path}: its base is the file itself, or leads back to it")
+        seen.add(base.resolve())
+        base = _base_beside(base, _parsed(base, what)) if base.suffix in ENDINGS else None
 
 
 def write_document(path: "str | os.PathLike[str]", values: Mapping[str, Any]) -> None:
@@ -122,5 +143,5 @@ def check_types(kind: "type[DataclassInstance]", values: Mapping[str, Any], wher
     for name, value in values.items():
         wanted = get_origin(types[name]) or types[name]
         fits = isinstance(value, wanted) or (wanted is float and is_finite(value))
-        if not fits or isinstance(value, bool):
+        if not fits or (isinstance(value, bool) and wanted is not bool):
             raise ValueError(f"{where}: {name} is {brief(value)}, not {wanted.__name__}")

@@ -45,6 +45,11 @@ class Search:
 
     def __init__(self, columns: tuple[int, ...], dt: float) -> None:
         self.columns, self.longest = columns, round(LONGEST / dt)
+        if self.longest < 2:
+            raise ValueError(
+                f"a latency that is looked for is at most {LONGEST:g} s, of which rows every "
+                f"{dt:g} s tell nothing: say the latency in s"
+            )
         self._steps = [max(round(step / dt), 1) for step in STEPS]
         self._looks = [round(look / dt) for look in LOOKS]
         self.lag, self.sd, self.done = 0, np.inf, False

@@ -165,6 +165,13 @@ def positive(name: str, value: float) -> float:
     return float(value)
 
 
+def not_negative(name: str, value: float) -> float:
+    """The value; ValueError unless it is finite and zero or more."""
+    if not 0.0 <= value < math.inf:
+        raise ValueError(f"{name} is a number of zero or more, got {value!r}")
+    return float(value)
+
+
 @jit
 def integrated(integral: Any, step: Any, wanted: Any, limited: Any) -> Any:
     """An integral after a step, which is dropped where it would push further past the limit."""

@@ -14,7 +14,7 @@ from ...envs.vehicle.vehicle import Vehicle
 from ..design.gain_schedule import SPEEDS, cell
 from ..design.nominal_car import nominal_car, plant_of
 from ..env_facts import AnyEnv
-from .base import Array, Controller, entries_of, integrated, positive
+from .base import Array, Controller, entries_of, integrated, not_negative, positive
 
 BANDWIDTH = 16.0  # rad/s
 RELEASE = 0.5  # s, in which the integral is let go within the dead band
@@ -119,7 +119,7 @@ class Esc(Controller):
             np.array([yaw_gains(self.nominal, v, bandwidth) for v in SPEEDS]),
             float(band),
             slip,
-            self.full_scale / slip if stiffness is None else float(stiffness),
+            self.full_scale / slip if stiffness is None else not_negative("stiffness", stiffness),
             int(bounded),
             self.full_scale,
             self.control_period * TICK,

@@ -120,6 +120,11 @@ class Mpc(Lqr):
             self.status.append(status)
             self.solve_time.append(seconds)
 
+    def acted(self, state: Array, action: Any) -> None:
+        """As of `Lqr`; here it is a share of the full steering."""
+        if self.width == 2:
+            state[:, 0] = action[:, 1]
+
     def _solve(
         self, speed: float, z: Array, memory: Array, chosen: Array, most: float
     ) -> tuple[str, float]:

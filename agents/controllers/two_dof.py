@@ -17,7 +17,7 @@ from ...envs.vehicle.vehicle import COMS, Vehicle
 from ..design.nominal_car import CAR, nominal_car, plant_at
 from ..design.pi import COMS_PI, PLACEMENTS, POLE, design_pi, sample_pi
 from ..env_facts import AnyEnv
-from .base import Array, Controller, integrated
+from .base import Array, Controller, integrated, not_negative
 
 SLOWEST = 2.0  # m/s: gains below it are those of this speed
 SPEEDS = np.arange(SLOWEST, 61.0, 0.5)  # m/s
@@ -191,7 +191,9 @@ class TwoDof(Controller):
         period = self.control_period * TICK
         wait = 1 if rate == "control" else max(1, math.ceil(CAMERA_PERIOD / period - 1e-9))
         dt = wait * period
-        table = _pi_table(self.nominal, gain, pole, placement, dt if sampled else None)
+        table = _pi_table(
+            self.nominal, not_negative("gain", gain), pole, placement, dt if sampled else None
+        )
         self.k_p, self.k_i = np.ascontiguousarray(table.T)
         car = nominal_car(self.nominal)
         follows = int(feedforward == FEEDFORWARDS[0])

@@ -45,7 +45,8 @@ class Case:
     @property
     def path(self) -> Path:
         """The file of the finished case; other sources or another question give another name."""
-        asked = [asdict(self.contest), self.seed, sources(), __version__]
+        rung = oracle_of(self.contest)  # with which the search begins
+        asked = [asdict(self.contest), rung, self.seed, sources(), __version__]
         digest = hashlib.sha256(json.dumps(asked).encode()).hexdigest()
         return Path(self.folder) / f"{digest[:24]}.json"
 

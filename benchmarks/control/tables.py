@@ -67,11 +67,9 @@ class Standing:
         if self.pairs:
             found["cost_vs_nominal"] = geometric_mean(*(-r for r, _ in self.pairs.values()))
             found["score"] = score(list(self.pairs.values()))
-            yards = {c: self.yards[c].nominal.costs for c in self.pairs}
-            mine = np.concatenate([self.driven[c].costs[: len(yards[c])] for c in yards])
-            nominal = np.concatenate([yards[c][: len(self.driven[c].costs)] for c in yards])
-            found["share_won"] = won(mine, nominal)
-            found["worst_cost"] = worst(mine)
+            kept = zip(*map(self._kept, self.pairs), strict=True)
+            found["share_won"] = won(*map(np.concatenate, kept))
+            found["worst_cost"] = worst(np.concatenate([self.driven[c].costs for c in self.pairs]))
         return found
 
     @property
@@ -101,17 +99,21 @@ class Standing:
         ]
         return float(np.mean(means)) if means else float("nan")
 
+    def _kept(self, contest: Contest) -> tuple[Array, Array]:
+        """(its costs, nominal's) of the episodes that count."""
+        costs, yard = self.driven[contest].costs, self.yards[contest]
+        kept = yard.kept(len(costs))
+        return costs[: len(kept)][kept], yard.nominal.costs[: len(kept)][kept]
+
     def _metrics(self, contest: Contest) -> dict[str, Estimate]:
         driven = self.driven[contest]
         found = {"failure_rate": share(~survived(driven)), "worst_cost": worst(driven.costs)}
         if contest in self.pairs:
             r, own = self.pairs[contest]
-            nominal = self.yards[contest].nominal.costs
-            n = min(len(nominal), len(driven.costs))
             found["cost_vs_nominal"] = geometric_mean(-r)
             found["score"] = score([(r, own)])
             found["gap"] = average(own)
-            found["share_won"] = won(driven.costs[:n], nominal[:n])
+            found["share_won"] = won(*self._kept(contest))
         for metric in EPISODE:
             if metric.name != "failure":
                 found[metric.name] = average(driven[metric.name])

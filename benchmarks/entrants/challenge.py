@@ -164,6 +164,10 @@ class Challenge:
             data = options | {"scenario": scenario.to_dict()}
             tier = _CAR if car else _COMS
             own = [Contest("", *driven, scenario.name) for driven in TIERS[tier]]
+            if any(found.get(contest, data) != data for contest in self._allowed(own)):
+                raise ValueError(
+                    f"two scenarios are called {scenario.name!r}: give each a name of its own"
+                )
             found |= {contest: data for contest in self._allowed(own)}
         return found
 

@@ -21,7 +21,7 @@ from .cases import ALONE, FILTER, ID, PPO, Case
 
 FIRST_SEED = 2**30
 NOISE = 0.3  # of what shakes the teacher in the first round
-OURS = ("measure",)  # with the agents and the case all that its numbers depend on
+OURS = ("measure", "cases")  # with the agents and the case all that its numbers depend on
 _LETTERS = 24  # of a kept case's name
 
 

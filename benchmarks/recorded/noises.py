@@ -13,6 +13,7 @@ from .emulate import ground_speed, heading
 WIDE = "its interval is too wide"
 BLOCKS = 20  # of a log, which the intervals take for independent
 LATE = (-0.2, 1.2)  # s, of the GPS
+_COURSE, _SPEED = range(2)  # places in its values
 LATE_WITHIN = 0.05  # s, half of the widest interval of a latency
 _FAST = {"gyro": "rad/s", "accel_y": "m/s2", "roll_rate": "rad/s", "wheel_left": "m/s"}
 
@@ -60,7 +61,8 @@ def _fixes(log: Log, value: int, signal: Array, part: Array, times: Array) -> li
     rows, place = packets[:, PACKET.captured] - log.record.first, np.arange(float(len(signal)))
     earlier = rows[:, None] - times / log.record.dt
     d = np.diff(packets[:, PACKET.value + value, None] - np.interp(earlier, place, signal), axis=0)
-    d = (d + math.pi) % (2.0 * math.pi) - math.pi  # courses are within a turn
+    if value == _COURSE:
+        d = (d + math.pi) % (2.0 * math.pi) - math.pi  # within a turn
     p = np.diff(np.interp(earlier, place, part), axis=0)
     usual = np.diff(rows) <= 1.5 * np.median(np.diff(rows))
     inside = (earlier[1:].min(axis=1) > 0.0) & (earlier[1:].max(axis=1) < place[-1])
@@ -107,9 +109,9 @@ def sensor_findings(
             noise |= {f"{channel.removesuffix('_left')}_noise": sd} if told else {}
     times = np.arange(*LATE, max(logs[0].record.dt, 0.01))
     pairs = [pair for pair in zip(logs, slips, strict=True) if "gps" in pair[0].slow]
-    courses = [b for log, slip in pairs for b in _fixes(log, 0, heading(log), slip, times)]
+    courses = [b for log, slip in pairs for b in _fixes(log, _COURSE, heading(log), slip, times)]
     speeds = [
-        b for log, _ in pairs for b in _fixes(log, 1, ground_speed(log), 0.0 * log.time, times)
+        b for log, _ in pairs for b in _fixes(log, _SPEED, ground_speed(log), 0.0 * log.time, times)
     ]
     if not courses:
         return findings, noise, {}

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...envs.arguments import is_finite
+from ...envs.arguments import brief, check_choice, is_finite
 from ...envs.documents import is_document, read_document, write_document
 from ...envs.record import FAST, PACKET, Log
 from ...envs.sensors.slow import SLOW_NAMES
@@ -18,6 +18,10 @@ from ...estimators.design.options import FAST_CHANNELS, columns_of
 CHANNELS = (*FAST_CHANNELS, *SLOW_NAMES)
 """What may be late."""
 MOST_LATE = 5.0  # s
+NOISES = [
+    f"{name}_noise" for name in ("gyro", "accel_y", "roll_rate", "wheel", "course", "gps_speed")
+]
+"""Of what `identify` finds the standard deviation."""
 
 
 class Wires(NamedTuple):
@@ -49,6 +53,10 @@ class Wires(NamedTuple):
                     f"a latency is CHANNEL=S, {least:g} to {MOST_LATE:g} s, of "
                     f"{', '.join(CHANNELS)}; got {channel}={late}"
                 )
+        for name, value in self.noise.items():
+            check_choice("noise", name, NOISES)
+            if not (is_finite(value) and value > 0.0):
+                raise ValueError(f"noise {name} is a number above zero, got {brief(value)}")
         return self
 
 

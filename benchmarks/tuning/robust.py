@@ -22,7 +22,7 @@ from rich.console import Console
 from ...agents.rollout import rollout
 from ...envs.backend.cache import source_stamp
 from ...envs.record import FAST, Array, Log
-from ...envs.vehicle.vehicle import Vehicle
+from ...envs.vehicle.vehicle import GRAVITY, Vehicle
 from ...estimators.make import make_estimator
 from ..harness.drives import SETTLED, Drive, quietly
 from ..harness.parallel import run_cases
@@ -34,7 +34,6 @@ PLANTS = ("", "drift", "multi-body")
 """Of a drive: ours, then CommonRoad's."""
 EVERY = 10  # ticks between two rows of a log
 LASTS = 30.0  # s
-GRAVITY = 9.81
 LATE = Emulation(delay=0.2)
 SPACE: dict[str, Range] = {
     "inverse_friction_sd": (0.02, 0.6),

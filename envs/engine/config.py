@@ -108,8 +108,9 @@ class EnvConfig:
             raise ValueError(f"control_period is 1 to 1000 ticks, got {brief(n)}")
         if not isinstance(self.fast, str) or self.fast not in ("summary", "all"):
             raise ValueError(f"fast is 'summary' or 'all', got {brief(self.fast)}")
-        if not isinstance(self.steering, bool):
-            raise TypeError(f"steering is True or False, got {brief(self.steering)}")
+        for name in ("steering", "yaw_first"):
+            if not isinstance(getattr(self, name), bool):
+                raise TypeError(f"{name} is True or False, got {brief(getattr(self, name))}")
         bad = self.on_bad_action
         if not isinstance(bad, str) or bad not in ("raise", "fail"):
             raise ValueError(f"on_bad_action is 'raise' or 'fail', got {brief(bad)}")
@@ -176,7 +177,7 @@ class EnvConfig:
         """An episode with options of reset; ValueError for an unknown option or state."""
         if not options:
             return self.base
-        unknown = sorted(set(options) - set(OPTIONS))
+        unknown = sorted(map(str, set(options) - set(OPTIONS)))
         if unknown:
             raise ValueError(
                 f"unknown reset option {', '.join(unknown)}; known: {', '.join(OPTIONS)}"

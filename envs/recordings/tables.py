@@ -48,7 +48,9 @@ def read_table(path: Path) -> "pd.DataFrame":
                 low_memory=False,
                 compression=None,
             )
-    except (ValueError, OSError) as error:  # what pandas' and pyarrow's own errors derive from
+    except MemoryError:
+        raise
+    except Exception as error:  # of scipy and asammdf anything, where a file is damaged
         reason = "it is not text" if isinstance(error, UnicodeDecodeError) else str(error).strip()
         raise ValueError(
             f"{path}: expected CSV, Parquet, MATLAB or MDF, but {reason:.300}"

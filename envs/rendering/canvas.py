@@ -15,7 +15,7 @@ from ..backend.extras import extra
 
 os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
 with extra("render", "pictures need pygame"):
-    import pygame
+    import pygame as pygame  # the other files of the room take it from here
 
 Points = npt.ArrayLike
 """Places, (n, 2)."""

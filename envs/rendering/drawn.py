@@ -33,6 +33,7 @@ class Drawn:
     """
 
     _our_tyres = True  # tyre forces can be drawn
+    _shown = False  # in a window
     control_period: int
     render_mode: str | None
     metadata: dict[str, Any] = {"render_modes": list(MODES), "render_fps": 100}  # noqa: RUF012
@@ -69,6 +70,7 @@ class Drawn:
         between = n * max(-(-_SHOWN // n), 1)
         if int(now.state[Z.clock.tick]) % between == 0:
             window.show(picture.draw(now), 1.0 / (between * TICK))
+            self._shown = True
 
     def shot(self, row: int = 0) -> Shot:
         """What a car's picture is drawn from."""
@@ -99,7 +101,7 @@ class Drawn:
         return int(getattr(self, "num_envs", 1))
 
     def _close_window(self) -> None:
-        if self.render_mode == "human":
+        if self.render_mode == "human" and self._shown:
             from .window import close
 
             close()

@@ -3,13 +3,11 @@
 import math
 from collections.abc import Iterable, Sequence
 
-import pygame
-
 from ..engine.layout import FLAGS, P
 from ..task.failures import FAILURES
 from ..task.reference import ZERO_SLIP
 from ..ticks import TICK
-from .canvas import Canvas
+from .canvas import Canvas, pygame
 from .closeup import PAPER, draw_closeup
 from .palette import GREY, INK, PALETTE, colour
 from .road import BLUE, ORANGE, SOFT, Driven, draw_road

@@ -3,7 +3,7 @@
 import functools
 import os
 
-import pygame
+from .canvas import pygame
 
 _NO_WINDOW = ("offscreen", "dummy")  # SDL's drivers that show nothing
 

@@ -1,14 +1,16 @@
 """What a scenario's fields may be; a value out of place is refused by its field's name."""
 
+import dataclasses
 import math
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from ..arguments import brief, check_choice, is_finite, listed
+from ..arguments import brief, check_choice, is_finite, listed, unknown_names
 from ..sensors.gps import HDOP_LAWS
 from ..sensors.noise import Noise
 from ..ticks import TICK
 from ..vehicle.tyres import TYRE_LAWS
+from ..vehicle.vehicle import Vehicle
 from .draws import Draws, range_of
 from .roads import ROADS
 from .steering import STEERING_KINDS
@@ -31,6 +33,7 @@ _CHOICES = {
     "tyres": TYRE_LAWS,
     "tier": TIER_NAMES,
 }
+_PARAMETERS = [each.name for each in dataclasses.fields(Vehicle)]
 _FLAGS = ("mirror", "small_angle", "lags", "roll")
 _NUMBERS_OR_NONE = ("acceleration", "gps_period")
 _MAY_BE_INFINITE = ("half_width", "camera_heading", "camera_offset")
@@ -46,7 +49,6 @@ _POSITIVE = (
     "half_width",
     "camera_heading",
     "camera_offset",
-    "change_length",
     "surge_frequency",
     "hdop",
     "hdop_time",
@@ -67,7 +69,8 @@ _POSITIVE_OR_NONE = ("path_speed", "friction_right", "tyre_change_time")
 
 
 def check(fields: Fields, numbers: Iterable[str]) -> None:
-    """ValueError for a field out of place, with the scenario's name and the field's.
+    """ValueError for a field out of place, TypeError for a vehicle's parameter that there is not,
+    with the scenario's name and the field's.
 
     numbers: the fields that are one number, neither drawn nor None.
     """
@@ -79,8 +82,8 @@ def check(fields: Fields, numbers: Iterable[str]) -> None:
         _check_motion(fields)
         _check_sensors(fields)
         _check_trace(fields)
-    except ValueError as error:
-        raise ValueError(f"scenario {brief(fields['name'])}: {error}") from None
+    except (TypeError, ValueError) as error:
+        raise type(error)(f"scenario {brief(fields['name'])}: {error}") from None
 
 
 def _check_names(fields: Fields) -> None:
@@ -99,6 +102,8 @@ def _check_names(fields: Fields) -> None:
         raise ValueError("road 'nominal-path' follows a programme's steering, not a driver's")
     if fields["road"] == "nominal-path" and range_of(fields["curvature"]) != (0.0, 0.0):
         raise ValueError(f"road 'nominal-path' has no curvature, got {fields['curvature']!r}")
+    if not fields["change_length"] >= TICK:
+        raise ValueError(f"change_length is {TICK:g} s at least, got {fields['change_length']!r}")
     if fields["path_speed"] is not None and fields["path"] == "road":
         raise ValueError("path_speed needs a track as path; a road has no lengths to scale")
 
@@ -121,6 +126,8 @@ def _check_mappings(fields: Fields) -> None:
         values = fields[name]
         if not isinstance(values, Mapping) or not all(isinstance(key, str) for key in values):
             raise ValueError(f"{name} is a mapping of names to numbers, got {brief(values)}")
+        if name != "noise" and (unknown := [key for key in values if key not in _PARAMETERS]):
+            raise TypeError(unknown_names(f"parameter of {name}", unknown, _PARAMETERS))
     unknown = sorted(set(fields["noise"]) - set(Noise._fields))
     if unknown:
         raise ValueError(f"unknown noise {listed(unknown)}; known: {listed(Noise._fields)}")

@@ -1,9 +1,4 @@
-"""What a scenario does over time: steering and wind; and its draws, realised from a key.
-
-A scenario names a range for each quantity of `Draws`. `realise` turns a 64-bit key into numbers
-within the ranges and writes them into the packed parameters, in compiled code, so that a batch
-can reset its rows without Python.
-"""
+"""The steering programmes: the driver's angle at a time, from numbers that were drawn."""
 
 from typing import Any
 

@@ -40,4 +40,4 @@ def trace_from(path: str | os.PathLike[str], mapping: Mapping[str, str] | None =
         trace_step=step,
         duration=round((len(trace) - 1) * step, 9),
     )
-    return made.replace(speed=float(known[0])) if len(known) else made
+    return made.replace(speed=max(float(known[0]), 0.0)) if len(known) else made  # noise at rest

@@ -8,7 +8,7 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from ..arguments import mapping_of
+from ..arguments import mapping_of, unknown_names
 from ..backend.decorators import jit
 from ..backend.elementary import exp
 from ..backend.primitives import whole
@@ -102,12 +102,16 @@ SENSOR_SETS: dict[str, dict[str, SlowSensor]] = {
 def with_changes(
     sensors: dict[str, SlowSensor], changes: Mapping[str, Mapping[str, Any] | None]
 ) -> dict[str, SlowSensor]:
-    """The sensors with some of their fields replaced; ValueError for a sensor that is absent."""
+    """The sensors with some of their fields replaced; ValueError for a sensor that is absent,
+    TypeError for a field that it has not."""
     changed = dict(sensors)
     for name, fields in changes.items():
         if fields is None:
             continue
         if name not in sensors:
             raise ValueError(f"this id has no {name}; it has: {', '.join(sensors)}")
-        changed[name] = dataclasses.replace(sensors[name], **mapping_of(name, fields))
+        known = [field.name for field in dataclasses.fields(sensors[name])]
+        if unknown := [each for each in mapping_of(name, fields) if each not in known]:
+            raise TypeError(unknown_names(f"number of the {name}", unknown, known))
+        changed[name] = dataclasses.replace(sensors[name], **fields)
     return changed

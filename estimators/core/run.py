@@ -190,7 +190,8 @@ def advance(
 ) -> int:
     """Take the fast rows from `start` to `rows` and the first `count` packets.
 
-    layers: (1,) or (2,), the second measures what the first estimates. gains: of the first layer.
+    layers: (1,); (2,), of which the second measures what the first estimates; or a bank, the
+    mixture and its members. gains: of the first layer.
     fast: (rows or more, FAST_WIDTH). packets: (count or more, PACKET_WIDTH). X, S: (rows, n) to be
     filled with states and standard deviations, or empty. nis: (count,) to be filled with each
     packet's normalised innovation squared, or empty. Returns the rows done: fewer than `rows` where

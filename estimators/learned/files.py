@@ -8,6 +8,7 @@ from typing import Any
 from safetensors.numpy import save
 
 from ...envs.backend.files import write_whole
+from ...envs.documents import made_of
 from ..filters import FILTERS
 from .network import Network
 from .network_file import ENDING, architecture_of, json_object, network_of, read_tensors, tensors_of
@@ -51,6 +52,9 @@ class CorrectionCard:
             raise ValueError(f"a correction's base is {', '.join(known)}, got {self.base!r}")
         if not isinstance(self.states, list | tuple) or "beta" not in self.states:
             raise ValueError(f"a correction reads its filter's beta, got states {self.states!r}")
+        told = sorted({"vehicle", "sensors", "dt", "speed"} & self.base_options.keys())
+        if told:
+            raise ValueError(f"base_options hold what the env tells a filter: {', '.join(told)}")
 
     @property
     def inputs(self) -> int:
@@ -109,7 +113,7 @@ def load_correction(path: str | Path) -> Correction:
         architecture = content.pop("network", None)
         if content.keys() != {each.name for each in fields(CorrectionCard)}:
             raise ValueError(f"the card has other fields than a correction's: {sorted(content)}")
-        card = CorrectionCard(**content)
+        card = made_of(CorrectionCard, content, "the card")
         return Correction(card, network_of(architecture, card.inputs, tensors))
     except ValueError as error:
         raise ValueError(f"{found}: {error}") from None

@@ -65,12 +65,18 @@ def test_arguments(arguments: Arguments, error: type[Exception], message: str) -
         StabilityEnv(**arguments)
 
 
+def test_a_sensor_s_number_is_named() -> None:
+    with pytest.raises(TypeError, match="unknown number of the camera 'perod'; did you mean 'per"):
+        gymnasium.make("sideslip/YawVision-v0", camera={"perod": 0.05})
+
+
 def test_a_camera_argument_on_the_gps_id() -> None:
     with pytest.raises(ValueError, match="this id has no camera; it has: gps"):
         gymnasium.make("sideslip/YawGps-v0", camera={"period": 0.05})
 
 
 OPTIONS: list[tuple[Arguments, type[Exception], str]] = [
+    ({3: 1}, ValueError, "unknown reset option 3; known"),  # type: ignore[dict-item]
     ({"speed": 5.0}, ValueError, "unknown reset option speed; known: scenario, vehicle, friction"),
     ({"state": {"beta": 0.1}}, ValueError, "unknown state beta; known: v_x, v_y, gamma"),
     ({"state": {"v_y": math.nan}}, ValueError, "reset option state: v_y is nan"),

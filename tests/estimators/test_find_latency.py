@@ -8,6 +8,7 @@ import pytest
 
 from sideslip.envs.record import FAST, PACKET, PACKET_WIDTH, Log, Record
 from sideslip.estimators import make_estimator
+from sideslip.estimators.find_latency import Search
 from tests.estimators.simulation import CAMERA, FIG7, simulate
 from tests.estimators.test_late import later
 
@@ -45,6 +46,12 @@ def test_it_finds_the_latency_whatever_the_tyres(tyres: tuple[float, float], lat
             for each in (estimates, punctual)
         ]
         assert squares[0] < 1.2 * squares[1]
+
+
+@pytest.mark.parametrize("dt", [0.1, 0.25])
+def test_rows_too_far_apart_are_refused(dt: float) -> None:
+    with pytest.raises(ValueError, match=f"rows every {dt:g} s tell nothing: say the latency"):
+        Search((FAST.gyro,), dt)
 
 
 def straight(rows: int) -> Log:

@@ -1,7 +1,7 @@
 """A simulation of the ledger: seeds in cases, and the numbers that they give.
 
 A simulation is data and gives the same `Measured` whatever it is: filters over one drive
-(`estimation`), controllers over the same manoeuvre (`controlled`), or a computation without a car
+(`filters`), controllers over the same manoeuvre (`controllers`), or a computation without a car
 (`Analysis`).
 """
 

@@ -242,5 +242,9 @@ def test_another_action_costs_what_the_curvature_says_and_moves_the_rate_limit()
     agent.acted(memory, np.array([[0.0, 0.5]], np.float32))
     taken, _ = agent.predict(obs, memory)
     assert memory[0, 0] == pytest.approx(0.5 * agent.authority)
+    planner = make_agent("mpc", env)
+    memory, most = np.zeros((1, planner.memory)), np.array([[0.0, 1.0]], np.float32)
+    planner.acted(memory, most)
     step = COMS.steering_rate * 0.01 / agent.authority
+    assert planner.predict(obs, memory)[0][1] > 1.0 - step - 1e-6
     assert abs(free[1]) <= step + 1e-6 and abs(taken[1] - 0.5) <= step + 1e-6

@@ -70,6 +70,17 @@ def test_the_best_come_first_with_their_numbers() -> None:
     assert standing[1].n == 80 and standing[1].excluded == 0
 
 
+def test_won_are_episodes_that_count() -> None:
+    """Of those that nominal fails nothing is compared, cheap as they may be."""
+    found = results(nominal=8)
+    for cell, driven in found.found.items():
+        if cell.controller == "lqr":
+            driven.numbers[:8, COST] = 1e3  # lost, where nominal fails
+    lqr = next(each for each in table(found) if each.cell.controller == "lqr")
+    assert lqr.n == 64 and lqr.overall["share_won"].value == 1.0
+    assert all(each["share_won"].value == 1.0 for each in lqr.by_contest.values())
+
+
 def test_failures_are_of_all_episodes_and_rank_where_nominal_fails_often() -> None:
     some = results(nominal=2, lqr=3)
     standing = {each.label: each for each in table(some)}

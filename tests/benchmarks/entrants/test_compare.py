@@ -236,6 +236,10 @@ def test_contests_are_those_of_the_id() -> None:
     assert scored and set(scored) <= set(contests())
     own = Challenge(esc, vehicle="passenger-car", scenarios=("gust",)).contests
     assert {contest.reference for contest in own} == {"lagged"}
+    gusts = [{"base": "gust", "name": name, "duration": s} for name, s in (("a", 1.0), ("b", 2.0))]
+    assert len(Challenge(esc, scenarios=tuple(gusts)).contests) == 4
+    with pytest.raises(ValueError, match="two scenarios are called 'b': give each a name"):
+        assert Challenge(esc, scenarios=(*gusts, gusts[0] | {"name": "b"})).contests
 
 
 def test_a_users_agent_has_nominals_filter(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -52,6 +52,7 @@ def test_a_file_starts_from_a_name_or_a_file_beside_it(tmp_path: Path) -> None:
         ('steering = "trace"\ntrace = [0.1, nan]', ValueError, "trace is angles in rad, finite"),
         ('steering = "trace"\ntrace = [0, 1]\ntrace_step = 0', ValueError, "trace_step is 0.001"),
         ('base = "bad.toml"', ValueError, "its base is the file itself"),
+        ('base = "good.toml"', ValueError, "its base is the file itself, or leads back to it"),
         ("", ValueError, "holds nothing"),
     ],
 )
@@ -60,6 +61,7 @@ def test_a_bad_file_is_refused(
 ) -> None:
     path = tmp_path / "bad.toml"
     path.write_text(content)
+    (tmp_path / "good.toml").write_text('base = "bad.toml"')
     with pytest.raises(error, match=message) as caught:
         scenario_from(path)
     assert str(path) in str(caught.value)
