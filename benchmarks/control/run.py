@@ -15,7 +15,7 @@ import numpy.typing as npt
 from rich.console import Console
 
 from ...agents.learned.files import stamp
-from ...envs.backend.cache import source_stamp
+from ...envs.backend.cache import experiment_stamp
 from ...envs.backend.files import whole
 from ..harness.parallel import run_cases
 from .cells import SLOW_EPISODES, Cell
@@ -119,7 +119,7 @@ class CachedDrive:
 @cache
 def sources() -> str:
     """A hash of all files that an episode's numbers depend on, tuned options and weights too."""
-    digest = hashlib.sha256((source_stamp("agents") + salt_of()).encode())
+    digest = hashlib.sha256((experiment_stamp() + salt_of()).encode())
     for name in (
         "build.py",
         "cells.py",

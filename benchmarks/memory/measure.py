@@ -13,7 +13,7 @@ import gymnasium as gym
 import numpy as np
 
 from ...agents.optimum import Lqg, Optimum, estimated
-from ...envs.backend.cache import source_stamp
+from ...envs.backend.cache import experiment_stamp
 from ...envs.backend.files import whole
 from ...envs.record import Array
 from ..harness.stats import Estimate, interval
@@ -134,7 +134,7 @@ class Kept:
         if self.folder is None:
             return measured(case)
         ours = "".join((Path(__file__).parent / f"{name}.py").read_text() for name in OURS)
-        text = source_stamp("agents") + ours + json.dumps(asdict(case) | case.options)
+        text = experiment_stamp() + ours + json.dumps(asdict(case) | case.options)
         path = self.folder / f"{hashlib.sha256(text.encode()).hexdigest()[:_LETTERS]}.npz"
         with contextlib.suppress(Exception), np.load(path, allow_pickle=False) as there:
             return Found(*(there[name] for name in Found._fields))  # damaged: measured anew

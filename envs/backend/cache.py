@@ -24,6 +24,7 @@ QUIET = "SIDESLIP_QUIET"
 _PACKAGE = Path(__file__).resolve().parents[2]
 LAYERS = ("envs", "estimators", "agents", "benchmarks")  # each calls only those before it
 _NOT_COMPILED = ("rendering", "highway")
+_DATA = (".toml", ".json")
 _VERSIONS = 12  # of the sources whose kernels stay on disk
 
 _logger = logging.getLogger("sideslip.compiler")
@@ -63,6 +64,16 @@ def source_stamp(layer: str = LAYERS[-1]) -> str:
                 digest.update(str(path.relative_to(_PACKAGE)).encode())
                 digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
+
+
+def experiment_stamp() -> str:
+    """The hash of all that a drive's numbers depend on but tuned options and weights: the sources
+    below the benchmarks, the ids with their options, and the cars and cameras in files."""
+    digest = hashlib.sha256(source_stamp("agents").encode())
+    files = [path for path in (_PACKAGE / "envs").rglob("*.*") if path.suffix in _DATA]
+    for path in [_PACKAGE / "__init__.py", *sorted(files)]:
+        digest.update(str(path.relative_to(_PACKAGE)).encode() + path.read_bytes())
+    return digest.hexdigest()
 
 
 @functools.cache

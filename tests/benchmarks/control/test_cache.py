@@ -14,6 +14,7 @@ from sideslip.benchmarks.control.cells import Cell
 from sideslip.benchmarks.control.contests import Contest
 from sideslip.benchmarks.control.episodes import Chunk, Driven
 from sideslip.benchmarks.control.run import CachedDrive
+from sideslip.envs.backend import cache
 
 SEEDS = (3, 4, 5)
 NUMBERS, SIGNALS = len(episodes.NUMBERS), 1 + len(episodes.SIGNALS)
@@ -88,6 +89,22 @@ def test_a_damaged_case_is_driven_again(
         assert found.series is not None and np.array_equal(found.series, series)
     assert len(driven) == 2
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_other_options_of_an_id_and_another_car_s_file_are_another_case(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A scratch package: an id's options stand at its root, cars and cameras in files."""
+    monkeypatch.setattr(cache, "_PACKAGE", tmp_path)
+    (tmp_path / "__init__.py").write_text("a")
+    seen = [cache.experiment_stamp()]
+    for path in ("__init__.py", "envs/vehicle/car.toml", "envs/camera.json", "envs/tick.py"):
+        (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / path).write_text("b")
+        seen.append(cache.experiment_stamp())
+    assert len(set(seen)) == 5
+    (tmp_path / "envs/notes.txt").write_text("b")
+    assert cache.experiment_stamp() == seen[-1]
 
 
 def test_other_tuned_options_are_another_case(
