@@ -20,7 +20,7 @@ from rich.console import Console
 from ... import __version__
 from ...agents.rungs import NOMINAL, RUNGS
 from ...agents.tuned import Options
-from ...envs.backend.cache import source_stamp
+from ...envs.backend.cache import experiment_stamp
 from ...envs.record import Array
 from ..control.cells import ADAPTIVE, REFERENCE_FILTER, Cell
 from ..control.contests import Contest, candidates, contests
@@ -54,7 +54,7 @@ class Contestant:
     @property
     def study(self) -> str:
         """The study's name: the same for the same question asked of the same sources."""
-        stamp = f"{json.dumps(asdict(self), default=str)} {source_stamp('agents')} {__version__}"
+        stamp = f"{json.dumps(asdict(self), default=str)} {experiment_stamp()} {__version__}"
         digest = hashlib.sha256(stamp.encode()).hexdigest()[:12]
         return f"{self.name} in {self.kind} {digest}"
 
