@@ -48,7 +48,7 @@ def read_table(path: Path) -> "pd.DataFrame":
                 low_memory=False,
                 compression=None,
             )
-    except MemoryError:
+    except (MemoryError, ImportError):
         raise
     except Exception as error:  # of scipy and asammdf anything, where a file is damaged
         reason = "it is not text" if isinstance(error, UnicodeDecodeError) else str(error).strip()

@@ -102,8 +102,6 @@ def _check_names(fields: Fields) -> None:
         raise ValueError("road 'nominal-path' follows a programme's steering, not a driver's")
     if fields["road"] == "nominal-path" and range_of(fields["curvature"]) != (0.0, 0.0):
         raise ValueError(f"road 'nominal-path' has no curvature, got {fields['curvature']!r}")
-    if not fields["change_length"] >= TICK:
-        raise ValueError(f"change_length is {TICK:g} s at least, got {fields['change_length']!r}")
     if fields["path_speed"] is not None and fields["path"] == "road":
         raise ValueError("path_speed needs a track as path; a road has no lengths to scale")
 
@@ -189,6 +187,8 @@ def _check_motion(fields: Fields) -> None:
     slowest = range_of(fields["speed"])[0]
     if slowest < 0.0 or slowest + fields["speed_change"] < 0.0:
         raise ValueError("speed must not be negative, with speed_change or without")
+    if not fields["change_length"] >= TICK:
+        raise ValueError(f"change_length is {TICK:g} s at least, got {fields['change_length']!r}")
     if fields["acceleration"] is not None and (fields["speed_change"] or fields["surge"]):
         raise ValueError("speed_change and surge need the held speed (acceleration None)")
     if fields["path_speed"] is not None and slowest <= 0.0:

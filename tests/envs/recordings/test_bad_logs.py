@@ -119,7 +119,6 @@ def test_a_bad_table_gets_one_clear_error(tmp_path: Path, spoil: Spoiler, messag
         (b"\x89PNG\r\n\x1a\n" + b"\xfe\xfd" * 99, "it is not text"),
         (b"PAR1 but not for long", "expected CSV, Parquet, MATLAB or MDF"),
         (b"MATLAB 5.0 MAT-file" + b" " * 81, "expected CSV, Parquet, MATLAB or MDF"),
-        (b"MDF     4.10    ours" + bytes(400), "expected CSV, Parquet, MATLAB or MDF"),
         (b"time_s,steer_rad\n1,2\n1,2,3,4\n", "expected CSV, Parquet, MATLAB or MDF"),
     ],
 )
