@@ -8,15 +8,13 @@ from .backend.primitives import floor
 TICK = 0.001
 """The base tick of the simulated car in seconds."""
 FOREVER = 1e15  # ticks
+NEVER = -1.0
 
 
 @jit
 def whole_ticks(seconds: Any) -> Any:
     """Whole ticks of a time in seconds."""
     return floor(seconds / TICK + 0.5)
-
-
-NEVER = -1.0
 
 
 _whole_ticks = plain(whole_ticks)
