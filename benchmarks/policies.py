@@ -68,13 +68,10 @@ def enjoy(
     home, shown, reference, options = _task(loaded, env_id, scenario)
     salt = loaded.salt if seed is None else ""
     seeds = salted_seeds(salt, episodes) if seed is None else list(range(seed, seed + episodes))
-    rivals = f"{CLASSICAL} on {FILTER}", "none"
+    rivals = {f"{CLASSICAL} on {FILTER}": (FILTER, CLASSICAL), "none": ("", "none")}
     if loaded.name in rivals:
         raise ValueError(f"the policy's file is called {loaded.name!r}, as what it is held against")
-    contestants = {
-        loaded.name: (loaded.card.estimator, policy),
-        **dict(zip(rivals, ((FILTER, CLASSICAL), ("", "none")), strict=True)),
-    }
+    contestants = {loaded.name: (loaded.card.estimator, policy)} | rivals
     cells = {
         name: Cell(Contest(env_id=home, scenario=shown), estimator, who, options)
         for name, (estimator, who) in contestants.items()

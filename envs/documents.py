@@ -81,7 +81,7 @@ def _check_ends(path: Path, base: Path | None, what: str) -> None:
         if base.resolve() in seen:
             raise ValueError(f"{path}: its base is the file itself, or leads back to it")
         seen.add(base.resolve())
-        base = _base_beside(base, _parsed(base, what)) if base.suffix in ENDINGS else None
+        base = _base_beside(base, _parsed(base, what)) if ends_in(base, ENDINGS) else None
 
 
 def write_document(path: "str | os.PathLike[str]", values: Mapping[str, Any]) -> None:

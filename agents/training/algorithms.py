@@ -27,7 +27,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from ...envs.arguments import check_choice
+from ...envs.arguments import check_choice, is_finite
 from ...envs.backend.extras import extra
 from .export import activations
 from .normalise import Scaling, Standardised  # first: it says which extra is missing
@@ -110,23 +110,13 @@ def settings_of(algo: str, env_id: str, file: str | Path | None = None) -> Setti
     return dict(found)
 
 
-def _default(arguments: Mapping[str, inspect.Parameter], name: str) -> Any:
-    """Of an option, or a number of those that are a training's own and numbers."""
-    if name in arguments:
-        return arguments[name].default
-    return 0 if name in ("n_timesteps", "n_envs") else None
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
-
 def check_settings(algo: str, settings: Any) -> None:
     """ValueError for settings that the algorithm has not, or that say code instead of a value."""
     if not isinstance(settings, Mapping):
         raise ValueError(f"settings are {{name: value}}, got {settings!r}")
     arguments = inspect.signature(algorithm_of(algo).load()).parameters
     known = sorted((arguments.keys() - _OURS) | set(_OF_TRAINING))
+    numbers = {"n_timesteps": 0, "n_envs": 0} | {k: each.default for k, each in arguments.items()}
     for name, value in settings.items():
         if name not in known:
             raise ValueError(f"unknown option {name!r} of {algo}; known: {', '.join(known)}")
@@ -134,7 +124,7 @@ def check_settings(algo: str, settings: Any) -> None:
             raise ValueError(f"{name} is {{name: value}}, which is no code to run, got {value!r}")
         if name in _SCHEDULED:
             _schedule(name, value)
-        elif isinstance(value, str) and _is_number(_default(arguments, name)):
+        elif isinstance(value, str) and is_finite(numbers.get(name)):
             hint = "; YAML reads 2e6 as text, 2.0e+6 as a number" if "e" in value else ""
             raise ValueError(f"{name} is a number, got {value!r}{hint}")
     kwargs = settings.get("policy_kwargs", {})

@@ -139,14 +139,15 @@ def distill(
     """
     if not lessons:
         raise ValueError("no lessons: there is nothing to learn from")
-    if course.told and not _unseen(lessons[0]):
+    unseen = len(_unseen(lessons[0]))
+    if course.told and not unseen:
         raise ValueError("nothing is left to be told: the student sees all that its teacher reads")
     torch.set_num_threads(1)
     torch.manual_seed(course.seed)
     begun, target, steps = time.process_time(), Path(path), 0
     cars = lessons[0].cars
     seeds = itertools.count(DISTILLING + course.seed * SEEDS, cars.num_envs)
-    width, unseen = cars.single_action_space.shape[0], len(_unseen(lessons[0]))
+    width = cars.single_action_space.shape[0]
     model = Student(len(cars.layout), width, course, unseen)
     policy: Policy | None = None
     scaling: Scaling | None = None

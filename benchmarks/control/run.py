@@ -152,9 +152,8 @@ def read_case(path: Path, chunk: Chunk, entire: bool = True) -> Driven | None:
 
 
 def _fits(array: npt.NDArray[Any], shape: tuple[int, ...], entire: bool) -> bool:
-    """Whether these are numbers of that shape, all of them, or all of some columns."""
-    there = np.isfinite(array).all(axis=0)
-    found = there.all() if entire else there.any()
+    finite = np.isfinite(array)
+    found = finite.all() if entire else finite.any()
     return array.dtype == np.float64 and array.shape == shape and bool(found)
 
 

@@ -16,6 +16,8 @@ LATE = (-0.2, 1.2)  # s, of the GPS
 _COURSE, _SPEED = range(2)  # places in its values
 LATE_WITHIN = 0.05  # s, half of the widest interval of a latency
 _FAST = {"gyro": "rad/s", "accel_y": "m/s2", "roll_rate": "rad/s", "wheel_left": "m/s"}
+NOISES = {name: f"{name.removesuffix('_left')}_noise" for name in (*_FAST, "course", "gps_speed")}
+"""The estimators' options for a standard deviation, by what it is of."""
 
 
 class Finding(NamedTuple):
@@ -106,7 +108,7 @@ def sensor_findings(
             told = half < 0.3 * sd
             remark = "" if told else WIDE if sd > 0.0 else "none is seen"
             findings.append(Finding(f"noise of {channel}", math.nan, sd, half, unit, told, remark))
-            noise |= {f"{channel.removesuffix('_left')}_noise": sd} if told else {}
+            noise |= {NOISES[channel]: sd} if told else {}
     times = np.arange(*LATE, max(logs[0].record.dt, 0.01))
     pairs = [pair for pair in zip(logs, slips, strict=True) if "gps" in pair[0].slow]
     courses = [b for log, slip in pairs for b in _fixes(log, _COURSE, heading(log), slip, times)]
@@ -130,5 +132,5 @@ def sensor_findings(
         if blocks:  # a difference has twice the variance
             sd, half = jackknife(np.array(blocks), lambda sums: math.sqrt(0.5 * _left(sums)[at]))
             row = Finding(f"noise of {name}", math.nan, scale * sd, scale * half, unit, True)
-            findings, noise = [*findings, row], noise | {f"{name}_noise": sd}
+            findings, noise = [*findings, row], noise | {NOISES[name]: sd}
     return findings, noise, {"gps": late} if pays else {}

@@ -14,14 +14,11 @@ from ...envs.sensors.slow import SLOW_NAMES
 from ...envs.vehicle.vehicle import Vehicle
 from ...envs.vehicle.vehicles import WIRES, VehicleSource
 from ...estimators.design.options import FAST_CHANNELS, columns_of
+from .noises import NOISES
 
 CHANNELS = (*FAST_CHANNELS, *SLOW_NAMES)
 """What may be late."""
 MOST_LATE = 5.0  # s
-NOISES = [
-    f"{name}_noise" for name in ("gyro", "accel_y", "roll_rate", "wheel", "course", "gps_speed")
-]
-"""Of what `identify` finds the standard deviation."""
 
 
 class Wires(NamedTuple):
@@ -54,9 +51,9 @@ class Wires(NamedTuple):
                     f"{', '.join(CHANNELS)}; got {channel}={late}"
                 )
         for name, value in self.noise.items():
-            check_choice("noise", name, NOISES)
-            if not (is_finite(value) and value > 0.0):
-                raise ValueError(f"noise {name} is a number above zero, got {brief(value)}")
+            check_choice("noise", name, NOISES.values())
+            if not (is_finite(value) and value >= 0.0):
+                raise ValueError(f"noise {name} is a number of zero or more, got {brief(value)}")
         return self
 
 

@@ -51,7 +51,8 @@ def read_table(path: Path) -> "pd.DataFrame":
     except (MemoryError, ImportError):
         raise
     except Exception as error:  # of scipy and asammdf anything, where a file is damaged
-        reason = "it is not text" if isinstance(error, UnicodeDecodeError) else str(error).strip()
+        reason = " ".join(str(error).split()) or type(error).__name__
+        reason = "it is not text" if isinstance(error, UnicodeDecodeError) else reason
         raise ValueError(
             f"{path}: expected CSV, Parquet, MATLAB or MDF, but {reason:.300}"
         ) from None

@@ -33,7 +33,7 @@ class Drawn:
     """
 
     _our_tyres = True  # tyre forces can be drawn
-    _shown = False  # in a window
+    _has_shown = False  # a picture, in a window
     control_period: int
     render_mode: str | None
     metadata: dict[str, Any] = {"render_modes": list(MODES), "render_fps": 100}  # noqa: RUF012
@@ -69,8 +69,8 @@ class Drawn:
         n, now = self.control_period, self.shot(0)
         between = n * max(-(-_SHOWN // n), 1)
         if int(now.state[Z.clock.tick]) % between == 0:
+            self._has_shown = True
             window.show(picture.draw(now), 1.0 / (between * TICK))
-            self._shown = True
 
     def shot(self, row: int = 0) -> Shot:
         """What a car's picture is drawn from."""
@@ -101,7 +101,7 @@ class Drawn:
         return int(getattr(self, "num_envs", 1))
 
     def _close_window(self) -> None:
-        if self.render_mode == "human" and self._shown:
+        if self.render_mode == "human" and self._has_shown:
             from .window import close
 
             close()

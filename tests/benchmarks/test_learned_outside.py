@@ -51,7 +51,7 @@ def test_designers_have_the_outside_car_and_its_actuators_are_the_class_s() -> N
         assert env.unwrapped.nominal.friction == 0.65
 
 
-def test_a_finished_case_is_found_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_finished_case_is_found_again(tmp_path: Path) -> None:
     """Though it has neither series nor all numbers; by another driver it is another case."""
     cell, driven = Cell(outside("car-yaw", "drift"), "", NOMINAL), list[Chunk]()
 

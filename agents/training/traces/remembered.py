@@ -64,7 +64,7 @@ class Remembered(VectorWrapper[Any, Any, Any, Any, Any]):
         begun, found = np.zeros_like(self._state[anew]), self._last.copy()
         found[anew] = self._read(obs[anew], begun)
         self._state[anew], self._last = begun, found
-        return found, infos
+        return found.copy(), infos
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """The inner env's; `final_obs` of its infos too."""
@@ -80,7 +80,7 @@ class Remembered(VectorWrapper[Any, Any, Any, Any, Any]):
             infos = infos | {"final_obs": last}
             self._state[over] = 0.0
         self._last = self._read(obs, self._state)
-        return self._last, rewards, terminated, truncated, infos
+        return self._last.copy(), rewards, terminated, truncated, infos
 
     def _read(self, obs: Any, state: Any) -> Any:
         """(N, k) float32; state (N, memory) is updated."""

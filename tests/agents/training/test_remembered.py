@@ -69,10 +69,13 @@ def test_an_observation_is_what_is_remembered_across_episodes(policy: Policy) ->
 def test_a_row_that_is_not_reset_goes_on_with_its_memory(policy: Policy) -> None:
     rows, mask = [Remembered(cars(3), policy.network) for _ in range(2)], np.arange(3) == 1
     action = np.full((3, 1), 0.1, np.float32)
+    seen = []
     for env in rows:
         env.reset(seed=5)
         env.step(action)
-        before = env.step(action)[0]
+        seen.append(env.step(action)[0])
+    before = seen[1]
+    seen[0][:] = 9.0  # whoever has an observation may write into it
     first = rows[0].reset(seed=[None, 8, None], options={"reset_mask": mask})[0]
     assert np.array_equal(first[~mask], before[~mask])
     assert np.array_equal(first[mask], Remembered(cars(3), policy.network).reset(seed=7)[0][mask])

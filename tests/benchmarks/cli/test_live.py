@@ -65,7 +65,6 @@ def test_ctrl_c_ends_with_the_summary_and_a_whole_session(run: Run, tmp_path: Pa
         ({"estimator": "mine.py:Mine"}, "name it in the command"),
         ({"agent": "mine.py:Mine"}, "name it in the command"),
         ({"env": "mine:Car-v0"}, "'mine:Car-v0', which names a module"),
-        ({"env": "mine:Car-v0", "options": {"env": "mine:Car-v0"}}, "which names a module"),
         ({"estimator_options": {"estimator": "mine.py:Mine"}}, "holds an estimator"),
     ],
 )

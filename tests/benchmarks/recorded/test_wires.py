@@ -54,7 +54,10 @@ def test_a_file_keeps_the_car_and_the_wires(tmp_path: Path) -> None:
         ("latency = {radar = 0.1}", "radar=0.1"),
         ("latency = {gps = -0.1}", "0 to 5 s"),
         ("latency = {steer = 9.0}", "-5 to 5 s"),
-        ('noise = {gyro_noise = "loud"}', "noise gyro_noise is a number above zero, got 'loud'"),
+        (
+            'noise = {gyro_noise = "loud"}',
+            "noise gyro_noise is a number of zero or more, got 'loud'",
+        ),
         ("noise = {gyro_nois = 0.1}", "did you mean 'gyro_noise'"),
     ],
 )
