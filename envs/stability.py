@@ -56,6 +56,7 @@ class StabilityEnv(
     | ..._mean | | mean over the step (`fast="all"`: every sample instead of last and mean) |
     | steer, torque_left, torque_right | rad, N m | applied, in the last tick |
     | steer_command | rad | the driver's |
+    | curvature | 1/m | the road's at the car, with `with_map` |
     | camera_psi, camera_y_l | rad, m | newest camera sample of quality 1 |
     | gps_course, gps_speed, gps_X, gps_Y | rad, m/s, m | newest GPS sample |
     | gps_hdop, gps_satellites | - | its dilution of precision and satellites |
@@ -90,9 +91,10 @@ class StabilityEnv(
     `scenario_from`. vehicle: the true one, as of `vehicle_from`; nominal: that of estimators and
     controllers (default: vehicle). control_period: ticks of 1 ms. reference: "zero-slip", "model"
     (its steady state), "limited" (by friction) or "lagged" (so limited, understeering, lag 0.1 s).
-    fast: "summary" or "all". slow, by name ("camera", "gps"): fields of `SlowSensor` that replace
-    the id's. yaw_first: yaw moment before acceleration where both pass the motors' limit. steering:
-    the action may steer too. vision, delay, appearance: as of `Seeing`. render_mode: of `Drawn`.
+    fast: "summary" or "all". with_map: the road's curvature is seen, which estimators are always
+    told. slow, by name ("camera", "gps"): fields of `SlowSensor` that replace the id's. yaw_first:
+    yaw moment before acceleration where both pass the motors' limit. steering: the action may steer
+    too. vision, delay, appearance: as of `Seeing`. render_mode: of `Drawn`.
     """
 
     config: EnvConfig
@@ -106,6 +108,7 @@ class StabilityEnv(
         control_period: int = 10,
         reference: str = "zero-slip",
         fast: str = "summary",
+        with_map: bool = False,
         yaw_first: bool = True,
         steering: bool = False,
         on_bad_action: str = "raise",
@@ -119,7 +122,7 @@ class StabilityEnv(
         believed = car if nominal is None else vehicle_from(nominal)
         self.config = EnvConfig(
             sensors, scenario_from(scenario), car, believed, control_period, reference, fast,
-            yaw_first, steering, on_bad_action, vision, delay, slow,
+            with_map, yaw_first, steering, on_bad_action, vision, delay, slow,
         )  # fmt: skip
         self.control_period, self.reference = int(control_period), reference
         self._now = self.config.base

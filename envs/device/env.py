@@ -147,11 +147,11 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
     def _build(self, most: dict[int, Capacity]) -> None:
         """The step with these capacities, and all rows on the device."""
         host = self._host
-        all_samples = bool(host.config.base.start.switches[FLAGS.all_samples])
+        switches = read(host.config.base.start.switches, FLAGS)
         obs_dtype = self.dtype if self._grad else torch.float32
         how = self.dtype, obs_dtype, self.device, self._compiled
         n, bounds = self.control_period, host.config.bounds
-        self._step = step = Step(self._kind, n, most, all_samples, bounds, *how)
+        self._step = step = Step(self._kind, n, most, switches, bounds, *how)
         start = Start(step, tuple(most)) if self._grad else None
         self._rows = DeviceRows(host, most, self.device, self.dtype, start)
 

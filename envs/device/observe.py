@@ -5,7 +5,7 @@ from typing import Any
 from ..backend.elementary import clip
 from ..backend.on_torch import on_tensors, torch
 from ..backend.primitives import select
-from ..engine.layout import IN_SLOW
+from ..engine.layout import IN_SLOW, Switches
 from ..record import FAST, PACKET
 from ..sensors.slow import WIDTHS
 from ..task.cost import rest_of_cost
@@ -25,14 +25,14 @@ class Observer:
     def __init__(
         self,
         sensors: tuple[int, ...],
-        all_samples: bool,
+        switches: Switches,
         bounds: Tensor,
         dtype: torch.dtype,
         obs_dtype: torch.dtype,
     ) -> None:
         """bounds: (2, k), of the observation's entries. obs_dtype: of the observations."""
         self._obs_dtype = obs_dtype
-        self._sensors, self._all_samples = sensors, all_samples
+        self._sensors, self._switches = sensors, switches
         self._bounds = bounds[:, :, None]
         self._clip, self._select, self._rest_of_cost = on_tensors(dtype, clip, select, rest_of_cost)
 
@@ -45,7 +45,7 @@ class Observer:
         """
         entries: list[Tensor] = []
         sampled = rows[:, :SAMPLED]
-        if self._all_samples:
+        if self._switches.all_samples:
             entries += sampled.transpose(0, 1).flatten(0, 1).unbind(0)
         else:
             total: Any = 0.0
@@ -53,6 +53,8 @@ class Observer:
                 total = total + self._select(j < done, sampled[j], 0.0)
             entries += torch.stack((sampled[-1], total / done), 1).flatten(0, 1).unbind(0)
         entries += rows[-1, FAST.steer : FAST.steer + 4].unbind(0)
+        if self._switches.with_map:
+            entries.append(rows[-1, FAST.curvature])
         for sensor in self._sensors:
             entries += self._sensor(sensor, now.tick, slow[sensor], delivered)
         shown = Shown(*now.shown)

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 from ..backend.elementary import clip
 from ..backend.on_torch import compiled, on_tensors, torch
 from ..backend.primitives import select
-from ..engine.layout import P
+from ..engine.layout import P, Switches
 from ..engine.tick import Kind
 from ..record import Array
 from ..task.failures import BAD_ACTION, NOT_FINITE, RUNNING
@@ -66,7 +66,7 @@ class Step:
         kind: Kind,
         n: int,
         most: dict[int, Capacity],
-        all_samples: bool,
+        switches: Switches,
         bounds: Array,
         dtype: torch.dtype,
         obs_dtype: torch.dtype,
@@ -77,7 +77,7 @@ class Step:
         self._ticks = Ticks(kind, dtype, compile)
         self._slow = SlowSensors(most, kind.small_angle, dtype)
         limits = torch.as_tensor(bounds, dtype=dtype, device=device)
-        self._observer = Observer(tuple(most), all_samples, limits, dtype, obs_dtype)
+        self._observer = Observer(tuple(most), switches, limits, dtype, obs_dtype)
         self._clip, self._select = on_tensors(dtype, clip, select)
         self.conclude: Any = compiled(self._concluded) if compile else self._concluded
 

@@ -89,6 +89,7 @@ class EnvConfig:
     control_period: int
     reference: str
     fast: str
+    with_map: bool
     yaw_first: bool
     steering: bool
     on_bad_action: str
@@ -108,7 +109,7 @@ class EnvConfig:
             raise ValueError(f"control_period is 1 to 1000 ticks, got {brief(n)}")
         if not isinstance(self.fast, str) or self.fast not in ("summary", "all"):
             raise ValueError(f"fast is 'summary' or 'all', got {brief(self.fast)}")
-        for name in ("steering", "yaw_first"):
+        for name in ("steering", "yaw_first", "with_map"):
             if not isinstance(getattr(self, name), bool):
                 raise TypeError(f"{name} is True or False, got {brief(getattr(self, name))}")
         bad = self.on_bad_action
@@ -130,7 +131,8 @@ class EnvConfig:
     @cached_property
     def layout(self) -> tuple[Entry, ...]:
         """The entries of an observation."""
-        return observation_layout(tuple(self.slow), int(self.control_period), self.fast)
+        n, fast = int(self.control_period), self.fast
+        return observation_layout(tuple(self.slow), n, fast, self.with_map)
 
     @cached_property
     def bounds(self) -> Array:
@@ -169,6 +171,7 @@ class EnvConfig:
             self.reference,
             motion,
             self.fast == "all",
+            self.with_map,
             self.yaw_first,
             self.on_bad_action == "fail",
         )

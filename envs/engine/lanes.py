@@ -11,7 +11,7 @@ from ..backend.simd import LANES
 from ..record import FAST_WIDTH, Array
 from ..task.info import REPORT
 from .arrays import Rows, row_of
-from .layout import FLAGS, PARAMS_WIDTH, STATE_WIDTH, Z
+from .layout import PARAMS_WIDTH, STATE_WIDTH, Z
 from .observe import observe_fast
 from .step import conclude_slow, drive_on, kind_of, shares_of
 from .window import follow, follows_another, foresee_lanes, window_of
@@ -85,8 +85,8 @@ def step_block(count: int, rows: Rows, actions: Any, n: int, bounds: Any, block:
     )
     if done == 0:
         return False
-    refs, every = read(block.reports, _REFS), rows.switches[first, FLAGS.all_samples]
-    slow, last = observe_fast(block.rows, n, refs, bounds, every, block.obs), len(bounds[0]) - 2
+    refs, last = read(block.reports, _REFS), len(bounds[0]) - 2
+    slow = observe_fast(block.rows, n, refs, bounds, rows.switches[first], block.obs)
     for lane in range(count):
         i = block.members[lane]
         for k in range(_MOVING):

@@ -144,6 +144,7 @@ class Switches(NamedTuple):
     reference: int
     steering: int  # kind of steering programme, used at reset
     all_samples: int  # the observation holds every fast sample
+    with_map: int  # and the road's curvature
     fail_bad: int  # a non-finite action ends the episode instead of being refused
     roll: int  # the body rolls
     road: int  # of `scenarios.roads.ROADS`

@@ -18,18 +18,18 @@ from .layout import FLAGS, P, Z
 def observe(row: Any, n: int, count: int, refs: Any, bounds: Any) -> None:
     """Write the float32 observation of a record of n ticks and `count` packets, every entry
     clipped at its bounds (2, k); entries as in `observation_layout`."""
-    k = observe_fast(row.rows, n, refs, bounds, row.switches[FLAGS.all_samples], row.obs)
+    k = observe_fast(row.rows, n, refs, bounds, row.switches, row.obs)
     observe_slow(row, k, count, bounds)
 
 
 @jit
-def observe_fast(rows: Any, n: int, refs: Any, bounds: Any, all_samples: int, obs: Any) -> int:
+def observe_fast(rows: Any, n: int, refs: Any, bounds: Any, switches: Any, obs: Any) -> int:
     """Write the entries of n fast rows, which come first, and of the references, which come last;
     returns how many come first. rows, obs: of a vehicle, or with an axis more for those of a block.
     """
     k = 0
     for column in range(SAMPLED):
-        if all_samples:
+        if switches[FLAGS.all_samples]:
             for j in range(n):
                 _put_clipped(obs, at(rows, j, column), bounds, k)
                 k += 1
@@ -42,6 +42,9 @@ def observe_fast(rows: Any, n: int, refs: Any, bounds: Any, all_samples: int, ob
             k += 2
     for i in range(4):
         _put_clipped(obs, at(rows, n - 1, FAST.steer + i), bounds, k)
+        k += 1
+    if switches[FLAGS.with_map]:
+        _put_clipped(obs, at(rows, n - 1, FAST.curvature), bounds, k)
         k += 1
     last = len(obs) - 2
     _put_clipped(obs, refs[0], bounds, last)

@@ -163,6 +163,7 @@ def episode_config(
     reference: str,
     motion: Array | None = None,
     all_samples: bool = False,
+    with_map: bool = False,
     yaw_first: bool = True,
     fail_bad: bool = False,
 ) -> EpisodeConfig:
@@ -213,6 +214,7 @@ def episode_config(
         reference=REFERENCES.index(reference),
         steering=STEERING_KINDS.index(scenario.steering),
         all_samples=int(all_samples),
+        with_map=int(with_map),
         fail_bad=int(fail_bad),
         roll=int(scenario.roll),
         road=ROADS.index(scenario.road),

@@ -184,14 +184,14 @@ def sense_ticks(row: Row, first: int, last: int, count: int, done: int, window: 
 def observe_step(row: Row, n: int, done: int, bounds: Any) -> int:
     """The observation of a step of `done` ticks but for the slow sensors, whose entries begin where
     it returns."""
-    report, rows, every = row.report, row.rows, row.switches[FLAGS.all_samples]
+    report, rows = row.report, row.rows
     refs = (report[REPORT.beta_ref], report[REPORT.gamma_ref])
     shown = done
-    if every:  # the last one stands for the missing
+    if row.switches[FLAGS.all_samples]:  # the last one stands for the missing
         for j in range(done, n):
             copied(rows[done - 1], rows[j])
         shown = n
-    return int(observe_fast(rows, shown, refs, bounds, every, row.obs))
+    return int(observe_fast(rows, shown, refs, bounds, row.switches, row.obs))
 
 
 @jit

@@ -22,7 +22,8 @@ class Entry(NamedTuple):
 SAMPLED = 6  # the first columns of a fast row are sensors; the policy sees last and mean of each
 AGE_CAP = 10.0  # s
 
-_FAST_BOUNDS = (10.0, 50.0, 50.0, 10.0, 100.0, 100.0, 1.0, 2000.0, 2000.0, 1.0, 50.0)
+_FAST_BOUNDS = (10.0, 50.0, 50.0, 10.0, 100.0, 100.0, 1.0, 2000.0, 2000.0, 1.0, 50.0, 1.0)
+_LAST = ("steer", "torque_left", "torque_right", "steer_command")  # seen as they were last
 
 
 def space_of(layout: Sequence[Entry], frames: int = 1) -> "gym.spaces.Box[np.float32]":
@@ -31,18 +32,21 @@ def space_of(layout: Sequence[Entry], frames: int = 1) -> "gym.spaces.Box[np.flo
     return gym.spaces.Box(np.repeat(low, frames), np.repeat(high, frames), dtype=np.float32)
 
 
-def observation_layout(slow: tuple[str, ...], n: int, fast: str) -> tuple[Entry, ...]:
+def observation_layout(
+    slow: tuple[str, ...], n: int, fast: str, with_map: bool = False
+) -> tuple[Entry, ...]:
     """The entries of an observation.
 
     slow: names of the slow sensors present. n: ticks of a control period. fast: "summary" (last
-    sample and mean over the step) or "all" (every sample of the step).
+    sample and mean over the step) or "all" (every sample of the step). with_map: the road's
+    curvature is seen.
     """
     entries = []
     for column in range(SAMPLED):
         name, unit, bound = FAST._fields[column], FAST_UNITS[column], _FAST_BOUNDS[column]
         names = (name, f"{name}_mean") if fast == "summary" else [f"{name}_{j}" for j in range(n)]
         entries += [Entry(each, unit, -bound, bound) for each in names]
-    for name in ("steer", "torque_left", "torque_right", "steer_command"):
+    for name in (*_LAST, "curvature") if with_map else _LAST:
         column = getattr(FAST, name)
         bound = _FAST_BOUNDS[column]
         entries.append(Entry(name, FAST_UNITS[column], -bound, bound))

@@ -38,6 +38,7 @@ ARGUMENTS: list[tuple[Arguments, type[Exception], str]] = [
     ({"control_period": 10.0}, TypeError, "control_period is a number of ticks, got 10.0"),
     ({"control_period": True}, TypeError, "control_period is a number of ticks, got True"),
     ({"steering": "yes"}, TypeError, "steering is True or False, got 'yes'"),
+    ({"with_map": 1}, TypeError, "with_map is True or False, got 1"),
     (
         {"reference": "slip"},
         ValueError,

@@ -82,6 +82,7 @@ CASES: list[dict[str, Any]] = [
     {"scenario": {"base": "tie-vision-fig7", "duration": 0.1}, "sensors": "vision"},
     {"scenario": {"base": "sensor-outage", "duration": 0.3}, "reference": "lagged"},
     {"scenario": {"base": "stiffness-step", "duration": 0.04}, "fast": "all"},
+    {"scenario": {"base": "straight", "curvature": 0.01, "curve_start": 0.0}, "with_map": True},
     {"control_period": 33, "camera": {"loss": 0.2, "duplicate": 0.3, "jitter": 0.02}},
     {"control_period": 1, "yaw_first": False},
     {"scenario": {**WANDER, "duration": 0.04}},

@@ -95,7 +95,7 @@ ARGUMENTS: list[dict[str, Any]] = [
     {"scenario": {"base": "sine-with-dwell", "tyres": "dugoff"}},
     {"gps": {"period": 0.1, "delays": (0.2, 0.05, 0.15, 0.1), "duplicate": 1.0}},
     {"yaw_first": False, "steering": True, "on_bad_action": "fail"},
-    {"scenario": "coms-brake-in-turn", "reference": "lagged"},
+    {"scenario": "coms-brake-in-turn", "reference": "lagged", "with_map": True},
     {"scenario": {"base": "recovery", "gps_period": 0.05}, "reference": "lagged"},
 ]  # fmt: skip
 

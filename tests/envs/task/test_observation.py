@@ -30,7 +30,7 @@ def expected(
         name = Fast._fields[column]
         values[name] = record.fast[-1, column]
         values[f"{name}_mean"] = float(np.sum(record.fast[:, column]) / len(record.fast))
-    for name in ("steer", "torque_left", "torque_right", "steer_command"):
+    for name in ("steer", "torque_left", "torque_right", "steer_command", "curvature"):
         values[name] = record.fast[-1, getattr(FAST, name)]
     for sensor in env.slow_sensors:
         fresh = 0.0
@@ -43,7 +43,8 @@ def expected(
         values |= {f"{sensor}_{each.name}": newest[i] for i, each in enumerate(kind.values)}
         values[f"{sensor}_age"] = min((record.ticks[-1] - captured) * TICK, AGE_CAP)
         values[f"{sensor}_fresh"] = fresh
-    return values | {name: info[name] for name in ("beta_ref", "gamma_ref")}
+    values |= {name: info[name] for name in ("beta_ref", "gamma_ref")}
+    return {entry.name: values[entry.name] for entry in env.layout}
 
 
 def compare(env: StabilityEnv, obs: np.ndarray, by_name: dict[str, float]) -> None:
@@ -68,6 +69,28 @@ def test_summary_is_last_mean_newest_age_and_fresh(name: str, n: int) -> None:
     for moment in play(env, np.random.default_rng(0).uniform(-1.0, 1.0, 1500 // n)):
         compare(env, moment.obs, expected(env, moment.record, seen, moment.info))
     assert seen
+
+
+@pytest.mark.parametrize("fast", ["summary", "all"])
+def test_with_a_map_a_bend_is_seen_where_the_car_is(fast: str) -> None:
+    bend = LINEAR | {"speed": 15.0, "curvature": 1.0 / 60.0, "curve_start": 20.0, "duration": 3.0}
+    env = StabilityEnv(scenario=bend, fast=fast, with_map=True)
+    plain = StabilityEnv(scenario=bend, fast=fast)
+    (obs, _), (without, _) = env.reset(seed=0), plain.reset(seed=0)
+    names = [entry.name for entry in env.layout]
+    at = names.index("curvature")
+    assert names[at - 1] == "steer_command" and names[:at] + names[at + 1 :] == [
+        entry.name for entry in plain.layout
+    ]
+    found = [obs[at]]
+    for moment, other in zip(play(env, [0.3] * 250), play(plain, [0.3] * 250), strict=True):
+        assert moment.obs[at] == np.float32(moment.record.fast[-1, FAST.curvature])
+        np.testing.assert_array_equal(np.delete(moment.obs, at), other.obs)
+        found.append(moment.obs[at])
+    assert 1.2 < 0.01 * np.flatnonzero(found)[0] < 1.5  # 20 m at 15 m/s
+    assert found[-1] == pytest.approx(1.0 / 60.0, rel=0.3)  # of the lane beside the centre's
+    assert env.observation_space.contains(moment.obs)
+    np.testing.assert_array_equal(np.delete(obs, at), without)
 
 
 def test_late_and_doubled_packets_are_not_fresh(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -94,6 +94,10 @@ ARGUMENTS: list[dict[str, Any]] = [
     {"scenario": {"base": "tie-vision-fig7", "duration": 0.2}, "yaw_first": False},
     {"scenario": {"base": "coms-slalom", "duration": 0.7}, "reference": "lagged"},
     {
+        "scenario": {"base": "straight", "curvature": 0.01, "curve_start": 0.0, "duration": 0.7},
+        "with_map": True,
+    },
+    {
         "scenario": {"base": "recovery", "duration": 0.7},
         "reference": "lagged",
         "gps": {"phase": None},
