@@ -2,7 +2,7 @@
 from it, and what came of it in each of them."""
 
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,6 +14,7 @@ from ..agents.learned.card import Card, JsonMap
 from ..agents.learned.files import Policy, is_policy, load_policy, save_policy
 from ..envs.arguments import check_choice
 from ..envs.scenarios.manoeuvres import scenario_from
+from ..envs.task.observation import SEEN
 from ..estimators.vector.estimate import EstimateObservation
 from .control.build import estimate_options, make_cars
 from .control.cells import ADAPTIVE, REFERENCE_FILTER, RUNGS, Cell
@@ -52,12 +53,21 @@ def contests_of(kind: str) -> list[Contest]:
     return [each for each in contests() if each.kind == kind]
 
 
-def card_of(kind: str, estimator: str = "", teacher: str = RIVAL, **rest: Any) -> Card:
-    """The card of a policy for a class of contests, in the first one's env; rest: other fields."""
+def card_of(
+    kind: str,
+    estimator: str = "",
+    teacher: str = RIVAL,
+    seen: Mapping[str, Any] | None = None,
+    **rest: Any,
+) -> Card:
+    """The card of a policy for a class of contests, in the first one's env with options `seen` of
+    what is observed; rest: other fields."""
     check_choice("estimator", estimator, FILTERS)
+    for name in seen or {}:
+        check_choice("option", name, SEEN)
     first = contests_of(kind)[0]
     options = _options(first, teacher) if estimator else {}
-    return Card.of(first.env_id, first.env_options, estimator, options, **rest)
+    return Card.of(first.env_id, first.env_options | dict(seen or {}), estimator, options, **rest)
 
 
 def _options(contest: Contest, teacher: str) -> JsonMap:
@@ -88,15 +98,21 @@ def _changes(varied: int, rng: np.random.Generator) -> Iterator[JsonMap]:
 
 
 def lessons_of(
-    kind: str, teacher: str, estimator: str, cars: int, varied: int = 0, seed: int = 0
+    kind: str,
+    teacher: str,
+    estimator: str,
+    cars: int,
+    varied: int = 0,
+    seed: int = 0,
+    seen: Mapping[str, Any] | None = None,
 ) -> "list[Lesson]":
     """A lesson for each contest of a class, and more of each where what the contest keeps varies.
 
     teacher: a rung, a controller of the matrix, which reads its filter there, or a policy, which
     reads the one of its card. cars: of each contest's lesson. varied: so many more, as `VARIED`
     says, share as many cars, rounded up; no filter and no teacher learns of it. seed: of what is
-    drawn for them. Raises ValueError for another name, or where that observation lacks what the
-    teacher needs.
+    drawn for them. seen: options of what the student observes. Raises ValueError for another name,
+    or where that observation lacks what the teacher needs.
     """
     from ..agents.training.distill import Lesson
 
@@ -111,7 +127,8 @@ def lessons_of(
             cell = Cell(contest, reads.get(teacher, REFERENCE_FILTER), teacher, own)
             count = -(-cars // varied) if change else cars
             twins, agent = make_cars(cell, count)
-            env: Any = gym.make_vec(contest.env_id, num_envs=count, **contest.env_options | own)
+            options = contest.env_options | own | dict(seen or {})
+            env: Any = gym.make_vec(contest.env_id, num_envs=count, **options)
             if estimator:
                 env = EstimateObservation(env, estimator, **_options(contest, teacher))
             found.append(Lesson(env, twins, agent))

@@ -217,6 +217,10 @@ def distill_command(
     told: Annotated[
         float, typer.Option(help="Weight of what the teacher reads, as its GRU or traces tell it.")
     ] = 0.0,
+    option: Annotated[
+        list[str] | None,
+        typer.Option(help="NAME=VALUE of what is observed: with_map, fast; repeatable."),
+    ] = None,
     seed: Annotated[int, typer.Option(help="Of weights and episodes.")] = 0,
     episodes: Annotated[int, typer.Option(help="Of each contest's test.", min=2)] = 32,
     out: Annotated[Path | None, typer.Option(help="The file; default: NAME here.")] = None,
@@ -235,9 +239,10 @@ def distill_command(
     about = {"class": kind, "teacher": teacher, "cars": cars, "varied": varied}
     about |= course.described()
     options = {"algorithm": "distill", "algorithm_options": about, "seeds": {"training": seed}}
-    card = card_of(kind, estimator, teacher, command=command_line(), **options)
+    seen = options_of(option)
+    card = card_of(kind, estimator, teacher, seen, command=command_line(), **options)
 
-    lessons = lessons_of(kind, teacher, estimator, cars, varied, seed)
+    lessons = lessons_of(kind, teacher, estimator, cars, varied, seed, seen)
 
     def show(now: Round) -> None:
         text = f"{now.steps:,} steps, mean cost {now.cost:.4g}, loss {now.loss:.3g}"

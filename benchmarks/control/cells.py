@@ -5,8 +5,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from ...agents import AGENTS
-from ...agents.learned.files import is_policy
+from ...agents.learned.files import is_policy, load_policy
 from ...agents.tuned import Options, tuned
+from ...envs.task.observation import SEEN
 from .contests import NOMINAL, ORACLES, PARAMETERS, STATE, STEERING, TIERS, YAW, Contest, oracle_of
 
 TRUTH, REFERENCE_CONTROLLER = "truth", "lqr"
@@ -135,8 +136,11 @@ class Cell:
 
     @property
     def env_options(self) -> dict[str, Any]:
-        """Options of the env: an action that is none ends the episode."""
-        return self.contest.env_options | {"on_bad_action": "fail"} | self.options
+        """Options of the env: an action that is none ends the episode, and a policy sees what its
+        training saw."""
+        card = load_policy(self.controller).card.env_options if is_policy(self.controller) else {}
+        seen = {name: card[name] for name in SEEN if name in card}
+        return self.contest.env_options | {"on_bad_action": "fail"} | seen | self.options
 
     @property
     def rung(self) -> str:

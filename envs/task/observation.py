@@ -19,6 +19,8 @@ class Entry(NamedTuple):
     high: float
 
 
+SEEN = ("fast", "with_map")
+"""The options of an environment that change what is observed, and nothing of a drive."""
 SAMPLED = 6  # the first columns of a fast row are sensors; the policy sees last and mean of each
 AGE_CAP = 10.0  # s
 

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 pytest.importorskip("torch")
-from sideslip.agents.learned.files import Policy
+from sideslip.agents.learned.files import Policy, save_policy
 from sideslip.agents.training.task import Task
 from sideslip.benchmarks import distillation
-from sideslip.benchmarks.control.cells import ADAPTIVE
+from sideslip.benchmarks.control.build import make_cars
+from sideslip.benchmarks.control.cells import ADAPTIVE, Cell
 from sideslip.benchmarks.control.contests import changed, contests
 from sideslip.benchmarks.distillation import (
     FILTERS,
@@ -23,6 +24,7 @@ from sideslip.benchmarks.distillation import (
     start_and_task,
 )
 from sideslip.envs.vehicle.vehicles import VEHICLES
+from sideslip.estimators.learned.network import Network
 from tests.benchmarks.conftest import Run
 
 
@@ -35,6 +37,26 @@ def test_a_class_is_lessons_with_one_observation_and_the_cards() -> None:
         for each in lessons:
             assert tuple((e.name, e.unit) for e in each.cars.layout) == card.observation
             assert each.teacher.width == 1
+
+
+def test_what_a_student_sees_besides_is_told_its_lessons_its_card_and_its_contests(
+    tmp_path: Path,
+) -> None:
+    seen: dict[str, Any] = {"with_map": True, "fast": "all"}
+    card = card_of("coms-zero-slip", "", seen=seen)
+    lesson = lessons_of("coms-zero-slip", "none", "", 2, seen=seen)[0]
+    assert tuple((e.name, e.unit) for e in lesson.cars.layout) == card.observation
+    assert ("curvature", "1/m") in card.observation and ("gyro_9", "rad/s") in card.observation
+    assert "curvature" not in [entry.name for entry in lesson.teachers.layout]
+    k = len(card.observation)
+    network = Network(np.zeros(k), np.ones(k), [np.full((1, k), 0.1)], [np.zeros(1)])
+    save_policy(tmp_path / "sees.safetensors", network, card)
+    contest = contests_of("coms-zero-slip")[1]
+    cell = Cell(contest, "", str(tmp_path / "sees.safetensors"))
+    env, agent = make_cars(cell, 2)
+    assert "curvature" in agent.needs and agent.predict(env.reset(seed=0)[0])[0].shape == (2, 1)
+    assert cell.env_options["scenario"] == contest.scenario
+    assert not set(seen) & Cell(contest, "", "distill-coms-yaw").env_options.keys()
 
 
 @pytest.mark.parametrize("teacher", ADAPTIVE.values())
@@ -138,6 +160,7 @@ def test_every_contest_is_in_one_class() -> None:
         (("--class", "coms-model", "--teacher", "oracle"), "unknown agent 'oracle'"),
         (("--class", "coms-model", "--teacher", "lane-keeping"), "needs psi_hat, y_l_hat"),
         (("--class", "coms-model", "--rounds", 0), "1 at least"),
+        (("--class", "coms-model", "--option", "map=true"), "unknown option 'map'"),
     ],
 )
 def test_a_distillation_that_cannot_be_is_one_line(
