@@ -10,8 +10,8 @@ from rich.table import Table
 
 from ...envs.arguments import check_choice
 from ..harness.engines import PROCESSES, engine
-from .cluster import Address, EngineName
-from .output import check_files, command_line, wrote
+from .options import Address, EngineName, command_line
+from .output import check_files, wrote
 
 
 def calibrate_command(

@@ -10,7 +10,8 @@ import typer
 from rich.console import Console
 
 from ..harness.results import check_writable
-from .output import command_line, options_of, wrote
+from .options import command_line, options_of
+from .output import wrote
 
 if TYPE_CHECKING:
     from ...estimators.learned.network import Network

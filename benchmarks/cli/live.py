@@ -22,7 +22,8 @@ from ..harness.verdict import verdict
 from .contestant import Contestant
 from .export import Trust
 from .names import check_env, complete
-from .output import check_files, options_of, show_episode, wrote
+from .options import options_of
+from .output import check_files, show_episode, wrote
 
 if TYPE_CHECKING:
     from ...agents.live.onboard import Onboard

@@ -16,13 +16,13 @@ from ..report.page import check_page, write_page
 from ..suites import SUITES, Request, run_suites
 from .calibrate import calibrate_command
 from .challenge import Agents, EnvId, Estimators, Fresh, Limit, Scenarios, challenge_of
-from .cluster import Address, EngineName
 from .enjoy import enjoy_command
 from .export import Trust, export_command
 from .lane import lane_command
 from .live import live_command
 from .names import KINDS, complete
-from .output import check_files, options_of, show_episode, write_output, wrote
+from .options import Address, EngineName, options_of
+from .output import check_files, show_episode, write_output, wrote
 from .recorded import Mapping, identify_command, replay_command
 from .train import distill_command, train_command, train_estimator_command
 from .tune import tune_app

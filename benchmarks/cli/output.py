@@ -1,33 +1,28 @@
-"""The output of commands: tables and lines on the screen, and files."""
+"""The output of commands: an episode, suites and the progress of a training, and files."""
 
 import json
 import platform
-import shlex
-import sys
 from collections.abc import Sequence
-from dataclasses import replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from rich import box
 from rich.console import Console
-from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-from rich.table import Table as RichTable
 
 from ... import __version__
 from ...envs.backend.files import whole
 from ..harness.results import (
     Row,
     Suite,
-    Table,
     check_writable,
     write_json,
     write_parquet,
     write_text,
 )
+from ..report.terminal import print_suite
+from .options import command_line
 
 if TYPE_CHECKING:
     from ...agents.rollout import Rollout
@@ -66,22 +61,6 @@ def check_files(**paths: Path | None) -> None:
 def wrote(console: Console, path: Path) -> None:
     """Print what was written."""
     console.print(f"wrote {path}", highlight=False, soft_wrap=True, markup=False)
-
-
-def option_of(text: str) -> tuple[str, Any]:
-    """NAME=VALUE; a value that is no JSON is a word."""
-    name, equals, value = text.partition("=")
-    if not (name and equals):
-        raise ValueError(f"an option is NAME=VALUE, got {text!r}")
-    try:
-        return name, json.loads(value)
-    except json.JSONDecodeError:
-        return name, value
-
-
-def options_of(texts: Sequence[str] | None) -> dict[str, Any]:
-    """The options in texts of NAME=VALUE; ValueError for a text of another form."""
-    return dict(map(option_of, texts or ()))
 
 
 def show_episode(
@@ -137,11 +116,6 @@ def write_output(
 
         write_report(html, list(suites), command_line(), environment())
         wrote(console, html)
-
-
-def command_line() -> str:
-    """The command line of this process."""
-    return shlex.join(["sideslip", *sys.argv[1:]])
 
 
 def words_of(task: "Task", steps: int) -> list[str]:
@@ -212,87 +186,3 @@ def environment() -> dict[str, str]:
         except PackageNotFoundError:
             continue
     return found
-
-
-_NAME = 32  # letters: a longer text in a table's first column is no name and may wrap
-_LEAST = 22  # letters that a column of text has at least, and the first one on a narrow screen
-_NARROW = 80  # columns
-
-
-def print_suite(console: Console, suite: Suite) -> None:
-    """The title, the verdict, the text, and each table with its note, but for details."""
-    if len(suite.title) + 4 <= console.width:
-        console.rule(f"[bold]{escape(suite.title)}")
-    else:  # a rule would cut it
-        console.print(f"\n[bold]{escape(suite.title)}[/]", highlight=False)
-    if suite.verdict:
-        console.print(f"[bold]{escape(suite.verdict)}[/]\n", highlight=False)
-    console.print(f"{escape(suite.text)}\n", highlight=False)
-    for table in suite.tables:
-        if table.detail:
-            continue
-        for part in _parts(table, console.width):
-            console.print(_rich(part, console.width))
-        if table.note:
-            console.print(f"[dim]{escape(table.note)}[/]\n", highlight=False)
-    if more := [table.title for table in suite.tables if table.detail]:
-        count = f"{len(more)} tables more are" if len(more) > 1 else "1 table more is"
-        console.print(f"{count} in the report (--html).\n", highlight=False)
-
-
-def _parts(table: Table, width: int) -> list[Table]:
-    """The table as it fits into so many columns of text: some columns each, the first in all;
-    texts wrap."""
-    from ..report.tables import numeric
-
-    columns = list(zip(table.header, *table.cells, strict=True))
-    most = [max(map(len, column)) for column in columns]
-    widths = [
-        (each if numeric(column[1:]) else min(each, _LEAST)) + 2
-        for each, column in zip(most, columns, strict=True)
-    ]
-    groups: list[list[int]] = [[0]]
-    used = first = min(widths[0], _first(width) + 2) + 2
-    for i in range(1, len(columns)):
-        if used + widths[i] > width and len(groups[-1]) > 1:
-            groups.append([0])
-            used = first
-        groups[-1].append(i)
-        used += widths[i]
-    return [
-        replace(
-            table,
-            title=table.title if not k else f"{table.title} (continued)",
-            header=[table.header[i] for i in group],
-            cells=[[row[i] for i in group] for row in table.cells],
-        )
-        for k, group in enumerate(groups)
-    ]
-
-
-def _first(width: int) -> int:
-    """Letters that the first column has, if it needs them, on a screen of so many columns."""
-    return _NAME if width >= _NARROW else _LEAST
-
-
-def _rich(table: Table, width: int) -> RichTable:
-    """Columns of numbers to the right and whole, those of text to the left, wrapped if long."""
-    from ..report.tables import numeric
-
-    shown = RichTable(
-        title=table.title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0)
-    )
-    columns = zip(*table.cells, strict=True) if table.cells else [()] * len(table.header)
-    for i, (name, column) in enumerate(zip(table.header, columns, strict=True)):
-        right = i > 0 and numeric(column)
-        longest = max(map(len, column), default=0)
-        shown.add_column(
-            name,
-            justify="right" if right else "left",
-            no_wrap=right,
-            min_width=min(longest, _first(width)) if i == 0 else None,
-            overflow="fold",  # a long word goes on in the next line
-        )
-    for row in table.cells:
-        shown.add_row(*map(escape, row))
-    return shown

@@ -7,8 +7,10 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
+from ..report.terminal import print_suite
 from .names import complete
-from .output import check_files, option_of, options_of, print_suite, write_output, wrote
+from .options import option_of, options_of
+from .output import check_files, write_output, wrote
 
 Texts = list[str] | None
 Drive = Annotated[

@@ -18,15 +18,8 @@ from ...envs.sensors.slow import SENSOR_SETS
 from .enjoy import judged
 from .export import Trust
 from .names import check_env, complete
-from .output import (
-    TrainingBar,
-    check_files,
-    command_line,
-    folder_of,
-    options_of,
-    words_of,
-    wrote,
-)
+from .options import command_line, options_of
+from .output import TrainingBar, check_files, folder_of, words_of, wrote
 
 if TYPE_CHECKING:
     from ...agents.training.train import Trained

@@ -10,8 +10,9 @@ from rich.console import Console
 
 from ..harness.engines import PROCESSES, engine
 from ..harness.results import check_writable
-from .cluster import Address, EngineName
-from .output import check_files, options_of, print_suite, wrote
+from ..report.terminal import print_suite
+from .options import Address, EngineName, options_of
+from .output import check_files, wrote
 
 tune_app = typer.Typer(no_args_is_help=True)
 Texts = list[str] | None

@@ -14,7 +14,8 @@ pytest.importorskip("stable_baselines3")
 from sideslip.agents.training import keeper, train
 from sideslip.benchmarks import policies as enjoy
 from sideslip.benchmarks.cli import train as train_command
-from sideslip.benchmarks.cli.output import folder_of, options_of, words_of
+from sideslip.benchmarks.cli.options import options_of
+from sideslip.benchmarks.cli.output import folder_of, words_of
 from sideslip.benchmarks.distillation import contests_of
 from tests.benchmarks.conftest import Run
 

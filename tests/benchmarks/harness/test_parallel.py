@@ -1,6 +1,8 @@
 """The same results on any engine; on a cluster a dead node's running cases run again, no others."""
 
+import io
 import os
+import re
 import subprocess
 import sys
 import time
@@ -11,11 +13,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from rich.console import Console
 
 from sideslip.benchmarks.estimation import run
 from sideslip.benchmarks.harness import engines
 from sideslip.benchmarks.harness.engines import completed, engine
-from sideslip.benchmarks.harness.parallel import run_cases
+from sideslip.benchmarks.harness.parallel import one_bar, run_cases
 
 CASES = [float(k) for k in range(12)]
 
@@ -135,3 +138,15 @@ def test_a_cluster_that_is_not_there_is_named() -> None:
         engine("ray", "127.0.0.1:1"),
     ):
         pass
+
+
+def test_a_run_has_one_progress_bar() -> None:
+    """It shows what runs; nothing of the phases before it stays."""
+    written = io.StringIO()
+    console = Console(file=written, width=80, force_terminal=True)
+    with one_bar(console):
+        for phase in ("first", "second", "third"):
+            assert run_cases(abs, [-1, -2], phase, jobs=1, console=console) == [1, 2]
+    last = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", written.getvalue()).splitlines()[-1]
+    assert "third" in last and "2/2" in last
+    assert "\n" not in re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", written.getvalue()).strip()

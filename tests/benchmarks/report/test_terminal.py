@@ -1,4 +1,4 @@
-"""What commands print: every column of every row, on a narrow screen too."""
+"""What a suite prints: every column of every row, on a narrow screen too."""
 
 import io
 import re
@@ -7,9 +7,8 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from sideslip.benchmarks.cli.output import print_suite
-from sideslip.benchmarks.harness.parallel import one_bar, run_cases
 from sideslip.benchmarks.harness.results import Suite, Table
+from sideslip.benchmarks.report.terminal import print_suite
 from sideslip.estimators.make import ESTIMATORS
 
 HEADER = ("controller and estimator", *(f"column {i} / %" for i in range(12)))
@@ -85,15 +84,3 @@ def line_end(text: str, width: int) -> int:
     """Where the first column ends: at the gap before the second one's header."""
     head = next(line for line in text.splitlines() if "score" in line)
     return head.index("score") - 1
-
-
-def test_a_run_has_one_progress_bar() -> None:
-    """It shows what runs; nothing of the phases before it stays."""
-    written = io.StringIO()
-    console = Console(file=written, width=80, force_terminal=True)
-    with one_bar(console):
-        for phase in ("first", "second", "third"):
-            assert run_cases(abs, [-1, -2], phase, jobs=1, console=console) == [1, 2]
-    last = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", written.getvalue()).splitlines()[-1]
-    assert "third" in last and "2/2" in last
-    assert "\n" not in re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", written.getvalue()).strip()

@@ -1,0 +1,35 @@
+"""Options of commands: NAME=VALUE, those of cases on a cluster, and the line as it was said."""
+
+import json
+import shlex
+import sys
+from collections.abc import Sequence
+from typing import Annotated, Any
+
+import typer
+
+EngineName = Annotated[
+    str, typer.Option("--engine", help="What runs the cases: processes, or ray, a cluster.")
+]
+Address = Annotated[str, typer.Option(help="HOST:PORT of the cluster; default: this machine's.")]
+
+
+def option_of(text: str) -> tuple[str, Any]:
+    """NAME=VALUE; a value that is no JSON is a word."""
+    name, equals, value = text.partition("=")
+    if not (name and equals):
+        raise ValueError(f"an option is NAME=VALUE, got {text!r}")
+    try:
+        return name, json.loads(value)
+    except json.JSONDecodeError:
+        return name, value
+
+
+def options_of(texts: Sequence[str] | None) -> dict[str, Any]:
+    """The options in texts of NAME=VALUE; ValueError for a text of another form."""
+    return dict(map(option_of, texts or ()))
+
+
+def command_line() -> str:
+    """The command line of this process."""
+    return shlex.join(["sideslip", *sys.argv[1:]])

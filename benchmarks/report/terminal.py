@@ -1,0 +1,90 @@
+"""A suite on the screen: its verdict first, and tables that fit whatever the width."""
+
+from dataclasses import replace
+
+from rich import box
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table as RichTable
+
+from ..harness.results import Suite, Table
+from .tables import numeric
+
+_NAME = 32  # letters: a longer text in a table's first column is no name and may wrap
+_LEAST = 22  # letters that a column of text has at least, and the first one on a narrow screen
+_NARROW = 80  # columns
+
+
+def print_suite(console: Console, suite: Suite) -> None:
+    """The title, the verdict, the text, and each table with its note, but for details."""
+    if len(suite.title) + 4 <= console.width:
+        console.rule(f"[bold]{escape(suite.title)}")
+    else:  # a rule would cut it
+        console.print(f"\n[bold]{escape(suite.title)}[/]", highlight=False)
+    if suite.verdict:
+        console.print(f"[bold]{escape(suite.verdict)}[/]\n", highlight=False)
+    console.print(f"{escape(suite.text)}\n", highlight=False)
+    for table in suite.tables:
+        if table.detail:
+            continue
+        for part in _parts(table, console.width):
+            console.print(_rich(part, console.width))
+        if table.note:
+            console.print(f"[dim]{escape(table.note)}[/]\n", highlight=False)
+    if more := [table.title for table in suite.tables if table.detail]:
+        count = f"{len(more)} tables more are" if len(more) > 1 else "1 table more is"
+        console.print(f"{count} in the report (--html).\n", highlight=False)
+
+
+def _parts(table: Table, width: int) -> list[Table]:
+    """The table as it fits into so many columns of text: some columns each, the first in all;
+    texts wrap."""
+    columns = list(zip(table.header, *table.cells, strict=True))
+    most = [max(map(len, column)) for column in columns]
+    widths = [
+        (each if numeric(column[1:]) else min(each, _LEAST)) + 2
+        for each, column in zip(most, columns, strict=True)
+    ]
+    groups: list[list[int]] = [[0]]
+    used = first = min(widths[0], _first(width) + 2) + 2
+    for i in range(1, len(columns)):
+        if used + widths[i] > width and len(groups[-1]) > 1:
+            groups.append([0])
+            used = first
+        groups[-1].append(i)
+        used += widths[i]
+    return [
+        replace(
+            table,
+            title=table.title if not k else f"{table.title} (continued)",
+            header=[table.header[i] for i in group],
+            cells=[[row[i] for i in group] for row in table.cells],
+        )
+        for k, group in enumerate(groups)
+    ]
+
+
+def _first(width: int) -> int:
+    """Letters that the first column has, if it needs them, on a screen of so many columns."""
+    return _NAME if width >= _NARROW else _LEAST
+
+
+def _rich(table: Table, width: int) -> RichTable:
+    """Columns of numbers to the right and whole, those of text to the left, wrapped if long."""
+    shown = RichTable(
+        title=table.title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0)
+    )
+    columns = zip(*table.cells, strict=True) if table.cells else [()] * len(table.header)
+    for i, (name, column) in enumerate(zip(table.header, columns, strict=True)):
+        right = i > 0 and numeric(column)
+        longest = max(map(len, column), default=0)
+        shown.add_column(
+            name,
+            justify="right" if right else "left",
+            no_wrap=right,
+            min_width=min(longest, _first(width)) if i == 0 else None,
+            overflow="fold",  # a long word goes on in the next line
+        )
+    for row in table.cells:
+        shown.add_row(*map(escape, row))
+    return shown
