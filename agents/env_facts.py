@@ -1,6 +1,6 @@
 """Facts of an environment, single or vector, that controllers are designed from."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -35,6 +35,14 @@ class EnvFacts:
     control_period: int
     reference: str
     width: int
+
+
+def made(env_id: str, options: Mapping[str, Any]) -> gym.Env[Any, Any]:
+    """The env of an id; what its arguments lack is said as the env says it, and no longer."""
+    try:
+        return gym.make(env_id, **options)
+    except TypeError as error:  # of which Gymnasium makes a longer one
+        raise TypeError(str(error).partition(" was raised from the environment")[0]) from None
 
 
 def facts_of(env: AnyEnv) -> EnvFacts:

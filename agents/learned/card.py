@@ -5,13 +5,11 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-import gymnasium as gym
-
 from ... import __version__
 from ...envs.documents import check_types
 from ...estimators.user_files import is_user_file
 from ...estimators.wrappers.estimate import EstimateObservation
-from ..env_facts import AnyEnv, facts_of
+from ..env_facts import AnyEnv, facts_of, made
 
 JsonMap = dict[str, Any]
 
@@ -74,7 +72,7 @@ class Card:
             "estimator": estimator,
             "estimator_options": dict(estimator_options or {}),
         }
-        env: gym.Env[Any, Any] = gym.make(env_id, **options["env_options"])
+        env = made(env_id, options["env_options"])
         if estimator:
             env = EstimateObservation(env, estimator, **options["estimator_options"])
         card = cls.seen(env, **options, **rest)

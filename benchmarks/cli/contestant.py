@@ -6,6 +6,7 @@ from typing import Any
 import gymnasium as gym
 
 from ...agents import make_agent
+from ...agents.env_facts import made
 from ...estimators.wrappers.arguments import usual_estimator
 from ...estimators.wrappers.estimate import EstimateObservation
 from ..control.build import outputs_for
@@ -48,10 +49,7 @@ class Contestant:
             raise
 
     def _built(self, env_id: str, options: dict[str, Any]) -> tuple[gym.Env[Any, Any], Any]:
-        try:
-            env: gym.Env[Any, Any] = gym.make(env_id, **options)
-        except TypeError as error:  # of which Gymnasium makes a longer one
-            raise TypeError(str(error).partition(" was raised from the environment")[0]) from None
+        env = made(env_id, options)
         sensors = env.get_wrapper_attr("slow_sensors")
         if self.estimator is not None:
             outputs, own = outputs_for(self.estimator), self.estimator_options

@@ -49,7 +49,7 @@ CLAIMS = (
         *(
             smaller(f"proposed / constant {delay}{text}", scenario, PROPOSED, rival, most, "y_l")
             for scenario, text in _NOISES
-            for delay, rival, most in (("33 ms", FRAME, 0.80), ("17 ms, the true mean", MEAN, None))
+            for delay, rival, most in (("33 ms", FRAME, 0.80), ("17 ms, near the mean", MEAN, None))
         ),
         note="Against one frame the time stamps win; against the true mean delay there is no "
         "gain. One process noise for all; with one tuned to the offset for each of them the order "

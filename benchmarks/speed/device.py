@@ -18,6 +18,7 @@ from rich.console import Console
 from ...envs.backend.on_torch import torch
 from ...envs.device.env import DeviceVectorEnv
 from ...envs.engine.layout import PARAMS_WIDTH
+from ..harness.errors import one_line
 from ..harness.results import check_writable, write_text
 
 COUNTS = (1024, 16384, 65536, 262144, 1048576)
@@ -143,4 +144,5 @@ def main(
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    with one_line():
+        typer.run(main)

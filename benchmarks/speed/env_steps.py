@@ -1,7 +1,7 @@
 """What an env-step costs: ours with full sensors, single and in batches, beside others'.
 
-Ours is 10 ms of driving, ten ticks of plant and sensors, infos included. Singles run episodes from
-`gym.make`, reset included; batches run on, and reset their rows themselves.
+Ours is 10 ms of driving, ten ticks of plant and sensors, infos included. Singles are of `gym.make`,
+reset after at most 500 steps; batches run on, and reset their rows themselves.
 """
 
 import warnings

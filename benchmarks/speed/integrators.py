@@ -72,7 +72,7 @@ def errors_in(scenario: str, controlled: bool, ticks: int = DRIVE) -> Array:
     """The largest errors of a drive, (rules, 2): of a velocity in m/s, of the yaw rate in rad/s.
 
     The drive is the environment's, which ends where the car spins. Each rule moves a car of its own
-    from the same start, under the same commands of driver and control.
+    from the same start, whose driver holds its own speed under the same commands else.
     """
     env, rng = StabilityEnv(scenario=scenario, control_period=1), np.random.default_rng(0)
     env.reset(seed=0)

@@ -12,7 +12,7 @@ import time
 from collections.abc import Iterator
 from math import radians
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import cv2
 import gymnasium as gym
@@ -30,6 +30,7 @@ from ...envs.sensors.camera.finder import LaneFinder
 from ...envs.sensors.camera.pinhole import Pinhole
 from ...envs.sensors.camera.road_image import Appearance, Painter, Scene
 from ...envs.vehicle.dynamics import Road
+from ..harness.errors import one_line
 
 _at_preview = plain(at_preview)
 
@@ -124,9 +125,14 @@ def picture_of(path: Path) -> None:
 
 
 def measure(
-    count: int = 200, seeds: int = 2, write: bool = False, picture: Path | None = None
+    count: Annotated[int, typer.Option(min=1, help="Pictures of a condition.")] = 200,
+    seeds: Annotated[int, typer.Option(min=1, help="Drives of a scenario.")] = 2,
+    write: bool = False,
+    picture: Path | None = None,
 ) -> None:
     """Print the tables; see the module."""
+    if picture is not None and not cv2.haveImageWriter(str(picture)):
+        raise ValueError(f"{picture}: a picture ends in .png or .jpg")
     cv2.setNumThreads(1)
     if picture is not None:
         picture_of(picture)
@@ -136,11 +142,12 @@ def measure(
     for name, look, bend, more in conditions():
         rest, lost, taken = errors(look, bend, more, count)
         times.append(taken)
-        psi, y_l = np.sqrt(np.mean(rest**2, axis=0))
-        print(
-            f"| {name} | {np.degrees(psi):.2f} | {100.0 * y_l:.1f} "
-            f"| {100.0 * np.abs(rest[:, 1]).max():.1f} | {100.0 * lost:.0f} |"
-        )
+        numbers = "- | - | -"  # where no lane was found
+        if len(rest):
+            psi, y_l = np.sqrt(np.mean(rest**2, axis=0))
+            worst = np.abs(rest[:, 1]).max()
+            numbers = f"{np.degrees(psi):.2f} | {100.0 * y_l:.1f} | {100.0 * worst:.1f}"
+        print(f"| {name} | {numbers} | {100.0 * lost:.0f} |")
     taken = np.concatenate(times)
     driven = np.abs(in_drives(seeds))
     psi, y_l = np.quantile(driven, 0.683, axis=0)  # where a bend begins the tail is long
@@ -176,4 +183,5 @@ def _processor() -> str:
 
 
 if __name__ == "__main__":
-    typer.run(measure)
+    with one_line():
+        typer.run(measure)

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium.error import ResetNeeded
@@ -10,23 +10,34 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from ..arguments import actions_of, count_of, mask_of, mode_of, named, options_of, seeds_of
+from ..arguments import actions_of, brief, count_of, mask_of, mode_of, named, options_of, seeds_of
 from ..backend.on_torch import torch
 from ..engine.layout import Z
 from ..engine.packing import EpisodeConfig
+from ..engine.step import kind_in
 from ..vector import StabilityVectorEnv
 from .generator import WORDS, words_of
-from .kernel import ASKED, RUNS, Memory, how_of, kind_in, packed_starts, specification
+from .kernel import ASKED, RUNS, How, Memory, how_of, packed_starts, specification
 from .launch import kernel_on
-from .tensors import device_of, dtype_of, infos_in
+from .tensors import check_arguments, device_of, dtype_of, infos_in
 from .text import SIMULATED
 
 Tensor = torch.Tensor
 Infos = dict[str, Any]
 
-_FRESH = ("actions", "obs", "rewards", "terminated", "truncated", "final_obs", "final_reports")
+_FRESH = ("actions", "rewards", "terminated", "truncated", "final_obs", "final_reports")
 """What is new in every step; all else stays where it is."""
 _TORCH = {np.uint8: torch.uint8, np.int64: torch.int64, np.float32: torch.float32}
+
+
+class Snapshot(NamedTuple):
+    """All that the rows of a `CudaVectorEnv` go on from."""
+
+    num_envs: int
+    how: How
+    dtype: torch.dtype
+    started: bool
+    memory: Memory
 
 
 class CudaVectorEnv(VectorEnv[Any, Any, Any]):
@@ -63,17 +74,17 @@ class CudaVectorEnv(VectorEnv[Any, Any, Any]):
         device: Any = "cuda",
         dtype: Any = "float64",
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+        *,
         record: bool = False,
         **arguments: Any,
     ) -> None:
+        check_arguments(arguments)
         self.num_envs = N = count_of("num_envs", num_envs, "environments")
         self._mode = mode_of(autoreset_mode)
         self.device, self.dtype = device_of(device), dtype_of(dtype)
         if (self.device.type == "cpu") != SIMULATED:
             runs = "in numba's simulator on 'cpu'" if SIMULATED else "on a CUDA device"
             raise ValueError(f"engine='cuda' runs {runs}, got {str(device)!r}")
-        if self.device.type == "cuda" and self.device.index is None:
-            self.device = torch.device("cuda", torch.cuda.current_device())
         one = StabilityVectorEnv(1, **arguments)
         self.layout, self.control_period = one.layout, one.control_period
         self.reference, self._config = one.reference, one.config
@@ -117,12 +128,11 @@ class CudaVectorEnv(VectorEnv[Any, Any, Any]):
             which=torch.as_tensor(which, device=self.device),
             starts=torch.as_tensor(packed).to(self.device, self.dtype),
             switches=torch.as_tensor(switches, device=self.device),
-            obs=self._memory.obs.clone(),
         )
         self._memory.over[torch.as_tensor(mask, device=self.device)] = ASKED
         self._kernel(N, True, self._memory)
         self._started = True
-        return self._memory.obs, infos_in(self._memory.reports.clone())
+        return self._memory.obs.clone(), infos_in(self._memory.reports.clone())
 
     def _with_options(
         self, options: Mapping[str, Any], mask: Any
@@ -141,7 +151,7 @@ class CudaVectorEnv(VectorEnv[Any, Any, Any]):
                     configs.append(self._config.with_options(own))
                 which[i] = known[key]
         for config in configs[1:]:
-            kind, width = kind_in(config), len(config.start.params)
+            kind, width = kind_in(config.start), len(config.start.params)
             if kind != self._how.kind or width != self._how.width:
                 raise ValueError(
                     f"on a device all rows have one kind of plant, {self._how.kind} with "
@@ -169,7 +179,7 @@ class CudaVectorEnv(VectorEnv[Any, Any, Any]):
         if self._mode == AutoresetMode.SAME_STEP:
             infos |= {"final_obs": memory.final_obs, "final_info": infos_in(memory.final_reports)}
             infos |= {f"_{key}": ends[0] | ends[1] for key in ("final_obs", "final_info")}
-        return memory.obs, memory.rewards, *ends, infos
+        return memory.obs.clone(), memory.rewards, *ends, infos
 
     def _taken(self, actions: Any) -> Tensor:
         """Actions (N, width) as float32 on the device, checked."""
@@ -235,22 +245,23 @@ class CudaVectorEnv(VectorEnv[Any, Any, Any]):
         results = m.obs, m.rewards, m.terminated, m.truncated, m.rows, m.packets
         return (m.states, m.reports, m.over), results
 
-    def get_state(self) -> Memory:
+    def get_state(self) -> Snapshot:
         """A snapshot of all rows, on the device."""
-        return Memory(*(each.clone() for each in self._memory))
+        memory = Memory(*(each.clone() for each in self._memory))
+        return Snapshot(self.num_envs, self._how, self.dtype, self._started, memory)
 
-    def set_state(self, snapshot: Memory) -> None:
+    def set_state(self, snapshot: Snapshot) -> None:
         """Go back to a snapshot of this env, or of one built with the same arguments.
 
-        Raises ValueError for one of other rows, sensors or records.
+        Raises ValueError for one of other rows, another dtype, plant, sensors or records.
         """
-        theirs, ours = (
-            [tuple(each.shape) for each in (of.params, of.obs, of.rows, of.packets)]
-            for of in (snapshot, self._memory)
-        )
+        if not isinstance(snapshot, Snapshot):
+            raise ValueError(f"a snapshot of this engine is a Snapshot, got {brief(snapshot)}")
+        theirs, ours = snapshot[:3], (self.num_envs, self._how, self.dtype)
         if theirs != ours:
-            raise ValueError(f"the snapshot has other rows or records, {theirs}, not {ours}")
-        self._memory, self._started = Memory(*(each.clone() for each in snapshot)), True
+            raise ValueError(f"the snapshot is of other rows, {theirs}, not {ours}")
+        self._memory = Memory(*(each.to(self.device, copy=True) for each in snapshot.memory))
+        self._started = snapshot.started
 
 
 def bytes_of(sizes: Memory) -> int:

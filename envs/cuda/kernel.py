@@ -19,9 +19,8 @@ from ..engine.arrays import Row, Start
 from ..engine.batch import ends_of
 from ..engine.config import EnvConfig
 from ..engine.layout import FLAGS, STATE_WIDTH, Switches
-from ..engine.packing import EpisodeConfig
 from ..engine.reset import reset_vehicle
-from ..engine.step import conclude, drive_on, kind_of, refuse, shares_of
+from ..engine.step import conclude, drive_on, kind_in, refuse, shares_of
 from ..engine.tick import Kind
 from ..engine.window import foresee, window_of
 from ..record import FAST_WIDTH, PACKET_WIDTH, Array
@@ -60,7 +59,7 @@ def how_of(config: EnvConfig, mode: str, record: bool) -> How:
     return How(
         mode=MODES.index(mode),
         n=int(config.control_period),
-        kind=kind_in(base),
+        kind=kind_in(base.start),
         switches=Switches(*base.start.switches.tolist()),
         width=len(base.start.params),
         entries=len(config.layout),
@@ -68,11 +67,6 @@ def how_of(config: EnvConfig, mode: str, record: bool) -> How:
         packets=config.most_packets,
         record=int(record),
     )
-
-
-def kind_in(config: EpisodeConfig) -> Kind:
-    """The kind of an episode's plant."""
-    return Kind(*map(int, kind_of(config.start.params, config.start.switches)))
 
 
 class Memory(NamedTuple):

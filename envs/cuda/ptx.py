@@ -36,14 +36,20 @@ def ptx_of(how: How, real: type[np.floating[Any]], capability: Capability) -> st
     key = json.dumps([how, real.__name__, capability, built])
     path = folder / f"fused-{hashlib.sha256(key.encode()).hexdigest()[:16]}.ptx" if folder else None
     if path and (data := cache.read(path)):
-        first, _, text = data.decode().partition("\n")
-        if first == f"// {key}":  # else it is of another GPU, or cut short
-            return text
-    text = _compiled(how, real, capability)
+        first, _, text = data.partition(b"\n")
+        if first == _first(key, text):  # else it is of another GPU, or not whole
+            return text.decode()
+    found = _compiled(how, real, capability)
     if path:
+        text = found.encode()
         with contextlib.suppress(OSError), replaced(path) as file:
-            file.write(f"// {key}\n{text}".encode())
-    return text
+            file.write(_first(key, text) + b"\n" + text)
+    return found
+
+
+def _first(key: str, text: bytes) -> bytes:
+    """The first line of a file: what it was compiled for, and its text's hash."""
+    return f"// {key} {hashlib.sha256(text).hexdigest()}".encode()
 
 
 def _compiled(how: How, real: type[np.floating[Any]], capability: Capability) -> str:

@@ -1,7 +1,9 @@
 """What both engines on tensors share: arguments, checked, and infos."""
 
+from collections.abc import Mapping
 from typing import Any
 
+from ..arguments import brief
 from ..backend.on_torch import DTYPES, torch
 from ..task.failures import RUNNING
 from ..task.info import REPORT, Report
@@ -10,7 +12,10 @@ Tensor = torch.Tensor
 
 
 def device_of(device: Any) -> torch.device:
-    """The device of a name or itself; ValueError for an unknown one and one that is not there."""
+    """The device of a name or itself, as its tensors have it: a GPU with an index, the CPU without.
+
+    ValueError for an unknown one and one that is not there.
+    """
     try:
         made = torch.device(device)
     except (RuntimeError, TypeError):
@@ -24,7 +29,16 @@ def device_of(device: Any) -> torch.device:
         raise ValueError(
             f"device {str(device)!r} is not there: torch {torch.__version__} finds {there}{why}"
         )
-    return made
+    if made.type == "cpu":
+        return torch.device("cpu")
+    return torch.device("cuda", torch.cuda.current_device() if made.index is None else made.index)
+
+
+def check_arguments(arguments: Mapping[str, Any]) -> None:
+    """TypeError for an argument of `StabilityVectorEnv` that no engine on a device heeds."""
+    for name in ("max_episode_steps", "info", "render_mode"):
+        if arguments.get(name) is not None:
+            raise TypeError(f"an env on a device has no {name}, got {brief(arguments[name])}")
 
 
 def dtype_of(dtype: Any) -> torch.dtype:

@@ -8,14 +8,13 @@ import numpy as np
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, VectorEnv
 
-from ..arguments import check_choice, count_of, mask_of, mode_of, named
+from ..arguments import brief, check_choice, count_of, mask_of, mode_of, named
 from ..backend.arrays import read
 from ..backend.on_torch import torch
-from ..cuda.tensors import device_of, dtype_of, infos_in
+from ..cuda.tensors import check_arguments, device_of, dtype_of, infos_in
 from ..engine.layout import FLAGS, P
 from ..engine.packing import EpisodeConfig
-from ..engine.step import kind_of
-from ..engine.tick import Kind
+from ..engine.step import kind_in
 from ..sensors.link import Link
 from ..sensors.slow import SLOW_NAMES
 from ..vector import StabilityVectorEnv
@@ -28,6 +27,7 @@ from .transfer import DeviceRows
 
 Tensor = torch.Tensor
 Infos = dict[str, Any]
+_Links = dict[int, set[Link]]  # by the sensor's place
 
 
 class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
@@ -79,6 +79,8 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
         check_choice("engine", engine, ("torch", "cuda"))
         if engine == "torch":
             return super().__new__(cls)
+        if wrong := [name for name in ("compile", "grad") if named.pop(name, False)]:
+            raise ValueError(f"{wrong[0]} is of engine='torch', not of 'cuda'")
         from ..cuda.env import CudaVectorEnv
 
         return CudaVectorEnv(*arguments, **named)
@@ -89,11 +91,13 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
         device: Any = "cpu",
         dtype: Any = "float64",
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+        *,
         compile: bool = False,
         engine: str = "torch",
         grad: bool = False,
         **arguments: Any,
     ) -> None:
+        check_arguments(arguments)
         self.num_envs = count_of("num_envs", num_envs, "environments")
         self._mode = mode_of(autoreset_mode)
         self.device, self.dtype = device_of(device), dtype_of(dtype)
@@ -108,11 +112,11 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
         self.observation_space = host.observation_space
         self.action_space = host.action_space
         self._started = self._waiting = False
-        self._kind = _kind_of(host.config.base)
-        self._links: dict[int, set[Link]] = {
-            i: set() for i, name in enumerate(SLOW_NAMES) if name in host.config.slow
-        }
-        self._build(self._capacities(host.configs))
+        self._kind = kind_in(host.config.base.start)
+        slow = host.config.slow
+        self._links: _Links = {i: set() for i, name in enumerate(SLOW_NAMES) if name in slow}
+        self._links, most = self._carried(host.configs)
+        self._build(most)
 
     @classmethod
     def make(cls, env_id: str, num_envs: int = 1, **arguments: Any) -> "DeviceVectorEnv":
@@ -122,27 +126,24 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
             raise ValueError(f"{env_id} has no environment on the device")
         return cls(num_envs, **{**spec.kwargs, **arguments})
 
-    def _capacities(self, configs: Iterable[EpisodeConfig]) -> dict[int, Capacity]:
-        """The slow sensors' capacities with these configs and those before.
-
-        Raises ValueError for a config of another kind of plant.
-        """
+    def _carried(self, configs: Iterable[EpisodeConfig]) -> tuple[_Links, dict[int, Capacity]]:
+        """The slow sensors' links in these configs and those before, and the room that they take;
+        ValueError for a config of another kind of plant."""
         configs = list({id(config): config for config in configs}.values())
         for config in configs:
             if config.scenario.steering in ("trace", "wander"):
                 what = f"{config.scenario.name!r}: no {config.scenario.steering}"
                 raise ValueError(f"{what} is driven on a device")
-            kind = _kind_of(config)
+            kind = kind_in(config.start)
             if kind != self._kind:
-                raise ValueError(
-                    f"on a device all rows have one kind of plant, {self._kind}; "
-                    f"scenario {config.scenario.name!r} has {kind}"
-                )
-        for config in configs:
-            for sensor, links in self._links.items():
-                links.add(read(config.start.params, P.slow[sensor]))
+                why = f"scenario {config.scenario.name!r} has {kind}, not {self._kind}"
+                raise ValueError(f"on a device all rows have one kind of plant: {why}")
+        links = {
+            sensor: known | {read(config.start.params, P.slow[sensor]) for config in configs}
+            for sensor, known in self._links.items()
+        }
         n = self.control_period
-        return {sensor: capacity_of(list(links), n) for sensor, links in self._links.items()}
+        return links, {sensor: capacity_of(list(each), n) for sensor, each in links.items()}
 
     def _build(self, most: dict[int, Capacity]) -> None:
         """The step with these capacities, and all rows on the device."""
@@ -170,16 +171,20 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
             asked, inputs = inputs_of(asked, host.config.base, self.num_envs, like)
         free = {name: value for name, value in asked.items() if name != "reset_mask"}
         configs, _ = host.with_options(free, chosen.tolist())
-        most = self._capacities(configs)
-        if most == self._rows.most:
-            host.reset(seed=seed, options=asked)
-        else:
+        links, most = self._carried(configs)
+        wider = most != self._rows.most
+        if wider and self._grad and len(chosen) < self.num_envs:
+            why = "these sensors take more room than any before"
+            raise ValueError(f"{why}: reset all rows, or the others would lose their gradients")
+        if wider:
             self._rows.give_back(host)
-            host.reset(seed=seed, options=asked)
+        host.reset(seed=seed, options=asked)
+        self._links = links
+        if wider:
             self._build(most)
         self._rows.take_over(host, chosen, inputs)
         self._started, self._waiting = True, bool(self._rows.state.over.any())
-        return self._rows.outcome.obs, self._infos()
+        return self._rows.outcome.obs.clone(), self._infos()
 
     def step(self, actions: Any) -> tuple[Tensor, Tensor, Tensor, Tensor, Infos]:
         """Hold each row's action for one control period."""
@@ -212,11 +217,12 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
             self._restart(resting)
         if ended and self._mode == AutoresetMode.SAME_STEP:
             infos = {"final_obs": outcome.obs, "final_info": self._infos()}
-            infos |= {f"_{key}": state.over for key in infos}
+            infos |= {f"_{key}": state.over.clone() for key in infos}
             self._restart(state.over)
             self._waiting = False
         infos |= self._infos()
-        return rows.outcome.obs, outcome.rewards, outcome.terminated, outcome.truncated, infos
+        ends = outcome.terminated, outcome.truncated
+        return rows.outcome.obs.clone(), outcome.rewards, *ends, infos
 
     def detach(self) -> None:
         """Cut the graph at the state: what follows has no gradients to actions and states before.
@@ -234,7 +240,7 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
 
     def _infos(self) -> Infos:
         """The numbers of `info` of every row, (N,) each."""
-        return infos_in(self._rows.state.report)
+        return infos_in(self._rows.state.report.clone())
 
     @property
     def rows(self) -> Tensor:
@@ -282,12 +288,10 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
         Raises ValueError for one of another number of rows, control period or observation, and one
         whose rows have another kind of plant.
         """
-        configs = {id(each): each for each in snapshot["configs"]}
-        most = self._capacities(configs.values())
+        if not isinstance(snapshot, Mapping):
+            raise ValueError(f"a snapshot of this engine is a mapping, got {brief(snapshot)}")
+        links, most = self._carried(snapshot["configs"])
         self._host.set_state(snapshot)
+        self._links = links
         self._build(most)
         self._started, self._waiting = snapshot["started"], bool(self._rows.state.over.any())
-
-
-def _kind_of(config: EpisodeConfig) -> Kind:
-    return Kind(*map(int, kind_of(config.start.params, config.start.switches)))

@@ -66,6 +66,10 @@ def inputs_of(
     for name, value in parameters.items():
         low, high = _of_rows(name, value, count, like).detach().aminmax()
         base.vehicle.replace(**{name: low.item()}).replace(**{name: high.item()})
+    if parameters and base.scenario.roll:  # which they make together
+        columns = [_of_rows(k, each, count, like).detach() for k, each in parameters.items()]
+        for row in set(zip(*(each.tolist() for each in columns), strict=True)):
+            base.vehicle.replace(**dict(zip(parameters, row, strict=True))).check_roll()
     state = rest.get("state")
     named = dict(state) if isinstance(state, Mapping) else {}
     found = {name: each for name, each in named.items() if isinstance(each, torch.Tensor)}
@@ -102,9 +106,14 @@ def _with(vehicle: Vehicle, values: Mapping[str, Any]) -> Vehicle:
 
 
 def _places_of(names: Iterable[str], config: EpisodeConfig) -> list[int]:
-    """Where the packed parameters lie that these of a vehicle make: without them they are NaN."""
+    """Where the packed parameters lie that these of a vehicle make: without them they are NaN.
+
+    The friction under the right wheels is the vehicle's where the scenario has none of its own.
+    """
     without = _with(config.vehicle, dict.fromkeys(names, np.nan))
-    return [place for place, value in _packed(without, config).items() if value != value]
+    own = () if config.scenario.friction_right is None else (P.car.mu_r,)
+    packed = _packed(without, config).items()
+    return [place for place, value in packed if value != value and place not in own]
 
 
 def with_motion(motion: Tensor, state: Mapping[str, Tensor], rows: Tensor) -> Tensor:

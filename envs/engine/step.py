@@ -21,7 +21,7 @@ from ..task.cost import rest_of_cost
 from ..task.failures import BAD_ACTION, REFUSED, RUNNING, failure_of
 from ..task.info import REPORT
 from ..vehicle.tyres import shifts
-from .arrays import Row, parts_of
+from .arrays import Row, Start, parts_of
 from .layout import FLAGS, P, Z
 from .observe import observe_fast, observe_slow, write_report
 from .packets import next_due, sense_slow
@@ -67,6 +67,11 @@ def kind_of(p: Any, switches: Any) -> Kind:
         shifting,
         flags.road,
     )
+
+
+def kind_in(start: Start) -> Kind:
+    """The same of an episode's start."""
+    return Kind(*map(int, kind_of(start.params, start.switches)))
 
 
 @jit

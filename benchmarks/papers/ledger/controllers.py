@@ -86,6 +86,8 @@ def _measured(
         curves: dict[str, dict[str, Array]] = {}
         for label in labels:
             driven, found = drive(label, seed)
+            if driven.failed:  # fewer ticks are no better drive
+                raise RuntimeError(f"{label}: the car of seed {seed} failed")
             numbers |= {(label, name): value for name, value in found.items()}
             curves[label] = {name: driven[name] for name in SIGNALS}
         lines.append(numbers)

@@ -1,6 +1,7 @@
 """The kernel compiles for an H200 without a GPU: what PTX it becomes, and where that is kept."""
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -71,10 +72,22 @@ def test_each_gpu_has_its_own_file(folder: Path) -> None:
     assert len(list(folder.iterdir())) == 3
 
 
-@pytest.mark.parametrize("left", [b"", b"// [", b"// another key\nPTX of another GPU"])
-def test_a_file_of_another_gpu_or_cut_short_is_compiled_anew(folder: Path, left: bytes) -> None:
+@pytest.mark.parametrize(
+    "left",
+    [
+        lambda whole: b"",
+        lambda whole: whole[:4],
+        lambda whole: whole[:-1],
+        lambda whole: whole[:-6] + b"\xfftext1",
+        lambda whole: b"\xff",
+        lambda whole: b"// another key\nPTX of another GPU",
+    ],
+)
+def test_a_file_of_another_gpu_or_not_whole_is_compiled_anew(
+    folder: Path, left: Callable[[bytes], bytes]
+) -> None:
     ptx.ptx_of(how(), np.float64, H200)
     (path,) = folder.iterdir()
-    path.write_bytes(left)
+    path.write_bytes(left(path.read_bytes()))
     assert ptx.ptx_of(how(), np.float64, H200) == "text 2"
     assert path.read_bytes().endswith(b"text 2")

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from gymnasium.error import ResetNeeded
 
 torch = pytest.importorskip("torch")
 pytest.importorskip("numba_cuda")
@@ -46,6 +47,15 @@ def same(ours: CudaVectorEnv, theirs: StabilityVectorEnv, one: Any, other: Any) 
         if not name.startswith(("_", "final")):
             there = other[-1][f"_{name}"]  # the rest was not reset
             assert bits(one[-1][name].cpu().numpy()[there]) == bits(values[there]), name
+    if "final_obs" in other[-1]:
+        over = other[-1]["_final_obs"]
+        for mask in ("_final_obs", "_final_info"):
+            assert one[-1][mask].tolist() == over.tolist()
+        final = one[-1]["final_obs"].cpu().numpy()
+        assert bits(final[over]) == bits(np.stack(other[-1]["final_obs"][over]))
+        assert not final[~over].any()
+        for name, mine in one[-1]["final_info"].items():
+            assert bits(mine.cpu().numpy()[over]) == bits(other[-1]["final_info"][name][over]), name
     assert bits(ours.motion.cpu().numpy()) == bits(theirs.motion)
     assert ours.ticks_done.tolist() == theirs.ticks_done.tolist()
     assert ours.delivered.tolist() == theirs.delivered.tolist()
@@ -156,6 +166,12 @@ def test_results_are_new_ones_that_the_kernel_wrote() -> None:
     ours.step(torch.ones(N, 1, device=DEVICE))
     assert torch.equal(obs, old)
     assert all(map(torch.equal, first[:4], kept))
+    obs, _, _, _, infos = ours.step(torch.ones(N, 1, device=DEVICE))
+    old, t = obs.clone(), infos["t"].clone()
+    obs.fill_(7.0)  # whoever has a result may write into it
+    infos["t"].fill_(7.0)
+    again, infos = ours.reset(options={"reset_mask": np.arange(N) == 0})
+    assert torch.equal(again[1:], old[1:]) and torch.equal(infos["t"][1:], t[1:])
 
 
 def test_a_snapshot_goes_on_with_the_same_bits() -> None:
@@ -168,8 +184,34 @@ def test_a_snapshot_goes_on_with_the_same_bits() -> None:
         runs.append([ours.step(np.ones((N, 1)))[0].tolist() for _ in range(5)])
         ours.set_state(snapshot)
     assert runs[0] == runs[1]
-    with pytest.raises(ValueError, match="the snapshot has other rows or records"):
-        CudaVectorEnv(2, device=DEVICE, **FUSION).set_state(snapshot)
+
+
+def test_a_snapshot_of_another_env_is_refused() -> None:
+    ours, _ = both()
+    ours.reset(seed=5)
+    before = ours.motion
+    others: list[dict[str, Any]] = [
+        {"num_envs": 2},
+        {"dtype": "float32"},
+        {"record": False},
+        {"scenario": {"base": "dakf-fig6"}},
+        {"scenario": {"base": "random-steering", "tyres": "dugoff"}},
+    ]
+    for arguments in others:
+        other = CudaVectorEnv(
+            **{"num_envs": N, "device": DEVICE, "record": True, **FUSION, **arguments}
+        )
+        other.reset(seed=5)
+        with pytest.raises(ValueError, match="the snapshot is of other rows"):
+            ours.set_state(other.get_state())
+    for wrong in (tuple(ours.get_state()), {"rows": 1}):
+        with pytest.raises(ValueError, match="a snapshot of this engine is a Snapshot, got"):
+            ours.set_state(wrong)  # type: ignore[arg-type]
+    assert torch.equal(ours.motion, before)
+    fresh, _ = both()
+    ours.set_state(fresh.get_state())
+    with pytest.raises(ResetNeeded):
+        ours.step(np.zeros((N, 1)))
 
 
 def test_float32_drives_the_same_noise_and_its_error_is_small() -> None:

@@ -14,8 +14,11 @@ from sideslip.envs.engine.layout import STATE_WIDTH, Z
 from sideslip.envs.record import PACKET, PACKET_WIDTH
 
 from ..batches import batch
+from ..helpers import IDS
 
 FUSION, UNEVEN = "sideslip/YawFusion-v0", "sideslip/YawVisionUneven-v0"
+DRIVEN = [each for each in IDS if "Linear" not in each]
+"""The ids that are driven on a device: the others have a driver who wanders."""
 EXACT = 1e-9
 
 _ARRAYS = (

@@ -20,6 +20,7 @@ from sideslip.envs.vehicle.dynamics import Motion  # noqa: E402
 
 from ..batches import MODES, batch  # noqa: E402
 from .moments import (  # noqa: E402
+    DRIVEN,
     EXACT,
     FUSION,
     UNEVEN,
@@ -188,7 +189,7 @@ def test_episodes_follow_each_other_as_in_the_vector_env(mode: str) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", IDS)
+@pytest.mark.parametrize("name", DRIVEN)
 def test_a_second_of_stable_driving_is_the_same(name: str) -> None:
     one, other = batch(name, 8), DeviceVectorEnv.make(name, 8)
     one.reset(seed=2)
@@ -235,6 +236,19 @@ def test_float32_costs_little_in_a_second() -> None:
     error = (one.motion - other.motion).abs().amax(0)
     for name, limit in SECOND.items():
         assert 0.0 < error[Motion._fields.index(name)] < limit, name
+
+
+@pytest.mark.plain
+def test_whoever_has_a_result_may_write_into_it() -> None:
+    env = DeviceVectorEnv.make(FUSION, 2)
+    idle = np.zeros((2, 1))
+    for first in (True, False):
+        obs, infos = env.reset(seed=0) if first else env.step(idle)[::4]
+        kept = obs.clone(), infos["t"].clone()
+        obs.fill_(7.0)
+        infos["t"].fill_(7.0)
+        obs, infos = env.reset(options={"reset_mask": np.array([True, False])})
+        assert torch.equal(obs[1], kept[0][1]) and infos["t"][1] == kept[1][1]
 
 
 @pytest.mark.plain

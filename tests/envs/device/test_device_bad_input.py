@@ -36,6 +36,11 @@ ARGUMENTS: list[tuple[dict[str, Any], type[Exception], str]] = [
     ({"autoreset_mode": "Later"}, ValueError, "'Later'; known: 'NextStep'"),
     ({"scenario": "slalon"}, ValueError, "unknown scenario 'slalon'"),
     ({"estimator": "dakf"}, TypeError, "unknown argument 'estimator'"),
+    ({"max_episode_steps": 3}, TypeError, "an env on a device has no max_episode_steps, got 3"),
+    ({"render_mode": "rgb_array"}, TypeError, "has no render_mode, got 'rgb_array'"),
+    ({"info": "ends"}, TypeError, "an env on a device has no info, got 'ends'"),
+    ({"engine": "cuda", "compile": True}, ValueError, "compile is of engine='torch', not of"),
+    ({"engine": "cuda", "grad": True}, ValueError, "grad is of engine='torch', not of 'cuda'"),
 ]
 
 
@@ -49,6 +54,19 @@ def test_arguments(arguments: dict[str, Any], error: type[Exception], message: s
 def test_a_device_that_is_not_there_is_named_with_those_that_are() -> None:
     with pytest.raises(ValueError, match=r"device 'cuda' is not there: torch .* finds cpu"):
         DeviceVectorEnv(device="cuda")
+
+
+def test_a_device_is_called_as_its_tensors_call_it() -> None:
+    """Or their actions would be refused: those of cuda:0 where the env is on cuda."""
+    env = DeviceVectorEnv.make(FUSION, 2, device="cpu:0")
+    assert env.device == torch.zeros(1, device=env.device).device == torch.device("cpu")
+    env.reset(seed=0)
+    env.step(torch.zeros(2, 1, device=env.device))
+
+
+def test_what_engines_differ_in_has_no_place_but_a_name() -> None:
+    with pytest.raises(TypeError, match="positional"):
+        DeviceVectorEnv(2, "cpu", "float64", "NextStep", False)  # type: ignore[call-arg]
 
 
 def test_without_a_compiler_nothing_is_compiled_and_a_warning_says_so(
@@ -130,6 +148,8 @@ def test_a_plant_of_another_kind_is_refused_and_nothing_is_reset() -> None:
         env.set_state(after)
     with pytest.raises(ValueError, match="the snapshot has 3 rows"):
         env.set_state(DeviceVectorEnv.make(FUSION, 3).get_state())
+    with pytest.raises(ValueError, match=r"a snapshot of this engine is a mapping, got \(1, 2\)"):
+        env.set_state((1, 2))  # type: ignore[arg-type]
 
 
 def test_what_was_not_started_or_is_over_waits_for_a_reset() -> None:

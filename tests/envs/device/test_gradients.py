@@ -5,17 +5,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ..helpers import IDS
-
 torch = pytest.importorskip("torch")
 
 from sideslip.envs.device.env import DeviceVectorEnv  # noqa: E402
 from sideslip.envs.record import PACKET  # noqa: E402
 
-from .moments import FUSION  # noqa: E402
+from .moments import DRIVEN, FUSION  # noqa: E402
 
 VISION = "sideslip/YawVision-v0"
-DRIVEN = [each for each in IDS if "Linear" not in each]  # theirs has a driver who wanders
 DEVICES = ["cpu"] + ["cuda"] * torch.cuda.is_available()
 STATE = {"v_x": (6.5, 1e-3), "v_y": (0.2, 1e-4), "gamma": (0.15, 1e-4), "psi": (0.02, 1e-4)}
 STATE |= {"Y": (0.3, 1e-3), "y": (0.3, 1e-3), "phi": (0.01, 1e-4)}

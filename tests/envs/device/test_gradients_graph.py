@@ -182,6 +182,7 @@ BAD: list[tuple[dict[str, Any], type[Exception], str]] = [
     ({"state": {"beta": leaf(0.1)[0]}}, ValueError, "unknown state beta"),
     ({"state": {"v_y": torch.zeros(2, device="meta")}}, ValueError, "v_y is on meta, the env on"),
 ]
+LATER = {"scenario": {"base": "random-steering", "gps_latency": (0.1, 0.9)}}
 
 
 @pytest.mark.parametrize(("options", "error", "message"), BAD, ids=str)
@@ -194,6 +195,40 @@ def test_bad_inputs_are_refused_and_nothing_is_reset(
     with pytest.raises(error, match=message):
         env.reset(seed=1, options=options)
     assert torch.equal(env.motion, before)
+
+
+def test_rows_that_are_not_reset_keep_their_graph_or_nothing_is_reset() -> None:
+    env, v_y = made(), leaf(0.1, 0.2)
+    env.reset(seed=0, options={"state": {"v_y": v_y}})
+    env.step(torch.zeros(2, 1))
+    before, mask = env.motion, np.array([False, True])
+    for _ in range(2):  # the refused sensors are not remembered
+        with pytest.raises(ValueError, match="more room than any before: reset all rows"):
+            env.reset(options=LATER | {"reset_mask": mask})
+        assert torch.equal(env.motion, before)
+    env.reset(options={"reset_mask": mask})
+    assert slope(env.motion[0], v_y) != [0.0, 0.0]
+    env.reset(options=LATER)
+
+
+def test_a_body_that_no_parameters_could_hold_up_is_refused() -> None:
+    """Though each of them could by itself."""
+    env = made(scenario="coms-slalom")
+    inertia, mass = {"roll_inertia": leaf(31.0, 31.0)}, {"mass": leaf(380.0, 340.0)}
+    for parameters in (inertia, mass):
+        env.reset(seed=0, options={"parameters": parameters})
+    with pytest.raises(ValueError, match=r"roll_inertia: 31\.0 .* of 340\.0 kg has more than 32"):
+        env.reset(options={"parameters": inertia | mass})
+
+
+def test_friction_is_that_of_both_sides_but_where_the_right_one_has_its_own() -> None:
+    for scenario, split in (("random-steering", False), ("split-friction", True)):
+        env = made(scenario=scenario)
+        env.reset(seed=0, options={"parameters": {"friction": leaf(0.8, 0.7)}})
+        params = env.get_state()["params"]
+        sides = [params[:, [P.car.mu, P.car.mu_r][i]].tolist() for i in range(2)]
+        assert [0.8, 0.7] in sides
+        assert (sides[0] == sides[1]) is not split
 
 
 def test_parameters_need_gradients() -> None:
