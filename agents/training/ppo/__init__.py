@@ -1,0 +1,1 @@
+"""PPO whose update is taken by NumPy."""
