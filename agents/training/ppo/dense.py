@@ -24,8 +24,7 @@ def _relu(z: Single, slope: Single) -> None:
 
 def _silu(z: Single, slope: Single) -> None:
     np.negative(z, out=slope)
-    with np.errstate(over="ignore"):
-        np.exp(slope, out=slope)
+    np.exp(slope, out=slope)
     slope += _ONE
     np.reciprocal(slope, out=slope)  # sigma
     z *= slope

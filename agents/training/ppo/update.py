@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ....envs.backend.extras import extra
+from ..normalise import Standardised
 from .adam import Adam
 from .dense import ACTIVATIONS, Dense, Layer, Single
 
@@ -16,6 +17,7 @@ with extra("train", "training needs {}"):
     import torch
     from stable_baselines3.common.distributions import DiagGaussianDistribution
     from stable_baselines3.common.policies import ActorCriticPolicy
+    from stable_baselines3.common.torch_layers import FlattenExtractor
     from stable_baselines3.common.utils import explained_variance
     from threadpoolctl import ThreadpoolController
 
@@ -39,7 +41,8 @@ class PPO(stable_baselines3.PPO):
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
         clip_range = float(self.clip_range(self._current_progress_remaining))  # type: ignore[operator]
-        with _threads().limit(limits=1, user_api="blas"):  # more wait for each other
+        one_thread = _threads().limit(limits=1, user_api="blas")  # more wait for each other
+        with one_thread, np.errstate(all="ignore"):  # a training looks itself whether all is finite
             losses = self._stepped(parts, clip_range)
         self._n_updates += self.n_epochs
         buffer = self.rollout_buffer
@@ -108,8 +111,14 @@ class Parts(NamedTuple):
 
 def parts_of(policy: Any) -> Parts | None:
     """A policy's parts; None where it has others, or learns in another way."""
-    plain = type(policy) is ActorCriticPolicy and type(policy.optimizer) is torch.optim.Adam
-    if not plain or type(policy.action_dist) is not DiagGaussianDistribution:
+    plain = (
+        (ActorCriticPolicy, policy),
+        (torch.optim.Adam, policy.optimizer),
+        (DiagGaussianDistribution, policy.action_dist),
+    )
+    if not all(type(part) is kind for kind, part in plain) or not policy.share_features_extractor:
+        return None
+    if type(policy.features_extractor) not in (FlattenExtractor, Standardised):
         return None
     hidden = policy.mlp_extractor.policy_net, policy.mlp_extractor.value_net
     kinds = {type(each).__name__ for net in hidden for each in net} - {"Linear"}

@@ -101,6 +101,7 @@ class Trained(BaseFeaturesExtractor):
         {"policy_kwargs": {"net_arch": []}},
         {"policy_kwargs": {"activation_fn": torch.nn.ELU}},
         {"policy_kwargs": {"features_extractor_class": Trained}},
+        {"policy_kwargs": {"share_features_extractor": False}},
         {"policy_kwargs": {"optimizer_class": torch.optim.AdamW}},
         {"policy_kwargs": {"optimizer_kwargs": {"weight_decay": 0.1}}},
     ],
