@@ -1,5 +1,5 @@
-"""PPO whose update NumPy takes: stable-baselines3's minibatches, losses and Adam, in a third of its
-time, which is most of a training's."""
+"""PPO whose update NumPy takes: stable-baselines3's minibatches, losses and Adam in less than half
+of its time, which was most of a training's."""
 
 from collections.abc import Iterator
 from functools import cache
