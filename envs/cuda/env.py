@@ -267,7 +267,7 @@ class CudaVectorEnv(VectorEnv[Any, Any, Any]):
 def bytes_of(sizes: Memory) -> int:
     """What an env needs of the device's memory: its own, and the results of three steps."""
     return sum(
-        math.prod(shape) * np.dtype(kind).itemsize * (3 if name in _FRESH else 1)
+        math.prod(shape) * np.dtype(kind).itemsize * (3 if name in (*_FRESH, "obs") else 1)
         for name, (kind, shape) in sizes._asdict().items()
     )
 
