@@ -2,10 +2,11 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import gymnasium as gym
 from gymnasium.vector import VectorEnv, VectorWrapper
+from gymnasium.vector.utils import batch_space
 
 from ..envs.engine.config import EnvConfig
 from ..envs.task.observation import Entry
@@ -37,6 +38,72 @@ class EnvFacts:
     width: int
 
 
+class PlantKind(NamedTuple):
+    """The text of a plant, as nonlinear MPC predicts with it."""
+
+    tyres: str
+    """The tyre law, of `TYRE_LAWS`."""
+    small_angle: bool
+    roll: bool
+    lags: bool
+    """Whether the actuators lag."""
+    yaw_first: bool
+    """Whether the yaw moment comes before the drive torque."""
+
+
+@dataclass(frozen=True)
+class EnvView:
+    """The spaces and facts of a vector environment, from which an agent is built elsewhere.
+
+    `make_agent`, `facts_of` and our controllers take it for an env. It has no `reset`, no `step`
+    and no seed: an agent built from it learns of the true car by observations alone.
+
+    Attributes:
+        num_envs: Number of rows, a car each.
+        facts: Observation layout, nominal car and limits of the actuators.
+        plants: The kinds of plant among the rows.
+        single_observation_space: Of one row.
+        single_action_space: Of one row.
+    """
+
+    num_envs: int
+    facts: "EnvFacts"
+    plants: frozenset[PlantKind]
+    single_observation_space: gym.Space[Any]
+    single_action_space: gym.Space[Any]
+
+    @classmethod
+    def from_env(cls, env: VectorEnv[Any, Any, Any]) -> "EnvView":
+        """Take the view of a vector env, with its wrappers."""
+        spaces = env.single_observation_space, env.single_action_space
+        return cls(env.num_envs, facts_of(env), plants_of(env), *spaces)
+
+    @property
+    def unwrapped(self) -> "EnvView":
+        """The view itself: nothing lies inside."""
+        return self
+
+    @property
+    def observation_space(self) -> gym.Space[Any]:
+        """Of all rows."""
+        return batch_space(self.single_observation_space, self.num_envs)
+
+    @property
+    def action_space(self) -> gym.Space[Any]:
+        """Of all rows."""
+        return batch_space(self.single_action_space, self.num_envs)
+
+    @property
+    def layout(self) -> tuple[Entry, ...]:
+        """The observation's entries: names, units and bounds."""
+        return self.facts.layout
+
+    @property
+    def nominal(self) -> Vehicle:
+        """The car as controllers know it."""
+        return self.facts.nominal
+
+
 def made(env_id: str, options: Mapping[str, Any]) -> gym.Env[Any, Any]:
     """The env of an id; what its arguments lack is said as the env says it, and no longer."""
     try:
@@ -45,14 +112,16 @@ def made(env_id: str, options: Mapping[str, Any]) -> gym.Env[Any, Any]:
         raise TypeError(str(error).partition(" was raised from the environment")[0]) from None
 
 
-def facts_of(env: AnyEnv) -> EnvFacts:
-    """The facts of an env, a vector env or a stable-baselines3 `VecEnv`.
+def facts_of(env: AnyEnv | EnvView) -> EnvFacts:
+    """The facts of an env, a vector env, a stable-baselines3 `VecEnv` or an `EnvView`.
 
     Raises ValueError where the rows of a vector env have different nominal cars or limits, or where
     a wrapper of stable-baselines3 changes the observations.
     """
     nominals: Sequence[Any]
     vehicles: Sequence[Any]
+    if isinstance(env, EnvView):
+        return env.facts
     if isinstance(env, gym.Env):
         base: Any = env.unwrapped
         layout, width = env.get_wrapper_attr("layout"), base.action_space.shape[0]
@@ -76,6 +145,17 @@ def facts_of(env: AnyEnv) -> EnvFacts:
                 "vehicle or other limits than row 0: make an agent for each kind of car"
             )
     return EnvFacts(layout, nominals[0], *limits[0], period, kind, width)
+
+
+def plants_of(env: AnyEnv | EnvView) -> frozenset[PlantKind]:
+    """The kinds of plant among the rows of an env."""
+    if isinstance(env, EnvView):
+        return env.plants
+    scenarios = ((config.scenario, config.yaw_first) for config in configs_of(env))
+    return frozenset(
+        PlantKind(each.tyres, each.small_angle, each.roll, each.lags, first)
+        for each, first in scenarios
+    )
 
 
 def configs_of(env: AnyEnv) -> Sequence[EnvConfig]:

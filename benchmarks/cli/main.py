@@ -15,7 +15,7 @@ from ..harness.errors import one_line
 from ..report.page import check_page, write_page
 from ..suites import SUITES, Request, run_suites
 from .calibrate import calibrate_command
-from .challenge import Agents, EnvId, Estimators, Fresh, Limit, Scenarios, challenge_of
+from .challenge import Agents, EnvId, Estimators, Fresh, Limit, Salt, Scenarios, challenge_of
 from .enjoy import enjoy_command
 from .export import Trust, export_command
 from .lane import lane_command
@@ -196,6 +196,7 @@ def bench(
     scenario: Scenarios = None,
     env_id: EnvId = "",
     fresh: Fresh = False,
+    salt: Salt = "",
     limit: Limit = 600.0,
     trust: Trust = False,
     engine_name: EngineName = PROCESSES,
@@ -211,6 +212,7 @@ def bench(
         scenario or [],
         env_id,
         fresh,
+        salt,
         limit,
         episodes,
         quick,

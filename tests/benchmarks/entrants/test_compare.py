@@ -168,16 +168,26 @@ def test_otherwise_they_drive_anew_on_everybodys_seeds(
     assert ("Publishable" in verdict(found)[-1]) == (why == "fresh")
 
 
-def test_fresh_seeds_follow_the_users_file(
-    tmp_path: Path, driven: list[tuple[Cell, tuple[int, ...]]]
+def test_fresh_seeds_are_nobodys_to_foresee_and_can_be_driven_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, driven: list[tuple[Cell, tuple[int, ...]]]
 ) -> None:
-    salts = [compare.compare(challenge(tmp_path, fresh=True)).salt]
-    (tmp_path / "pd.py").write_text(PD + "# better\n")
-    path = (Pair(f"{tmp_path}/pd.py"),)
-    salts += [compare.compare(Challenge(path, fresh=fresh)).salt for fresh in (True, False)]
-    assert len(set(salts)) == 3
-    (tmp_path / "pd.py").write_text(PD)
-    assert compare.compare(Challenge(path, fresh=True)).salt == salts[0]
+    """Other ones each time; with the bytes that the driver drew, others for another file."""
+    rehearsed = frozenset({str((tmp_path / "pd.py").resolve())})
+    monkeypatch.setattr(compare, "_rehearsed", lambda *_: rehearsed)
+    found = [compare.compare(challenge(tmp_path, fresh=True)) for _ in range(2)]
+    assert found[0].salt != found[1].salt
+    again = compare.compare(challenge(tmp_path, salt=found[0].salt))
+    assert again.salt == found[0].salt and "Not publishable" in verdict(again)[-1]
+    assert f"--salt {found[0].salt} repeats them" in verdict(found[0])[-1]
+    mine = [seeds for cell, seeds in driven if cell.is_users]
+    third = len(mine) // 3
+    assert mine[:third] == mine[2 * third :] != mine[third : 2 * third]
+    monkeypatch.setattr("secrets.token_hex", lambda n: "0" * 2 * n)
+    salts = set()
+    for text in (PD, PD + "# better\n"):
+        (tmp_path / "pd.py").write_text(text)
+        salts.add(compare.compare(Challenge((Pair(f"{tmp_path}/pd.py"),), fresh=True)).salt)
+    assert len(salts) == 2
 
 
 def test_the_verdict_has_a_sentence_for_each_and_five_lines_at_most(
@@ -265,6 +275,8 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
     "vehicle": ({"vehicle": "comss"}, "comss"),
     "scenario": ({"scenarios": ({"bas": "gust"},)}, "bas"),
     "limit": ({"limit": 0.0}, "above 0"),
+    "salt": ({"salt": "xyz"}, "hexadecimal"),
+    "salt beside seeds": ({"salt": "ab", "seeds": (1, 2)}, "no others beside it"),
 }
 
 
