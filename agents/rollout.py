@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.vector import VectorEnv
 
+from ..envs.backend.extras import extra
 from ..envs.backend.files import whole
 from ..envs.record import Log, Record, concatenate
 
@@ -149,7 +150,8 @@ class Rollout:
 
     def to_pandas(self) -> "DataFrame":
         """The table, a row a step, units in its attribute `attrs["units"]` (needs `report`)."""
-        from pandas import DataFrame
+        with extra("report", "to_pandas needs pandas"):
+            from pandas import DataFrame
 
         table = DataFrame(self.columns)
         table.attrs["units"] = dict(self.units)
@@ -157,8 +159,9 @@ class Rollout:
 
     def to_parquet(self, path: str | Path) -> None:
         """Write the table; units stand in the columns' metadata (needs the extra `report`)."""
-        import pyarrow as pa
-        import pyarrow.parquet as pq
+        with extra("report", "to_parquet needs pyarrow"):
+            import pyarrow as pa
+            import pyarrow.parquet as pq
 
         fields = [
             pa.field(name, pa.float64(), metadata={"unit": self.units[name]})
@@ -170,7 +173,8 @@ class Rollout:
 
     def plot(self) -> "Figure":
         """Sideslip angle, yaw rate, yaw moment and steering over time (needs `report`)."""
-        from matplotlib.figure import Figure
+        with extra("report", "plot needs matplotlib"):
+            from matplotlib.figure import Figure
 
         figure = Figure(figsize=(8.0, 7.0), layout="constrained")
         axes = figure.subplots(4, 1, sharex=True)

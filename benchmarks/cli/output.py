@@ -2,12 +2,14 @@
 
 import json
 import platform
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
@@ -56,6 +58,16 @@ def check_files(**paths: Path | None) -> None:
         if path and path.suffix.lower() not in known and not path.is_char_device():
             raise ValueError(f"{path}: expected a file that ends in {' or '.join(known)}")
     check_writable(*paths.values())
+
+
+@contextmanager
+def goes_on(how: str) -> Iterator[None]:
+    """End with exit status 130 where the user interrupts, and say how to continue."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        Console(stderr=True, soft_wrap=True).print(f"stopped; to go on: {how}", highlight=False)
+        raise typer.Exit(130) from None
 
 
 def wrote(console: Console, path: Path) -> None:

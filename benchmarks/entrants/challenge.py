@@ -88,13 +88,13 @@ def pairs_of(agents: Sequence[str], estimators: Sequence[str], trust: bool = Fal
     pairs = [
         Pair(agent, each, trust and agent.endswith(ZIP))
         for agent in agents
-        for each in estimators or [_usual(agent)]
+        for each in estimators or [usual_estimator(agent)]
     ]
     pairs += [Pair(REFERENCE_CONTROLLER, each) for each in estimators if each]
     return list(dict.fromkeys(pairs))
 
 
-def _usual(agent: str) -> str:
+def usual_estimator(agent: str) -> str:
     """The estimator for an agent: a policy's own, none for what saw an env alone."""
     if is_policy(agent):
         return load_policy(agent).card.estimator or ""
