@@ -3,6 +3,7 @@
 import importlib.metadata
 import importlib.util
 import os
+import re
 import subprocess
 import sys
 import zipfile
@@ -134,6 +135,11 @@ def test_one_version() -> None:
 
 
 @pytest.mark.smoke
+def test_the_citation_is_of_this_version() -> None:
+    text = (ROOT / "CITATION.cff").read_text()
+    assert re.findall(r"^version: (.+)$", text, re.MULTILINE) == [sideslip.__version__]
+
+
 def test_what_is_no_code_is_installed_too() -> None:
     from sideslip.agents.learned.files import load_policy, shipped
     from sideslip.benchmarks.speed.c_plant import source
