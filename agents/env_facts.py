@@ -1,8 +1,4 @@
-"""Facts of an environment, single or vector, that controllers are designed from.
-
-What reads an observation by name takes its numbers for SI units, and its own action for a share of
-the full scale. So every wrapper around the env is known to change neither, or is refused.
-"""
+"""Facts of an environment, single or vector, that controllers are designed from."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -24,8 +20,7 @@ if TYPE_CHECKING:
 else:
     AnyEnv = Any  # stable-baselines3 comes with an extra, and needs a second to load
 
-# By package and name: this module loads none of them, and a vector twin has its single one's name.
-# Ours change observations and describe by their `layout` what they give.
+# Not loaded here; vector twins have the same names. Ours describe what they change by `layout`.
 _TRANSPARENT = {
     "gymnasium": "Wrapper VectorWrapper OrderEnforcing PassiveEnvChecker TimeLimit Autoreset "
     "RewardWrapper VectorRewardWrapper ClipReward NormalizeReward TransformReward AddWhiteNoise "
@@ -78,10 +73,8 @@ def facts_of(env: AnyEnv) -> EnvFacts:
     try:
         return _facts(env)
     except AttributeError as error:
-        raise TypeError(
-            "an agent is built for an env of this package, as "
-            f"gym.make('sideslip/YawVision-v0') makes one, got {brief(env)}"
-        ) from error
+        made_by = "an agent is built for an env as of gym.make('sideslip/YawVision-v0')"
+        raise TypeError(f"{made_by}, got {brief(env)}") from error
 
 
 def _facts(env: Any) -> EnvFacts:

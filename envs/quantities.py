@@ -26,8 +26,8 @@ def quantity(
     default: Any = dataclasses.MISSING,
     per: tuple[str, ...] = (),
 ) -> Any:
-    """A field whose numbers are plausible from low to high, each times the fields `per`; of cars
-    from a model of 30 g to a lorry."""
+    """A field whose numbers are plausible from low to high, each times the fields `per`; where low
+    is above zero, they are positive at any rate."""
     metadata = {"unit": unit, "text": text, "plausible": (low, high), "per": per}
     return dataclasses.field(default=default, metadata=metadata)
 
@@ -36,11 +36,12 @@ def check_plausible(values: Any) -> None:
     """Raise ValueError for a number of a dataclass outside its range, with the unit that it may be
     in by mistake."""
     entries = [each for each in dataclasses.fields(values) if "plausible" in each.metadata]
-    for entry in sorted(entries, key=lambda each: len(each.metadata["per"])):  # those last go by others
-        unit, per = entry.metadata["unit"], entry.metadata["per"]
-        value = getattr(values, entry.name)
-        scale = math.prod(getattr(values, name) for name in per)
-        low, high = (scale * end for end in entry.metadata["plausible"])
+    for entry in sorted(
+        entries, key=lambda each: len(each.metadata["per"])
+    ):  # those last go by others
+        unit, _, (low, high), per = entry.metadata.values()
+        value, scale = getattr(values, entry.name), math.prod(getattr(values, n) for n in per)
+        low, high = scale * low, scale * high
         for number in value if isinstance(value, tuple) else (value,):
             if number is None or low <= number <= high:
                 continue

@@ -13,8 +13,6 @@ LATERAL = ("mass", "yaw_inertia", "front_arm", "rear_arm", "front_stiffness", "r
 """What a linear bicycle is made of, in the order of `linear.Bicycle`."""
 _POINTS = ("mass", "front_arm", "rear_arm")  # as inertia, that of two points over the axles
 
-_MAY_BE_ZERO = ("motor_lag", "steering_lag", "motor_power", "transfer_height")
-_OF_ANY_SIGN = ("antenna_ahead", "antenna_left")
 _SMALLEST = 1.0 / LARGEST  # what is below is taken for zero: it is divided by
 
 
@@ -70,9 +68,9 @@ class Vehicle:
             if not isinstance(value, int | float) or isinstance(value, bool):
                 raise TypeError(f"Vehicle.{entry.name}: expected a number, got {brief(value)}")
             least, low_ok = "positive and ", value > _SMALLEST
-            if entry.name in _MAY_BE_ZERO:
+            if entry.metadata["plausible"][0] == 0:
                 least, low_ok = "zero or more and ", value > _SMALLEST or value == 0.0
-            elif entry.name in _OF_ANY_SIGN:
+            elif entry.metadata["plausible"][0] < 0:
                 least, low_ok = "", True
             if not (is_finite(value) and low_ok):
                 got = f"{brief(value)} {entry.metadata['unit']}"

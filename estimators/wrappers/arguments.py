@@ -72,7 +72,13 @@ class Arguments:
         source: Any = usual_estimator(slow_sensors) if estimator is None else estimator
         recorded = source
         if misplaced:
-            _refuse(source, misplaced, slow_sensors)
+            wrong = unknown_names("argument of EstimateObservation", misplaced, _OWN)
+            if isinstance(source, str) and "did you mean" not in wrong:
+                make_estimator(
+                    source, sensors=slow_sensors, **misplaced
+                )  # names the nearest option
+                wrong = f"options of an estimator are passed as options={brief(dict(misplaced))}"
+            raise TypeError(wrong)
         self.options = dict(options or {})
         self.truth = isinstance(vehicle, str) and vehicle == TRUTH
         self.vehicle = None if vehicle is None or self.truth else vehicle_from(vehicle)
@@ -123,15 +129,6 @@ class Unrecorded:
             f"a spec cannot build {self._label} once more: it was passed as an object; pass its "
             "class, a factory or a name"
         )
-
-
-def _refuse(source: Any, misplaced: Mapping[str, Any], sensors: Mapping[str, SlowSensor]) -> None:
-    """TypeError for arguments that the wrapper has not."""
-    wrong = unknown_names("argument of EstimateObservation", misplaced, _OWN)
-    if isinstance(source, str) and "did you mean" not in wrong:
-        make_estimator(source, sensors=sensors, **misplaced)  # which has the nearest of its options
-        wrong = f"an estimator's options are passed as options={brief(dict(misplaced))}"
-    raise TypeError(wrong)
 
 
 def usual_estimator(slow_sensors: Iterable[str]) -> str:

@@ -62,7 +62,7 @@ def test_small_and_large_cars_are_plausible(car: dict[str, Any]) -> None:
 @pytest.mark.parametrize("kind", [Vehicle, Scenario])
 def test_every_number_has_a_unit_and_a_range_around_its_default(kind: Any) -> None:
     """But times and places that may stand for never and nowhere, and what is refused anyway."""
-    without = {"name", "trace", "onset", "hold", "change_start", "tyre_change_time", "wind_start",
+    without = {"name", "trace", "onset", "hold", "change_start", "wind_start",
                "wind_length", "disturbance_time", "curve_start", "curve_ramp", "half_width", "hdop",
                "hdop_time", "hdop_spread", "bank", "grade", "camera_loss", "camera_heading",
                "camera_offset", "camera_outage", "gps_outage"}  # fmt: skip
@@ -129,7 +129,7 @@ SCENARIO_MISTAKES = [
     ({"friction_right": (20.0, 30.0)}, r"friction_right: 20.0 is .*%"),
     ({"speed": 300.0}, r"speed: 300.0 m/s .*\(is it in km/h\?\)"),
     ({"speed": (60.0, 150.0)}, r"speed: 150.0 m/s .*km/h"),
-    ({"duration": 10_000.0}, r"duration: 10000.0 s .* 0.001 to 3600 .*ms"),
+    ({"duration": 10_000.0}, r"duration: 10000.0 s .* 0 to 3600 .*ms"),
     ({"steering": "step", "amplitude": 5.0}, r"amplitude: 5.0 rad .*deg"),
     ({"initial_gamma": 30.0}, r"initial_gamma: 30.0 rad/s .*deg/s"),
     ({"front_stiffness": 6000.0}, "front_stiffness: 6000.0 is"),  # it is a factor
