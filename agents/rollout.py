@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.vector import VectorEnv
 
+from ..envs.arguments import brief
 from ..envs.backend.extras import extra
 from ..envs.backend.files import whole
 from ..envs.record import Log, Record, concatenate
@@ -212,11 +213,17 @@ def rollout(
 ) -> Rollout:
     """Run one episode.
 
-    env: an environment or its id. agent, options: of `steps_of`; seed: of the reset.
+    env: an environment or its id. agent, options: of `steps_of`; seed: of the reset. Raises
+    TypeError for a vector env, or one that is not of this package.
     """
     if isinstance(env, str):
         with contextlib.closing(gym.make(env)) as made:
             return rollout(made, agent, seed, options)
+    if not (isinstance(env, gym.Env) and env.has_wrapper_attr("layout")):
+        raise TypeError(
+            f"rollout runs one env of this package, got {brief(env)}; agents.rollout.drives_of "
+            "runs a vector env"
+        )
     base: Any = env.unwrapped
     layout = env.get_wrapper_attr("layout")
     rows, records = [], []

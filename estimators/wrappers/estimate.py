@@ -74,11 +74,12 @@ class EstimateObservation(
         vehicle: VehicleSource | None = None,
         options: Mapping[str, Any] | None = None,
         name: str | None = None,
+        **misplaced: Any,
     ) -> None:
         self._base = base_of(env)
         clocks = self._base.slow_sensors
         self._arguments = Arguments(
-            estimator, outputs, std, replace, vehicle, options, name, clocks
+            estimator, outputs, std, replace, vehicle, options, name, clocks, misplaced
         )
         RecordConstructorArgs.__init__(self, **self._arguments.recorded)
         gym.Wrapper.__init__(self, env)

@@ -50,7 +50,7 @@ def test_round_trip(tmp_path: Path, vehicle: Vehicle) -> None:
 def test_a_mapping_may_start_from_another_vehicle() -> None:
     assert vehicle_from({"base": "coms", "mass": 400.0}) == COMS.replace(mass=400.0)
     assert vehicle_from({"base": COMS}) == COMS
-    axle = {"front_stiffness_axle": 9000.0, "rear_stiffness": 5000.0}
+    axle = {"front_stiffness_axle": 9000.0, "rear_stiffness_per_tyre": 5000.0}
     assert vehicle_from({"base": "coms"} | axle).front_stiffness == 4500.0
     assert vehicle_from({"base": "coms"} | axle).rear_stiffness == 5000.0
 
