@@ -5,6 +5,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from ...envs.record import FAST, Array, Log
 from ...envs.recordings.log_file import packet_rows
@@ -96,6 +97,12 @@ def ground_speed(log: Log) -> Array:
     """The mean speed of the front wheels in m/s; (rows,)."""
     fast = log.record.fast
     return np.asarray(0.5 * (fast[:, FAST.wheel_left] + fast[:, FAST.wheel_right]))
+
+
+def backward(log: Log) -> npt.NDArray[np.bool_]:
+    """The rows that are driven backward: at a negative speed, or with a truth about half a turn."""
+    turn = np.abs(np.nan_to_num(log.truth.get("beta", np.zeros(len(log.time))))) / math.pi
+    return np.asarray((ground_speed(log) < 0.0) | ((turn > 0.75) & (turn < 1.01)))
 
 
 def path(log: Log, beta: Array) -> tuple[Array, Array]:
