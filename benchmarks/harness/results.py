@@ -105,9 +105,10 @@ class Suite:
 
     verdict: the answer in plain words, at most five lines (`harness.verdict`). warnings: of the
     input, that stand over it. answers: figures that answer a question each: (question, plotly
-    figure, the answer in a sentence). figures: the others, (title, figure, what to see). Both are empty where the extra `report` is not installed
-    or pictures were not asked for. explorers: figures with menus. maps: for the summary's PNG.
-    files: what the report offers to save, (file name, media type, text).
+    figure, the answer in a sentence). figures: the others, (title, figure, what to see). Both are
+    empty where the extra `report` is not installed or pictures were not asked for. explorers:
+    figures with menus. maps: for the summary's PNG. files: what the report offers to save, (file
+    name, media type, text).
     """
 
     name: str

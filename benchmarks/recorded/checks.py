@@ -9,16 +9,16 @@ import numpy.typing as npt
 from scipy.ndimage import label, median_filter, uniform_filter1d
 from scipy.stats import linregress
 
-from ...envs.record import FAST, PACKET, Array, Log
+from ...envs.record import FAST, Array, Log
 from ...envs.vehicle.vehicle import GRAVITY, Vehicle
-from .emulate import backward, ground_speed, heading
+from .emulate import backward, course_steps, ground_speed
+from .emulate import moving as moving
 
 LEAST_RELATED = 0.5  # correlation, below which steering and yaw rate have nothing in common
 TRUTH = "the sideslip truth"  # how a warning begins that puts the score in doubt
 COMPASS = "degrees from north, clockwise? map it as course from north"
 FACTOR = 1.8  # by which a column may differ from what the others imply
 _SURE = 3.0  # standard errors beyond it
-_FAST_ENOUGH = 4.0  # m/s
 _TURNING = 0.3  # m/s2 RMS, below which nothing is judged
 _MILD = 5.0  # m/s2, up to which tyres are linear
 _FEW = 10  # samples, below which nothing is judged
@@ -36,28 +36,22 @@ _UNITS = {
     2.237: "mph in a column of m/s?",
     1.0 / GRAVITY: "g in a column of m/s2?",
     1.0 / 3.6: "the speed in km/h?",
-    1.0 / 2.237: "the speed in mph?",
 }
-_GUESSES = (  # a ratio of steering angles, and what it looks like from there on
-    (300.0, "degrees of the steering wheel in a column of radians?"),
-    (35.0, "degrees in a column of radians?"),
-    (6.0, "the angle of the steering wheel?"),
-    (0.05, "another unit or another car?"),
-    (0.0, "radians in a column of degrees?"),
-)
-
-
-def moving(log: Log) -> npt.NDArray[np.bool_]:
-    """The rows that are fast enough to judge."""
-    return np.asarray(ground_speed(log) > _FAST_ENOUGH)
+_GUESSES = {  # a ratio of steering angles, and what it looks like from there on
+    300.0: "degrees of the steering wheel in a column of radians?",
+    35.0: "degrees in a column of radians?",
+    6.0: "the angle of the steering wheel?",
+    0.05: "another unit or another car?",
+    0.0: "radians in a column of degrees?",
+}
 
 
 def _raw(log: Log) -> dict[str, Array]:
     """The columns that a log has, by name, (rows,) each."""
     names = {"gyro", "accel_y", "accel_x", "steer"} & set(log.record.present)
     found = {name: log.record.fast[:, getattr(FAST, name)] for name in names}
-    truth = {TRUTH: log.truth["beta"]} if "beta" in log.truth else {}
-    return {"speed": ground_speed(log), **found, **truth}
+    found |= {TRUTH: log.truth["beta"]} if "beta" in log.truth else {}
+    return {"speed": ground_speed(log), **found}
 
 
 def _jumps(log: Log, name: str) -> npt.NDArray[np.bool_]:
@@ -72,10 +66,10 @@ def _jumps(log: Log, name: str) -> npt.NDArray[np.bool_]:
         steps = np.minimum(steps, np.abs(2.0 * math.pi - steps))
     least, rate = _JUMPS[name]
     limit = max(least + rate * log.record.dt, 10.0 * float(np.percentile(steps, 90)))
-    if steps.max() <= limit:
-        return steps > limit
-    usual = median_filter(x, max(round(2.0 / log.record.dt), 3), mode="nearest")
-    return np.asarray((steps > limit) | (np.abs(x - usual) > limit))
+    if (jumps := steps > limit).any():
+        usual = median_filter(x, max(round(2.0 / log.record.dt), 3), mode="nearest")
+        jumps |= np.abs(x - usual) > limit
+    return np.asarray(jumps)
 
 
 def _columns(logs: Sequence[Log], *names: str) -> list[Array]:
@@ -106,10 +100,12 @@ def _line(y: Array, x: Array, *beside: Array) -> Any:
     return linregress(x, y) if min(x.std(), y.std()) > 1e-9 else None
 
 
-def _contradiction(line: Any, column: str, implied: str, inverse: bool = False) -> list[str]:
-    """A sentence if a line's slope, or its inverse, is surely no number about 1."""
+def _contradiction(
+    line: Any, column: str, implied: str, inverse: bool = False, factor: float = FACTOR
+) -> list[str]:
+    """A sentence if a line's slope, or its inverse, is surely not within a factor of 1."""
     margin = _SURE * line.stderr if line else math.inf
-    if not line or 1.0 / FACTOR - margin < line.slope < FACTOR + margin:
+    if not line or 1.0 / factor - margin < line.slope < factor + margin:
         return []
     if abs(line.rvalue) < LEAST_RELATED:
         return [f"{column} and {implied} are unrelated (correlation {line.rvalue:.2f})"]
@@ -119,33 +115,31 @@ def _contradiction(line: Any, column: str, implied: str, inverse: bool = False) 
     return [f"{column} is {factor:.3g} times {implied}: {guess}"]
 
 
-def _steering(logs: Sequence[Log], car: Vehicle, mild: float, beside: float) -> Any:
-    """The steering that the linear car needs for its yaw rate over the logged one, where speed x
-    yaw rate is mild, and accel_y not far beside it, in m/s2."""
+def _steering(logs: Sequence[Log], car: Vehicle, steady: bool, tyres: float = 1.0) -> Any:
+    """The steering that the linear car needs for its yaw rate over the logged one. steady: not in
+    hard turns, nor where accel_y is not speed x yaw rate. tyres: 0 for a neutral car."""
     speed, gyro, steer, accel_y = _columns(logs, "speed", "gyro", "steer", "accel_y")
-    accel_y = accel_y if accel_y.any() else speed * gyro
     bend = car.rear_arm / car.front_stiffness - car.front_arm / car.rear_stiffness
-    under = max(car.mass * bend / (2.0 * car.wheelbase), 0.0)
-    used = (np.abs(speed * gyro) < mild) & (np.abs(accel_y - speed * gyro) < beside)
-    used |= used.sum() < _FEW
+    under = tyres * max(car.mass * bend / (2.0 * car.wheelbase), 0.0)
+    slides = np.abs(accel_y - speed * gyro) > (1.0 if accel_y.any() else math.inf)
+    used = (np.abs(speed * gyro) < _MILD) & ~slides
+    used |= (used.sum() < _FEW) | (not steady)
     return _line((gyro * (car.wheelbase / speed + under * speed))[used], steer[used])
 
 
 def steering_gain(logs: Sequence[Log], car: Vehicle) -> tuple[float, float]:
     """(gain, correlation): by how much the logged steering is to be multiplied to turn the car as
     its gyro shows, from steady turns of the linear car."""
-    line = _steering(logs, car, math.inf, math.inf)
+    line = _steering(logs, car, steady=False)
     return (float(line.slope), float(line.rvalue)) if line else (1.0, 0.0)
 
 
 def resolution(log: Log) -> float:
     """The step between the values of the gyro in rad/s, 0 for one too fine to be seen."""
     steps = np.diff(np.unique(log.record.fast[:, FAST.gyro]))
-    if not 2 <= len(steps) < len(log.time) / 3:
-        return 0.0
-    step = float(np.median(steps))
-    uneven = np.abs(steps / step - np.rint(steps / step)).mean()
-    return step if uneven < 0.05 and steps.min() > 0.5 * step else 0.0
+    step = float(np.median(steps)) if 2 <= len(steps) < len(log.time) / 3 else math.inf
+    even = np.abs(steps / step - np.rint(steps / step)).max(initial=0.0) < 0.1
+    return step if even and math.isfinite(step) and steps.min() > 0.5 * step else 0.0
 
 
 def saturated(log: Log) -> npt.NDArray[np.bool_]:
@@ -177,35 +171,13 @@ def swapped(logs: Sequence[Log]) -> str:
     return ""
 
 
-def _course(logs: Sequence[Log], lag: float) -> Array:
-    """(5, steps) between fixes at least `lag` s apart, in rad: the course before and after, and the
-    change of course, integral of the gyro and sideslip, by the truth or else by accel_y."""
-    found = [np.zeros((5, 0))]
-    for log in (log for log in logs if "gps" in log.slow):
-        fixes, own, dt = log.record.packets_of("gps"), _raw(log), log.record.dt
-        place = fixes[:, PACKET.captured].astype(int) - log.record.first
-        good = (fixes[:, PACKET.quality] > 0.0) & (place >= 0) & (place < len(log.time))
-        good[good] &= (moving(log) & ~backward(log))[place[good]]
-        place, course = place[good], fixes[good, PACKET.value]
-        if len(place) < _FEW:
-            continue
-        usual = max(float(np.median(np.diff(place))), 1.0)
-        n = max(math.ceil(lag / (usual * dt) - 1e-9), 1)
-        accel_y = own.get("accel_y", own["speed"] * own["gyro"])
-        turned = np.cumsum(accel_y / np.maximum(own["speed"], _FAST_ENOUGH)) * dt
-        slip = own.get(TRUTH, turned - heading(log))
-        columns = np.stack([np.unwrap(course), heading(log)[place], slip[place]])
-        steps = np.vstack([course[:-n], course[n:], columns[:, n:] - columns[:, :-n]])
-        found.append(steps[:, (place[n:] - place[:-n] < 1.5 * n * usual) & np.isfinite(steps[4])])
-    return np.concatenate(found, axis=1)
-
-
 def _zeros(logs: Sequence[Log], name: str) -> list[str]:
     """A sentence if a column is filled with zeros where the car turns."""
-    x, moves = [np.zeros(0)], sum(int(moving(log).sum()) for log in logs)
-    for own in (_raw(log) for log in logs if name in _raw(log)):
+    x, moves = [np.zeros(0)], sum(moving(log).sum() for log in logs)
+    for log in (log for log in logs if name in _raw(log)):
+        own = _raw(log)
         turns = np.hypot(own["speed"] * own["gyro"], own.get("accel_y", 0.0)) > 1.0
-        x.append(own[name][turns & (own["speed"] > _FAST_ENOUGH)])
+        x.append(own[name][turns & moving(log)])
     values, counts = np.unique(np.concatenate(x), return_counts=True)
     zeros, others = counts[values == 0.0].sum(), counts[values != 0.0]
     if zeros <= max(_ZEROS[name] * moves, 5 * others.max(initial=1)):
@@ -215,7 +187,7 @@ def _zeros(logs: Sequence[Log], name: str) -> list[str]:
 
 def _fixes(logs: Sequence[Log]) -> list[str]:
     """What a course cannot be: held while the gyro turns, and elsewhere for a fix or two."""
-    before, after, change, turned, _ = _course(logs, 0.0)
+    before, after, change, turned, _ = course_steps(logs, 0.0)
     runs, _ = label(change == 0.0)
     held = (runs > 0) & (np.abs(np.bincount(runs, turned, 1)) > 0.1)[runs]
     if held.any():
@@ -231,16 +203,19 @@ def _fixes(logs: Sequence[Log]) -> list[str]:
     return []
 
 
-def _steering_text(line: Any) -> list[str]:
-    """What is wrong with the steering, by that needed over that logged."""
+def _steering_text(logs: Sequence[Log], car: Vehicle, steady: bool) -> list[str]:
+    """What is wrong with the steering, by steady turns and all rows, by these and other tyres."""
+    line, *lines = (_steering(logs, car, *how) for how in ((steady,), (False,), (False, 0.0)))
     found = _contradiction(line, "steering", "yaw rate")
+    if not all(_contradiction(each, "", "") for each in lines):
+        return []
     if not found or abs(line.rvalue) < LEAST_RELATED:
         return found
     ratio, found = 1.0 / abs(line.slope), []
     if line.slope < 0.0:
         found.append("steering and yaw rate differ in sign (--steering-sign -1 turns it)")
     if not 0.5 < ratio < 2.0:
-        guess = next(text for least, text in _GUESSES if ratio >= least)
+        guess = next(text for least, text in _GUESSES.items() if ratio >= least)
         text = f"the logged steering is {ratio:.3g} times what the yaw rate needs: {guess}"
         found.append(f"{text} (--steering-ratio {ratio:.3g} divides it)")
     return found
@@ -267,34 +242,33 @@ def remarks_of(logs: Sequence[Log]) -> list[str]:
 def warnings_of(logs: Sequence[Log], car: Vehicle) -> list[str]:
     """What does not fit together in a drive, a sentence each."""
     found = [f"columns seem to be swapped, {what}"] if (what := swapped(logs)) else []
-    if count := sum(int(saturated(log).sum()) for log in logs):
+    if count := sum(saturated(log).sum() for log in logs):
         found.append(f"the gyro is at its limit in {count} rows")
     for name in _JUMPS:
-        if count := sum(int(_jumps(log, name).sum()) for log in logs if name in _raw(log)):
+        if count := sum(_jumps(log, name).sum() for log in logs if name in _raw(log)):
             found.append(f"{name} jumps as in no car, in {count} rows")
     judged = [log for log in logs if "beta" in log.truth] or logs
     turning, accel_y, slipping = _columns(judged, "turning", "accel_y", "slipping")
     if len(turning) < _FEW or max(np.std(turning), np.std(accel_y)) < _TURNING:
         return found
     found += [text for name in _ZEROS for text in _zeros(logs, name)] + _fixes(logs)
-    used = (np.abs(turning) < _MILD) | slipping.any()
-    used |= 2 * used.sum() < len(used)
+    used = slipping.any() | (np.abs(turning) < _MILD)
     accel = _line(accel_y[used], turning[used], slipping[used])
     if np.std(turning) < _TURNING and not (accel and abs(accel.rvalue) > 0.8):
         return found
-    _, _, change, turned, slipped = _course(logs, 1.0)
+    _, _, change, turned, slipped = course_steps(logs, 1.0)
     course, wrong, unit = _line(change, turned, slipped), [], accel.slope if accel else 1.0
     if accel and course and 0.67 < accel.slope / course.slope < 1.5:
         wrong = _contradiction(accel, "the yaw rate", "what accel_y and course imply", True)
         unit = 1.0 if wrong else unit
     if not wrong:
-        wrong = _contradiction(accel, "accel_y", "speed x yaw rate")
-        steer = _steering(logs, car, _MILD, math.inf if wrong else 1.0)
-        wrong += _steering_text(steer) + _course_text(course, turned)
+        factor = FACTOR if slipping.any() else 3.0  # the faster the turns, the more they differ
+        wrong = _contradiction(accel, "accel_y", "speed x yaw rate", factor=factor)
+        wrong += _steering_text(logs, car, steady=not wrong) + _course_text(course, turned)
     found += wrong
-    in_course, by = _line(change, slipped, turned), "what gyro, accel_y and speed imply"
     if not slipping.any():
         return found
+    in_course, by = _line(change, slipped, turned), "what gyro, accel_y and speed imply"
     if not accel or abs(accel.rvalue) < LEAST_RELATED:
         return found + _contradiction(in_course, TRUTH, "what gyro and course imply", True)
     found += _contradiction(_line(accel_y / unit, slipping, turning), TRUTH, by, True)
