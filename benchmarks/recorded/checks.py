@@ -189,7 +189,7 @@ def _fixes(logs: Sequence[Log]) -> list[str]:
     """What a course cannot be: held while the gyro turns, and elsewhere for a fix or two."""
     before, after, change, turned, _ = course_steps(logs, 0.0)
     runs, _ = label(change == 0.0)
-    held = (runs > 0) & (np.abs(np.bincount(runs, turned, 1)) > 0.1)[runs]
+    held = (runs > 0) & (np.bincount(runs, np.abs(turned), 1) > 0.1)[runs]
     if held.any():
         return [f"the course stands still in {held.sum()} fixes while the gyro turns"]
     beside = np.angle(np.exp(1j * (change - turned)))
