@@ -152,7 +152,7 @@ def test_fifty_clean_drives_have_no_warning(seed: int) -> None:
         ("the course jumps to 0 deg and back", lambda log: filled(log, 0.0)),
         ("the course jumps to -57.3 deg and back", lambda log: changed(log, course=put(-1.0, 40))),
         ("the course stands still in [0-9]* fixes",
-            lambda log: changed(log, course=lambda x: put(x[30], 30, 12)(x))),
+            lambda log: changed(log, course=lambda x: put(x[30], 30, 40)(x))),
         ("the course does not follow", lambda log: changed(log, course=times(0.0))),
         ("the course shows no sideslip", of_heading),
         ("accel_y is 0.1.* g in a column", lambda log: changed(log, {"accel_y": times(0.102)})),
