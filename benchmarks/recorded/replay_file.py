@@ -10,13 +10,14 @@ from ...envs.recordings.sources import is_nmea
 from ...envs.vehicle.vehicles import VehicleSource, vehicle_from
 from ..harness.drives import SETTLED
 from ..harness.results import Suite
-from .checks import warnings_of
+from .checks import TRUTH, remarks_of, warnings_of
 from .identify import Identified, identify, suite_of
 from .suite import corners, replay
 from .wires import Wires, corrected
 
 FITTED, NOMINAL = "ferrari-250lm-fitted", "ferrari-250lm-nominal"
 FACTOR = 0.7  # of the fitted tyres, where no vehicle is named
+DOUBT = "The truth of this log is in doubt, and with it all errors: see the warnings."
 
 
 def identify_file(
@@ -35,8 +36,10 @@ def identify_file(
     logs, remarks = read_parts(log, parse_mapping(mapping), end=until)
     car = vehicle_from(vehicle)
     found = identify(logs, car, wires, tyres)
-    found.remarks = [*remarks, *warnings_of(logs, car), *found.remarks]
-    return found, suite_of(found, logs[0].name)
+    found.remarks = [*remarks, *remarks_of(logs), *found.remarks]
+    suite = suite_of(found, logs[0].name)
+    suite.warnings = warnings_of(logs, car)
+    return found, suite
 
 
 def replay_file(
@@ -82,7 +85,7 @@ def replay_file(
         )
     else:
         car = design = vehicle_from(vehicle)
-    remarks += [f"WARNING: {text}." for text in warnings_of(logs, design)]
+    remarks += remarks_of(logs)
     settings = {"noise": wires.noise} | settings
     parts = [part for part in logs if part.time[-1] - part.time[0] >= SETTLED] or logs[:1]
     suite, *others = [replay(part, design, **settings) for part in parts]
@@ -93,4 +96,7 @@ def replay_file(
         suite.figures += each.figures
     suite.tables += tables
     suite.text = "\n\n".join([suite.text, *remarks])
+    suite.warnings = warnings_of(logs, design)
+    if any(text.startswith(TRUTH) for text in suite.warnings):
+        suite.verdict = "\n".join([DOUBT, *suite.verdict.splitlines()[1:]])
     return suite

@@ -14,7 +14,7 @@ from ...envs.sensors.link import SlowSensor
 from ...envs.vehicle.vehicle import Vehicle
 from ...estimators.make import make_estimator
 from ..harness.drives import SETTLED, quietly
-from .emulate import Emulation
+from .emulate import Emulation, backward
 
 GYRO_ONLY = "bicycle-kf"
 ESTIMATORS: dict[str, tuple[str, ...]] = {
@@ -131,10 +131,12 @@ def drives_of(log: Log, how: Settings) -> list[Log]:
 def run_estimators(drives: Sequence[Log], vehicle: Vehicle, how: Settings) -> Result:
     """Every wanted estimator that the drives' slow sensors serve, over every drive."""
     log, result = drives[0], Result()
-    counts = log.time >= log.time[0] + SETTLED - 1e-9
+    counts = (log.time >= log.time[0] + SETTLED - 1e-9) & ~backward(log)
     truth = log.truth.get("beta")
     if truth is not None and not (counts := counts & np.isfinite(truth)).any():
-        raise ValueError(f"{log.name}: the sideslip truth is unknown from {SETTLED:g} s on")
+        raise ValueError(
+            f"{log.name}: the sideslip truth is unknown from {SETTLED:g} s on, driven forward"
+        )
     for name, serves in ESTIMATORS.items():
         if how.estimators is not None and name not in (GYRO_ONLY, *how.estimators):
             continue

@@ -22,7 +22,7 @@ def print_suite(console: Console, suite: Suite) -> None:
     else:  # a rule would cut it
         console.print(f"\n[bold]{escape(suite.title)}[/]", highlight=False)
     if suite.verdict:
-        console.print(f"[bold]{escape(suite.verdict)}[/]\n", highlight=False)
+        console.print(f"[bold]{escape(chr(10).join(suite.headlines))}[/]\n", highlight=False)
     console.print(f"{escape(suite.text)}\n", highlight=False)
     for table in suite.tables:
         if table.detail:
