@@ -15,7 +15,7 @@ INSTALL := PIP_CONSTRAINT=constraints.txt PIP_BUILD_CONSTRAINT=constraints.txt \
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
-.PHONY: help bench bench-full test test-plain test-all test-stock coverage lint types docs wheel clean
+.PHONY: help bench bench-full test test-plain test-long test-stock coverage lint types docs wheel clean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1\t\2/p' Makefile | expand -t 18
@@ -32,9 +32,8 @@ test: .venv/ready-all ## the tests and the examples in docstrings
 test-plain: .venv/ready-all ## the marked tests without compilation
 	NUMBA_DISABLE_JIT=1 $(PYTEST) $(TOGETHER) -m "plain and not compiled and not long"
 
-test-all: .venv/ready-all ## both with the long tests
-	$(PYTEST) $(TOGETHER) $(DOCTESTS)
-	NUMBA_DISABLE_JIT=1 $(PYTEST) $(TOGETHER) -m "plain and not compiled"
+test-long: .venv/ready-all ## the tests that `make test` leaves out
+	$(PYTEST) $(TOGETHER) -m long
 
 test-stock: .venv/ready-all ## the smoke tests without our compiler: numba compiles by itself, as its other versions do
 	SIDESLIP_STOCK_NUMBA=1 $(PYTEST) $(TOGETHER) -m smoke

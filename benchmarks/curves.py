@@ -71,7 +71,7 @@ def further(folders: Sequence[str | Path], episodes: int = EPISODES) -> Table:
         logs = geometric_mean(np.log(cost_ratios(costs, nominal)))
         level += ratio.low <= 1.0
         spent = json.loads((folder / CURVE).read_text().splitlines()[-1])["cpu_seconds"]
-        shown = (f"{each.value:.3f} [{each.low:.3f}, {each.high:.3f}]" for each in (ratio, logs))
+        shown = (each.inline(digits=".3f") for each in (ratio, logs))
         better = f"{100.0 * won(costs, nominal).value:.0f} %"
         table.add_row(str(folder), f"{spent:.0f}", *shown, better)
     table.title = f"over nominal on {episodes} further seeds; {level} of {len(folders)} level"

@@ -138,7 +138,7 @@ def run(seeds: int = SEEDS, jobs: int | None = None, console: Console | None = N
         "tie-vision reports that its pseudo-residual filter is the "
         "best on Fig. 7 and the bicycle model the worst: the second is so among the tuned filters, "
         "the first is not. dakf-stability's order (DAKF before KF) holds on its Fig. 6. Intervals "
-        "are 95 % bootstrap over seeds.",
+        "are 95 % over seeds.",
     )
     found, examples = list[tuple[Array, Array]](), list[tuple[Rollout, dict[str, Array]]]()
     for e, experiment in enumerate(EXPERIMENTS):

@@ -23,7 +23,7 @@ from ..estimators.vector.estimate import EstimateObservation
 from .harness.drives import quietly
 from .harness.parallel import run_cases
 from .harness.results import Row, Suite, Table
-from .harness.stats import Estimate, interval, ratio_of_means
+from .harness.stats import Estimate, interval, ratio_of_means, share
 from .harness.verdict import leader, verdict
 from .papers.ledger.tracking import drive, tracking
 
@@ -173,7 +173,7 @@ def _bandwidths(suite: Suite, found: Array) -> None:
     """found: (none and every bandwidth, seeds, numbers of `follow`)."""
     none, seeds = found[0].mean(axis=0), found.shape[1]
     shares = found[1:] / np.where([True, True, False, False], none, 1.0)
-    numbers = [[interval(column) for column in at_K.T] for at_K in shares]
+    numbers = [[*map(interval, at_K.T[:-1]), share(at_K.T[-1])] for at_K in shares]
     radius = np.array([loop_radius(STEP, K) for K in BANDWIDTHS])
     cells = []
     for K, spread, r in zip(BANDWIDTHS, numbers, radius.tolist(), strict=True):
@@ -201,7 +201,7 @@ def _lanes(suite: Suite, lanes: list[Array]) -> None:
     cells = []
     for i, numbers in enumerate(lanes):
         what, estimator, _ = KEEPERS[i]
-        most, slip, left = (interval(column) for column in numbers.T)
+        most, slip, left = *map(interval, numbers.T[:-1]), share(numbers.T[-1])
         cells.append(
             [_keeper(i), *most.text(), f"{1e3 * slip.value:.1f}", f"{100.0 * left.value:.1f}"]
         )

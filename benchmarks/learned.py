@@ -245,8 +245,7 @@ def tabled(suite: Suite, found: Found, title: str, env_id: str, driven: str, mor
 
 def _shown(share: Estimate) -> str:
     """A share, or "-" where there is no gap."""
-    value, low, high = share
-    return f"{value:.2f} [{low:.2f}, {high:.2f}]" if np.isfinite(value) else "-"
+    return share.inline() if np.isfinite(share.value) else "-"
 
 
 def illustrated(suite: Suite, found: Sequence[Found]) -> None:

@@ -171,5 +171,4 @@ def _ratios(found: Found, title: str) -> Table:
 
 
 def _percent(ratio: Estimate) -> str:
-    value, low, high = (100.0 * each for each in ratio)
-    return f"{value:.0f} [{low:.0f}, {high:.0f}]"
+    return ratio.inline(100.0, ".0f")

@@ -22,7 +22,7 @@ from .control.contests import YAW, Contest
 from .control.episodes import control_period
 from .harness.parallel import run_cases
 from .harness.results import Row, ShareMap, Suite, Table
-from .harness.stats import interval
+from .harness.stats import interval, mean_share
 from .harness.verdict import some, verdict
 
 NAME = "recovery"
@@ -201,7 +201,7 @@ def _tabled(suite: Suite, car: str, mine: Mapping[str, Array]) -> None:
     cells = []
     shares = {name: each.mean(axis=(0, 1)) for name, each in mine.items()}
     for name, share in shares.items():
-        number, more = interval(share), interval(share - shares["none"])
+        number, more = mean_share(share), interval(share - shares["none"])
         cells.append([name, *number.text(1e2, ".1f"), *more.text(1e2, ".1f")])
         where = {"scenario": car, "controller": name, "n": len(share)}
         common = {"suite": NAME, "salt": "fixed", "env_version": f"{YAW} {__version__}"}

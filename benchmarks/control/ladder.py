@@ -72,7 +72,7 @@ def ladder_table(
                 contest.name,
                 f"{100.0 * (1.0 - survived(yard.nominal).mean()):.1f}",
                 oracle_of(contest),
-                f"{gap.value:.2f} [{gap.low:.2f}, {gap.high:.2f}]",
+                gap.inline(),
                 known,
                 "" if ahead is None else f"{ahead.mean():.2f}",
                 f"{len(own)} of {len(yard.kept(len(yard.oracle.costs)))}",
@@ -146,9 +146,7 @@ def knowledge_table(results: Results, tiers: Mapping[str, Sequence[Contest]],
                 steps[1].append(own - r)
         texts = []
         for logs in steps:
-            ratio = geometric_mean(*logs)
-            spread = f"{ratio.value:.2f} [{ratio.low:.2f}, {ratio.high:.2f}]"
-            texts.append(spread if logs else "")
+            texts.append(geometric_mean(*logs).inline() if logs else "")
         cells.append([f"{tier}: {TITLES[tier]}", *texts])
     header = (
         *("tier", "car, friction, biases (model)", "state and disturbances (sensing)"),

@@ -11,7 +11,7 @@ import numpy as np
 from ... import __version__
 from ..harness.metrics import EPISODE
 from ..harness.results import Row, Table
-from ..harness.stats import Estimate, average, geometric_mean, share, won, worst
+from ..harness.stats import Estimate, average, geometric_mean, interval, share, won, worst
 from .cells import Cell
 from .contests import Contest
 from .episodes import Array, Driven, control_period
@@ -116,7 +116,7 @@ class Standing:
             found["share_won"] = won(*self._kept(contest))
         for metric in EPISODE:
             if metric.name != "failure":
-                found[metric.name] = average(driven[metric.name])
+                found[metric.name] = interval(driven[metric.name])
         for failure, name in (RATES | _FAILED).items():
             found[name] = share(driven.failed(failure))
         return found
@@ -215,8 +215,7 @@ def _texts(number: Estimate | None, scale: float, digits: str) -> tuple[str, str
     """A number and its interval, empty where there is none."""
     if number is None or not np.isfinite(number.value):
         return "", ""
-    value, spread = number.text(scale, digits)
-    return value, spread if np.isfinite(number.low) else ""
+    return number.text(scale, digits)
 
 
 def contest_table(title: str, found: Sequence[Standing], contests: Sequence[Contest]) -> Table:

@@ -118,7 +118,4 @@ def _baseline(label: str) -> str:
 
 
 def _text(number: Estimate, scale: float, digits: str) -> str:
-    if not math.isfinite(number.value):
-        return ""
-    value, low, high = (f"{scale * part:{digits}}" for part in number)
-    return f"{value} [{low}, {high}]" if math.isfinite(number.low) else value
+    return number.inline(scale, digits) if math.isfinite(number.value) else ""

@@ -28,8 +28,8 @@ class Row:
     """One number of a benchmark.
 
     suite, scenario, estimator, controller, metric: what was measured. value with its 95 % interval
-    [low, high] over n runs (NaN bounds where there is no spread); for a claim, which has a verdict,
-    the median and range over n seeds. salt: what salted the seeds.
+    [low, high] over n runs (NaN bounds where there is none); for a claim, which has a verdict, and
+    a replay the median and range over n seeds. salt: what salted the seeds.
     spec: the env's JSON, "" where no env was run. verdict and paper: for claims.
 
     Raises ValueError for a metric or verdict outside the vocabulary.

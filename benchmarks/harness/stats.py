@@ -1,26 +1,27 @@
 """Intervals over seeds, 95 %, paired where two columns share their seeds.
 
-Their coverage on skewed costs is tested by simulation.
+All but shares have Student's, from what each episode contributes to the estimate's error
+(`margin_of_error`); of positive numbers on a logarithmic scale. Their coverage on skewed costs and
+in small strata is tested by simulation. No interval of a mean holds for rare failures of which no
+episode is one: failures are counted, and `share` bounds their rate.
 """
 
 import math
 from collections.abc import Callable, Sequence
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.stats import bootstrap, norm
+from scipy.stats import norm
 from scipy.stats import t as student
 
 from ...envs.record import Array
 
 LEVEL = 0.95
-RESAMPLES = 2000
-_DRAWS = 1000  # of a ratio of sums
 WORST = 0.05
 """The share of the episodes that `worst` takes the mean of."""
 _TAIL = 0.5 * (1.0 - LEVEL)
+_FEWEST = 4  # seeds, with fewer an interval spans orders of magnitude
 _LEAST = 25  # episodes in the tail, with fewer the interval of `worst` covers too rarely
 
 
@@ -37,9 +38,14 @@ class Estimate(NamedTuple):
         return 0.5 * (self.high - self.low)
 
     def text(self, scale: float = 1.0, digits: str = ".3f") -> tuple[str, str]:
-        """The number and its interval, as two cells of a table."""
-        value, low, high = (f"{scale * each:{digits}}" for each in self)
-        return value, f"{low} .. {high}"
+        """The number and its interval, as two cells of a table; the second empty without one."""
+        value, low, high = (f"{scale * number:{digits}}" for number in self)
+        return value, f"{low} .. {high}" if math.isfinite(self.low) else ""
+
+    def inline(self, scale: float = 1.0, digits: str = ".2f") -> str:
+        """The number and its interval, if there is one, in brackets."""
+        value, low, high = (f"{scale * number:{digits}}" for number in self)
+        return f"{value} [{low}, {high}]" if math.isfinite(self.low) else value
 
 
 def root_mean(squares: Array, axis: int = -1) -> Array:
@@ -52,30 +58,77 @@ def mean(values: Array, axis: int = -1) -> Array:
     return np.asarray(np.mean(values, axis=axis))
 
 
+def margin_of_error(*strata: Array) -> float:
+    """Half of the 95 % interval of the sum of independent means, by Student's t.
+
+    The variances add up with the degrees of freedom of Welch and Satterthwaite. A variance that few
+    numbers carry has fewer of them, by its kurtosis (O'Neill 2014, Some useful moment results in
+    sampling problems).
+
+    Args:
+        strata: The numbers of each mean, shape (n_i,).
+
+    Returns:
+        Half of the interval's width; NaN where a mean is of fewer than two numbers.
+    """
+    variance = uncertainty = 0.0
+    for values in strata:
+        n = len(values)
+        if n < 2:
+            return math.nan
+        freedom, square = n - 1.0, float(np.var(values))
+        if n > 3 and square > 0.0:
+            excess = float(np.mean((values - np.mean(values)) ** 4)) / square**2 - 3.0
+            excess = ((n + 1.0) * excess + 6.0) * (n - 1.0) / ((n - 2.0) * (n - 3.0))  # unbiased
+            freedom = max(freedom / (1.0 + 0.5 * max(excess, 0.0)), 2.0)
+        variance += square / (n - 1.0)
+        uncertainty += (square / (n - 1.0)) ** 2 / freedom
+    if uncertainty == 0.0:
+        return 0.0
+    return float(student.isf(_TAIL, variance**2 / uncertainty)) * math.sqrt(variance)
+
+
 def interval(
     values: Array, statistic: Callable[..., Array] = mean, paired: Array | None = None
 ) -> Estimate:
-    """A statistic over seeds with its 95 % bootstrap interval.
+    """A statistic over seeds with its 95 % interval, by the jackknife.
 
-    values: (n,) one number a seed. paired: (n,), resampled together with values and handed to the
-    statistic as its second argument. Fewer than two different values: the estimate three times.
-    The random numbers are fixed, so the same values give the same interval.
+    Where no number is negative, it is that of the statistic's logarithm.
+
+    Args:
+        values: A number a seed, shape (n,).
+        statistic: Of values, and of paired where it is given.
+        paired: Numbers of the same seeds, shape (n,), left out together with values.
+
+    Returns:
+        The statistic and its interval; without one for fewer than four seeds, and where the
+        statistic of the others is not finite.
     """
     data = (values,) if paired is None else (values, paired)
-    estimate = float(statistic(*data, axis=-1))
-    if len(values) < 2 or all(np.ptp(column) == 0.0 for column in data):
-        return Estimate(estimate, estimate, estimate)
-    result = bootstrap(
-        data,
-        statistic,
-        paired=paired is not None,
-        n_resamples=RESAMPLES,
-        confidence_level=LEVEL,
-        method="percentile",
-        rng=np.random.default_rng(0),
-    )
-    low, high = result.confidence_interval
-    return Estimate(estimate, float(low), float(high))
+    estimate, n = float(statistic(*data, axis=-1)), len(values)
+    if n < _FEWEST:
+        return Estimate(estimate)
+    with np.errstate(divide="ignore"):
+        rest = [statistic(*(np.delete(column, i) for column in data), axis=-1) for i in range(n)]
+    if not np.isfinite(rest).all():
+        return Estimate(estimate)
+    if min(map(np.min, data)) >= 0.0 and min(rest) > 0.0:
+        reach = math.exp(margin_of_error((n - 1.0) * np.log(rest)))
+        return Estimate(estimate, estimate / reach, estimate * reach)
+    reach = margin_of_error((n - 1.0) * np.array(rest))
+    return Estimate(estimate, estimate - reach, estimate + reach)
+
+
+def mean_share(values: Array) -> Estimate:
+    """The mean of shares (n,) that are not only 0 and 1; its interval is that of the odds."""
+    if not 0.0 < np.mean(values) < 1.0:
+        return interval(values)
+    return Estimate(*(odds / (1.0 + odds) for odds in interval(values, _odds)))
+
+
+def _odds(values: Array, axis: int = -1) -> Array:
+    """The mean of shares over the mean of what is left of them."""
+    return ratio_of_means(values, 1.0 - values, axis)
 
 
 def ratio_of_roots(squares: Array, reference: Array, axis: int = -1) -> Array:
@@ -89,7 +142,7 @@ def ratio_of_means(values: Array, reference: Array, axis: int = -1) -> Array:
 
 
 def average(*strata: Array) -> Estimate:
-    """The mean over strata of the means of their numbers (n_i,), with Student's interval.
+    """The mean over strata of the means of their numbers (n_i,), such as clipped logarithms.
 
     NaN of none, and where a number is.
     """
@@ -97,11 +150,7 @@ def average(*strata: Array) -> Estimate:
     if not there:
         return Estimate(math.nan)
     middle = float(np.mean([each.mean() for each in there]))
-    if min(map(len, there)) < 2:
-        return Estimate(middle)
-    variance = sum(float(each.var(ddof=1)) / len(each) for each in there) / len(there) ** 2
-    freedom = sum(map(len, there)) - len(there)
-    reach = float(student.isf(_TAIL, freedom)) * math.sqrt(variance)
+    reach = margin_of_error(*(each / len(there) for each in there))
     return Estimate(middle, middle - reach, middle + reach)
 
 
@@ -140,8 +189,8 @@ def profile(values: Array, levels: Array) -> tuple[Array, Array, Array]:
 def worst(costs: Array) -> Estimate:
     """The mean of the largest `WORST` of positive numbers (n,): the conditional value at risk.
 
-    Its interval is Student's for the logarithm, from the influence of each number on the tail's
-    mean; there is none where the tail has fewer than 25.
+    Its interval is that of the logarithm, from the influence of each number on the tail's mean;
+    there is none where the tail has fewer than 25.
     """
     if len(costs) == 0 or np.isnan(costs).any():
         return Estimate(math.nan)
@@ -151,42 +200,25 @@ def worst(costs: Array) -> Estimate:
     if count < _LEAST or value <= 0.0:
         return Estimate(value)
     beyond = np.maximum(costs - ordered[-count], 0.0)
-    error = math.sqrt(len(costs)) * float(np.std(beyond, ddof=1)) / count
-    reach = math.exp(float(student.isf(_TAIL, count - 1)) * error / value)
+    reach = math.exp(margin_of_error(len(costs) / count * beyond / value))
     return Estimate(value, value / reach, value * reach)
 
 
 def ratio_of_sums(tops: Sequence[Array], bottoms: Sequence[Array]) -> Estimate:
     """Sum over strata of the mean top / that of the mean bottom, tops and bottoms paired (n_i,).
 
-    The interval is a bootstrap within the strata, in which an episode's top and bottom stay
-    together; its percentiles are widened for small strata (Hesterberg, What Teachers Should Know
-    about the Bootstrap). NaN without strata or where a sum of bottoms is not positive.
+    The interval is that of the mean residual top - ratio x bottom, in which an episode's top and
+    bottom stay together. NaN without strata or where a sum of bottoms is not positive.
     """
     if not tops or min(map(len, tops)) == 0:
         return Estimate(math.nan)
     above, below = (sum(float(np.mean(each)) for each in side) for side in (tops, bottoms))
     if not below > 0.0:
         return Estimate(math.nan)
-    least = min(map(len, tops))
-    if least < 2:
-        return Estimate(above / below)
-    sums = np.zeros((_DRAWS, 2))
-    for i, pair in enumerate(zip(tops, bottoms, strict=True)):
-        sums += _weights(i, len(pair[0])) @ np.column_stack(pair)
-    freedom = sum(map(len, tops)) - len(tops)
-    reach = float(student.isf(_TAIL, freedom)) * math.sqrt(least / (least - 1.0))
-    ends = norm.cdf([-reach, reach])
-    low, high = np.quantile(sums[:, 0] / sums[:, 1], ends)
-    return Estimate(above / below, float(low), float(high))
-
-
-@lru_cache(maxsize=32)
-def _weights(stratum: int, n: int) -> Array:
-    """(_DRAWS, n) how often a resample of a stratum has each of its n, over n; the same for all."""
-    rng = np.random.default_rng([stratum, n])
-    counts = rng.multinomial(n, np.full(n, 1.0 / n), _DRAWS)
-    return np.asarray(counts / n)
+    ratio = above / below
+    pairs = zip(tops, bottoms, strict=True)
+    reach = margin_of_error(*((top - ratio * bottom) / below for top, bottom in pairs))
+    return Estimate(ratio, ratio - reach, ratio + reach)
 
 
 def chance_of_no_less(logs: Array) -> float:

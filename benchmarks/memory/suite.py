@@ -101,8 +101,7 @@ def lqg_gap(found: Found) -> Estimate:
 
 
 def _shown(number: Estimate) -> str:
-    value, low, high = (100.0 * each for each in number)
-    return f"{value:.1f} [{low:.1f}, {high:.1f}]"
+    return number.inline(100.0, ".1f")
 
 
 def _tabled(suite: Suite, results: Results) -> None:

@@ -120,14 +120,15 @@ def _episodes(suite: Suite, done: dict[Case, list[outside.Episode]]) -> None:
         cost, paired = interval(costs[case]), ""
         if case.car in rivals and _who(case)[0] != RIVAL:
             logs = np.log(cost_ratios(costs[case], rivals[case.car]))
-            paired = "{:.0f} [{:.0f}, {:.0f}]".format(*(100.0 * x for x in geometric_mean(logs)))
+            paired = geometric_mean(logs).inline(100.0, ".0f")
         spins = float(np.mean([each.failed for each in found]))
         more: dict[str, Any] = {"n": len(found), "salt": "fixed"}
         suite.rows.append(_row(case, "cost", cost.value, low=cost.low, high=cost.high, **more))
         suite.rows.append(_row(case, "share", spins, **more))
         peak = 1e3 * float(np.median([each.peak for each in found]))
-        text = "{:.3g} [{:.3g}, {:.3g}]".format(*cost)
-        cells.append([*_who(case), text, paired, f"{100 * spins:.0f}", f"{peak:.0f}"])
+        cells.append(
+            [*_who(case), cost.inline(1.0, ".3g"), paired, f"{100 * spins:.0f}", f"{peak:.0f}"]
+        )
     header = ("controller", "model", "cost", f"of {RIVAL}'s / %", "failed / %", "peak slip / mrad")
     note = (
         f"{len(found)} lane changes at 60 to 90 km/h; speed, steering, tyres and friction are "

@@ -96,12 +96,13 @@ def answer(replay: Replay) -> str:
 
 
 def _pays(name: str, found: Mapping[str, Result]) -> str:
-    value, low, high = gain(found[TUNED], found[FIXED])
+    number = gain(found[TUNED], found[FIXED])
+    value, low, high = number
     what = f"Tuning the noise of {name} by HDOP"
     if max(abs(low), abs(high)) < _NO_SAY:
         return f"{what} changes nothing: log-likelihood {value:+.3f}."
     how = "pays" if low > 0.0 else "costs" if high < 0.0 else "is not seen to pay"
-    return f"{what} {how}: log-likelihood {value:+.2f} [{low:.2f}, {high:.2f}]."
+    return f"{what} {how}: log-likelihood {number.inline(digits='+.2f')}."
 
 
 def _rows(replay: Replay, signal: Signal, found: Mapping[str, Result]) -> list[Row]:
@@ -127,8 +128,7 @@ def _table(signal: Signal, found: Mapping[str, Result]) -> Table:
         error = scale * result.error
         more = "-"
         if law != FIXED:
-            value, low, high = gain(result, found[FIXED])
-            more = f"{value:+.3f} [{low:.3f}, {high:.3f}]"
+            more = gain(result, found[FIXED]).inline(digits="+.3f")
         numbers = [np.median(error), np.sqrt(np.mean(error**2)), np.percentile(error, 95)]
         numbers += [result.likelihood.mean(), result.square.mean()]
         noise = f"{scale * result.r:.3g}" if result.r > 1.5 * LEAST_NOISE else "none seen"

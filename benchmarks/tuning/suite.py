@@ -14,7 +14,7 @@ from rich.console import Console
 from ...estimators.design.tunings import TUNINGS
 from ..harness.drives import Drive
 from ..harness.results import Suite, Table
-from ..harness.stats import interval, ratio_of_roots, root_mean
+from ..harness.stats import Estimate, interval, ratio_of_roots, root_mean
 from .task import SAMPLERS, STORAGE, Array, Task, simulate, squares
 
 _EDGE = 1.25  # times an end of its range or less: the number counts as being there
@@ -47,7 +47,7 @@ def run(
     suite = Suite(
         "tune",
         f"Tuning {task.estimator} on {task.subject}",
-        f"RMSE of {task.target} from 2 s on in {task.unit}, with 95 % bootstrap intervals; "
+        f"RMSE of {task.target} from 2 s on in {task.unit}, with 95 % intervals; "
         f"{trials} trials. The default is make_estimator with no more than what is held "
         "fixed. Several scenarios count alike: the search makes the geometric mean of their RMSE "
         "least.",
@@ -65,17 +65,17 @@ def _comparisons(
     tables = []
     for i, scenario in enumerate(task.scenarios):
         before, after = [each[i] for each in default], [each[i] for each in tuned]
-        ratio, low, high = (
+        ratio = (
             interval(after[1], ratio_of_roots, before[1])
             if np.isfinite(before[1]).all() and np.isfinite(after[1]).all()
-            else [math.nan] * 3
+            else Estimate(math.nan)
         )
         tables.append(
             Table(
                 f"{task.estimator} on {scenario} ({task.env_id})",
                 ("tuning", f"{before[0].size} training seeds", f"{before[1].size} test seeds"),
                 [["default", *map(_spread, before)], ["found", *map(_spread, after)]],
-                f"Found over default on the test seeds: {ratio:.3f} ({low:.3f} .. {high:.3f}).",
+                f"Found over default on the test seeds: {ratio.inline(digits='.3f')}.",
             )
         )
     return tables
@@ -92,8 +92,7 @@ def _squares(task: Task, drives: Sequence[Drive], numbers: dict[str, float]) -> 
 def _spread(errors: Array) -> str:
     if not np.isfinite(errors).all():
         return "diverges"
-    value, low, high = interval(errors, root_mean)
-    return f"{value:.4g} ({low:.4g} .. {high:.4g})"
+    return interval(errors, root_mean).inline(digits=".4g")
 
 
 def found_table(found: Mapping[str, float], search: Mapping[str, tuple[float, float]]) -> Table:

@@ -8,7 +8,7 @@ import numpy as np
 from ... import __version__
 from ...envs.record import Array
 from ..harness.results import Row, Suite, Table
-from ..harness.stats import Estimate, interval, mean, ratio_of_roots, root_mean
+from ..harness.stats import Estimate, interval, mean, mean_share, ratio_of_roots, root_mean
 from .conditions import CONDITIONS, CURVES, PARTS, WITHOUT, Condition, Curve
 from .measure import LEVELS, Measured
 
@@ -96,7 +96,7 @@ def add_reliability(suite: Suite, found: Sequence[Measured]) -> None:
                 for seed, share in zip(each.seeds, each.of(label)[2], strict=True):
                     by_seed.setdefault(seed, []).append(share)
             inside = np.array([np.mean(each, axis=0) for each in by_seed.values()])
-            line = [interval(column, mean) for column in inside.T]
+            line = [mean_share(column) for column in inside.T]
             shares[f"{label}, {kind}"] = line
             here = columns_of(*mine[0]) | {"scenario": f"all with {kind}", "n": len(inside)}
             suite.rows += [

@@ -35,7 +35,7 @@ def run(seeds: int = SEEDS, jobs: int | None = None, console: Console | None = N
         "strong a gust is. joint and exact-kf know the nominal car "
         "and the data sheet's noise. NEES: the mean square of joint's error over its own "
         "deviation, 1 where that is honest. Where tyres saturate there is no such bound; the ratio "
-        "is to exact-kf alone. 95 % bootstrap over seeds.",
+        "is to exact-kf alone. Intervals are 95 % over seeds.",
     )
     over, against, lines = dict[str, dict[str, Estimate]](), dict[str, Estimate](), []
     for what, each in zip(CONDITIONS, found, strict=True):
@@ -115,7 +115,7 @@ def _race(suite: Suite, seeds: int, jobs: int | None, console: Console | None) -
 
 
 def _cell(ratio: Estimate | None) -> str:
-    return f"{ratio.value:.2f} [{ratio.low:.2f}, {ratio.high:.2f}]" if ratio else ""
+    return ratio.inline() if ratio else ""
 
 
 def _answer(over: Mapping[str, Mapping[str, Estimate]], against: Mapping[str, Estimate]) -> str:

@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
-from scipy.stats import mannwhitneyu
+from scipy.stats import mannwhitneyu, ttest_1samp
 
 from sideslip.benchmarks.harness.parallel import run_cases
 from sideslip.benchmarks.harness.stats import (
     interval,
     mean,
+    mean_share,
     profile,
     ratio_of_roots,
     root_mean,
@@ -15,35 +16,41 @@ from sideslip.benchmarks.harness.stats import (
 )
 
 
-def test_interval_covers_the_mean_nineteen_times_in_twenty() -> None:
-    rng = np.random.default_rng(1)
-    hits = 0
-    for _ in range(300):
-        _, low, high = interval(rng.normal(size=60), mean)
-        hits += low <= 0.0 <= high
-    # binomial with p = 0.95 (the percentile bootstrap of 60 values: about 0.94): 5 sigma is 0.07
-    assert 0.87 <= hits / 300 <= 1.0
+def far_away(values: np.ndarray, axis: int = -1) -> np.ndarray:
+    return -7.0 - 1.5 * mean(values, axis)
 
 
 def test_the_interval_is_of_the_same_statistic_as_the_estimate() -> None:
-    """Percentiles pass through rising functions: the root's interval is the interval's root."""
+    """On the logarithm's scale the root's interval is the interval's root, on the plain one that
+    of a line is the line of the interval."""
     values = np.random.default_rng(4).gamma(0.5, 2.0, 40)  # the median is a third of the mean
-
-    def far_away(x: np.ndarray, axis: int = -1) -> np.ndarray:
-        return 7.0 + 1.5 * mean(x, axis)
-
-    plain = np.array(interval(values, mean))
-    assert plain[1] < plain[0] < plain[2]
-    assert np.array(interval(values, far_away)) == pytest.approx(7.0 + 1.5 * plain, rel=1e-12)
-    # between two resamples the percentile is interpolated, which a root is not
-    assert np.array(interval(values, root_mean)) == pytest.approx(np.sqrt(plain), rel=1e-6)
-    least, low, high = interval(values, np.min)  # no resample has a smaller one
-    assert least == low == values.min() <= high
+    positive, signed = np.array(interval(values, mean)), np.array(interval(values - 0.5, mean))
+    assert positive[1] * positive[2] == pytest.approx(positive[0] ** 2)
+    assert signed[1] + signed[2] == pytest.approx(2.0 * signed[0])
+    assert np.array(interval(values, root_mean)) == pytest.approx(np.sqrt(positive))
+    lines = interval(values - 0.5, far_away)
+    assert np.array(lines) == pytest.approx(-7.0 - 1.5 * signed[[0, 2, 1]], rel=1e-12)
     # the ratio's interval is that of its inverse, turned round
     other = np.random.default_rng(5).gamma(0.5, 2.0, 40)
     ratio = np.array(interval(values, ratio_of_roots, other))
     inverse = np.array(interval(other, ratio_of_roots, values))
-    assert ratio == pytest.approx(1.0 / inverse[[0, 2, 1]], rel=1e-5)
+    assert ratio == pytest.approx(1.0 / inverse[[0, 2, 1]])
+
+
+def test_the_interval_of_a_mean_is_students() -> None:
+    values = np.array([-3.0, -2.0, 1.0, 2.0, 4.0, 5.0])  # no outlier
+    low, high = ttest_1samp(values, 0.0).confidence_interval()
+    assert interval(values) == pytest.approx((values.mean(), low, high))
+
+
+def test_a_mean_share_stays_between_none_and_all() -> None:
+    values = np.array([0.9, 1.0, 0.95, 1.0, 1.0, 0.85])
+    found = mean_share(values)
+    assert found.value == pytest.approx(values.mean())
+    assert 0.7 < found.low < found.value < found.high < 1.0
+    lost = np.array(mean_share(1.0 - values))
+    assert np.array(found) == pytest.approx(1.0 - lost[[0, 2, 1]])
+    assert mean_share(np.ones(5)) == (1.0, 1.0, 1.0)
 
 
 def test_pairing_removes_what_the_seeds_share() -> None:
@@ -53,11 +60,14 @@ def test_pairing_removes_what_the_seeds_share() -> None:
     assert (estimate, low, high) == pytest.approx((2.0, 2.0, 2.0))
 
 
-def test_the_same_values_give_the_same_interval_and_no_spread_gives_none() -> None:
-    values = np.random.default_rng(3).uniform(size=20)
-    assert interval(values, root_mean) == interval(values, root_mean)
+def test_no_spread_gives_a_point_and_too_few_seeds_no_interval() -> None:
     assert interval(np.full(9, 4.0), root_mean) == (2.0, 2.0, 2.0)
-    assert interval(np.array([4.0]), root_mean) == (2.0, 2.0, 2.0)
+    few = interval(np.array([4.0, 5.0, 3.0]))
+    assert few.value == 4.0 and np.isnan(few[1:]).all()
+    lonely = mean_share(np.array([1.0, 1.0, 1.0, 0.8]))  # without the last the odds are infinite
+    assert lonely.value == 0.95 and np.isnan(lonely[1:]).all()
+    assert few.text() == ("4.000", "") and few.inline() == "4.00"
+    assert interval(np.arange(1.0, 6.0)).inline(10.0, ".0f") == "30 [15, 58]"
 
 
 def _square(value: int) -> int:
