@@ -114,7 +114,8 @@ def filled(log: Log, value: float) -> Log:
     fixes = log.record.packets
     courses = np.full((len(log.time), 1), value)
     courses[(fixes[:, PACKET.captured] - log.record.first).astype(int), 0] = fixes[:, PACKET.value]
-    packets = packet_rows("gps", log.record.ticks, log.record.ticks, courses, np.ones(len(courses)))
+    ticks = log.record.ticks.astype(np.float64)
+    packets = packet_rows("gps", ticks, ticks, courses, np.ones(len(courses)))
     return dataclasses.replace(log, record=dataclasses.replace(log.record, packets=packets))
 
 
