@@ -54,7 +54,8 @@ def replay_file(
     does.
 
     vehicle: of `vehicle_from`; "identify": found in the log, or in its first `until` s, of which
-    the rest is then replayed, with the mass and arms of `nominal`; None: the Ferrari 250 LM of the
+    the rest is then replayed, with the mass and arms of `nominal` and linear tyres, which
+    estimators have; None: the Ferrari 250 LM of the
     Stanford log, with the fitted tyres x 0.7, and the corners of the nominal one. mapping: texts
     such as "steer_rad=Delta". wires: what is known beside the car; identified ones stand behind
     it. settings: of `replay`. Raises what `read_parts`, `vehicle_from`, `identify`, `replay` do.
@@ -65,10 +66,10 @@ def replay_file(
         return receiver_suite(replay_nmea(log, vehicle, mapping))
     if until is not None and vehicle != "identify":
         raise ValueError("--until is for --vehicle identify")
-    wires, tables = wires or Wires(), []
+    wires, tables, unknown = wires or Wires(), [], ""
     if vehicle == "identify":
-        found, shown = identify_file(log, nominal, mapping or (), wires, until=until)
-        vehicle, tables = found.car, shown.tables
+        found, shown = identify_file(log, nominal, mapping or (), wires, "linear", until)
+        vehicle, tables, unknown = found.car, shown.tables, found.reason
         latency = {**found.wires.latency, **wires.latency}
         wires = found.wires._replace(latency=latency, noise={**found.wires.noise, **wires.noise})
     logs, remarks = read_parts(log, parse_mapping(mapping or ()), start=until or 0.0)
@@ -82,6 +83,8 @@ def replay_file(
         )
     else:
         car = design = vehicle_from(vehicle)
+    if unknown:
+        remarks.append(f"WARNING: the car is not identified, {unknown}. It stays as stated.")
     remarks += [f"WARNING: {text}." for text in warnings_of(logs, design)]
     settings = {"noise": wires.noise} | settings
     parts = [part for part in logs if part.time[-1] - part.time[0] >= SETTLED] or logs[:1]
