@@ -9,17 +9,17 @@ import numpy as np
 import sideslip
 from sideslip.agents.rollout import rollout
 from sideslip.envs.record import FAST, PACKET, Array, Log
-from sideslip.envs.vehicle.vehicle import PASSENGER_CAR, Vehicle, critical_speed
+from sideslip.envs.vehicle.vehicle import LATERAL, PASSENGER_CAR, Vehicle, critical_speed
 
 assert sideslip.__version__
 EVERY, STEP = 10, 0.01  # ticks to a row; s of a steering trace
-NOISE = {"gyro": 0.005, "accel": 0.1, "wheel": 0.05, "course": 0.0087}
+NOISE = {"gyro": 0.005, "accel": 0.1, "wheel": 0.05, "course": 0.0407}
 
 
 class DrawnCar(NamedTuple):
     """A car and its logs: one to identify from, one held out.
 
-    ratio: I/(m a b) of the car. kind: which sensors the first log lacks.
+    ratio: I/(m l_f l_r) of the car. kind: which sensors the first log has. late: s, of the GPS.
     """
 
     car: Vehicle
@@ -46,7 +46,23 @@ def steering_trace(rng: np.random.Generator, duration: float, amplitude: float) 
     return np.asarray((angle + smooth) * np.minimum(1.0, t / 0.5))
 
 
-def _drive(scenario: dict[str, Any], seed: int) -> Log:
+def scenario_of(car: Vehicle) -> dict[str, Any]:
+    """Disturbed drives of this car after a steering trace, which is to be added."""
+    return {
+        "base": "random-steering",
+        "steering": "trace",
+        "trace_step": STEP,
+        "surge_frequency": 0.05,
+        "half_width": 1e4,
+        "disturbance_force": 150.0,
+        "disturbance_moment": 150.0,
+        "front_stiffness": 1.0,
+        "rear_stiffness": 1.0,
+        "vehicle": {name: getattr(car, name) for name in (*LATERAL, "sprung_mass")},
+    }
+
+
+def simulate(scenario: dict[str, Any], seed: int) -> Log:
     """A drive at 100 Hz whose GPS packets bear the time of their arrival."""
     env: Any = gym.make("sideslip/YawGps-v0", scenario=scenario, vehicle="passenger-car")
     log = rollout(env, seed=seed).log
@@ -106,26 +122,13 @@ def _drawn(rng: np.random.Generator, seed: int, duration: float, held_out: float
         if critical_speed(car) > speed + 6.0:
             break
     noisy = np.exp(rng.uniform(np.log(0.5), np.log(4.0)))
-    scenario = {
-        "base": "random-steering",
-        "steering": "trace",
-        "trace_step": STEP,
+    scenario = scenario_of(car) | {
         "speed": speed,
         "surge": surge,
-        "surge_frequency": 0.05,
-        "half_width": 1e4,
-        "disturbance_force": 150.0,
-        "disturbance_moment": 150.0,
         "friction": rng.uniform(0.8, 1.0),
         "gyro_bias": rng.uniform(-0.005, 0.005),
-        "front_stiffness": 1.0,
-        "rear_stiffness": 1.0,
         "gps_latency": round(rng.uniform(0.1, 0.3), 2),
         "noise": {name: noisy * size for name, size in NOISE.items()},
-        "vehicle": {
-            name: getattr(car, name)
-            for name in ("mass", "sprung_mass", "yaw_inertia", "front_stiffness", "rear_stiffness")
-        },
     }
     kind = ("all", "no accel_y", "no course", "gyro alone")[seed % 4]
     logs = []
@@ -134,7 +137,7 @@ def _drawn(rng: np.random.Generator, seed: int, duration: float, held_out: float
         size = rng.uniform(0.5, 1.2) * 0.05 * min(1.0, (16.0 / speed) ** 1.2)
         trace = steering_trace(rng, lasts, size)
         changes |= {"trace": tuple(trace), "duration": lasts}
-        logs.append(_drive(scenario | changes, 2 * seed + drive))
+        logs.append(simulate(scenario | changes, 2 * seed + drive))
     log = without(
         logs[0], kind in ("no accel_y", "gyro alone"), kind in ("no course", "gyro alone")
     )

@@ -6,6 +6,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import pandas as pd
 
 import sideslip
 from sideslip.agents.rollout import rollout
@@ -58,3 +59,20 @@ def drive(
     return dataclasses.replace(
         log, record=record, slow={"gps": log.slow["gps"]}, truth={}
     ), env.unwrapped.vehicle
+
+
+def as_table(log: Log) -> pd.DataFrame:
+    fast = log.record.fast
+    course = np.full(len(fast), np.nan)
+    packets = log.record.packets
+    course[(packets[:, PACKET.captured] - log.record.first).astype(int)] = packets[:, PACKET.value]
+    return pd.DataFrame(
+        {
+            "time_s": log.time,
+            "speed_x_mps": fast[:, FAST.wheel_left],
+            "yaw_rate_radps": fast[:, FAST.gyro],
+            "accel_y_mps2": fast[:, FAST.accel_y],
+            "steer_rad": np.append(fast[1:, FAST.steer], fast[-1, FAST.steer]),
+            "course_rad": course,
+        }
+    )
