@@ -163,7 +163,9 @@ def _fit_car(found: Identified, w: Windows, near: bool, laws: Sequence[str]) -> 
     found.remarks.append(
         f"{len(w.starts)} windows of 4 s, of whose rows 95 % turn with less than {hard:.1f} m/s2; "
         f"{w.tyres} tyres" + (" err least on held-out stretches" if len(laws) > 1 else "")
-        + (", whose stiffness is that of this drive" if w.tyres == "linear" else "")
+        + (", whose stiffness is that of this drive" if w.tyres == TYRES[0] else
+           ", as stiff as at small slips; estimators, whose tyres are linear, rather take "
+           "those of --tyres linear")
     )  # fmt: skip
 
 

@@ -156,7 +156,8 @@ def test_estimators_do_not_get_worse_on_another_drive(
     """By the drawn cars together, for the chosen law and the linear one of a replay: with the
     steering, latency and noise that were found, and with the car alone. The chosen law's intervals
     hold the small-slip stiffness and the inertia per mass."""
-    errors, outside = [], []
+    errors: list[tuple[str | None, Array, Array]] = []
+    outside = []
     for seed in seeds:
         drawn = drawn_car(seed)
         own = Wires(latency={"gps": drawn.late})
@@ -177,7 +178,8 @@ def test_estimators_do_not_get_worse_on_another_drive(
                     )
                 ]
     for law in laws:
-        before, after = (np.sum([e[i] for e in errors if e[0] == law], axis=0) for i in (1, 2))
+        before = np.sum([stated for tyres, stated, _ in errors if tyres == law], axis=0)
+        after = np.sum([now for tyres, _, now in errors if tyres == law], axis=0)
         assert np.all(np.sqrt(after / before) < 1.05), np.sqrt(after / before)
     assert (
         not outside or np.mean(outside) < 0.15
