@@ -12,7 +12,8 @@ from scipy.stats import t as student
 from typer.testing import CliRunner
 
 from sideslip.benchmarks.cli.main import app
-from sideslip.benchmarks.recorded.bicycle_fit import Fit, Theta
+from sideslip.benchmarks.recorded.bicycle_fit import Fit, Theta, fit, windows_of
+from sideslip.benchmarks.recorded.checks import saturated
 from sideslip.benchmarks.recorded.identify import POSSIBLE, TYRES, identify
 from sideslip.benchmarks.recorded.noises import noise_levels
 from sideslip.benchmarks.recorded.run import Settings, run_estimators
@@ -71,6 +72,14 @@ def test_a_yaw_rate_alone_does_not_lead_down_the_valley() -> None:
     for row, value in zip(found.findings[:3], true, strict=True):
         assert abs(row.value - value) < row.half, row
     assert POSSIBLE[0] < share(found.car) < POSSIBLE[1] and found.reason == ""
+
+
+def test_the_priors_bound_what_a_disturbed_yaw_rate_leaves_open() -> None:
+    log = with_lagging_gyro(without(driven(NEUTRAL, 1.0), accel=True, course=True), 0.08)
+    w = dataclasses.replace(windows_of([log], [saturated(log)]), tyres="fiala")
+    found = fit(NEUTRAL, w, Theta(), ("front", "rear", "inertia", "gyro_bias"))
+    for name, sd in (("front", 0.4), ("rear", 0.4), ("inertia", 0.2)):
+        assert abs(getattr(found.theta, name)) < sd and found.half(name) < 2.3 * sd, name
 
 
 def test_the_course_tells_what_the_yaw_rate_leaves_open() -> None:
