@@ -57,9 +57,9 @@ def replay_file(
     does.
 
     vehicle: of `vehicle_from`; "identify": found in the log, or in its first `until` s, of which
-    the rest is then replayed, with the mass and arms of `nominal`; None: the Ferrari 250 LM of the
-    Stanford log, with the fitted tyres x 0.7, and the corners of the nominal one. mapping: texts
-    such as "steer_rad=Delta". wires: what is known beside the car; identified ones stand behind
+    the rest is then replayed, with the mass and arms of `nominal` and linear tyres, which
+    estimators have; None: the Ferrari 250 LM of the Stanford log, with the fitted tyres x 0.7, and
+    the corners of the nominal one. mapping: texts such as "steer_rad=Delta". wires: what is known beside the car; identified ones stand behind
     it. settings: of `replay`. Raises what `read_parts`, `vehicle_from`, `identify`, `replay` do.
     """
     if is_nmea(log):
@@ -68,10 +68,10 @@ def replay_file(
         return receiver_suite(replay_nmea(log, vehicle, mapping))
     if until is not None and vehicle != "identify":
         raise ValueError("--until is for --vehicle identify")
-    wires, tables = wires or Wires(), []
+    wires, tables, unknown = wires or Wires(), [], ""
     if vehicle == "identify":
-        found, shown = identify_file(log, nominal, mapping or (), wires, until=until)
-        vehicle, tables = found.car, shown.tables
+        found, shown = identify_file(log, nominal, mapping or (), wires, "linear", until)
+        vehicle, tables, unknown = found.car, shown.tables, found.reason
         latency = {**found.wires.latency, **wires.latency}
         wires = found.wires._replace(latency=latency, noise={**found.wires.noise, **wires.noise})
     logs, remarks = read_parts(log, parse_mapping(mapping or ()), start=until or 0.0)
@@ -97,6 +97,8 @@ def replay_file(
     suite.tables += tables
     suite.text = "\n\n".join([suite.text, *remarks])
     suite.warnings = warnings_of(logs, design)
+    if unknown:
+        suite.warnings.append(f"the car is not identified, {unknown}: it stays as stated")
     if any(text.startswith(TRUTH) for text in suite.warnings):
         suite.verdict = "\n".join([DOUBT, *suite.verdict.splitlines()[1:]])
     return suite

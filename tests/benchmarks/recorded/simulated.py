@@ -6,6 +6,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import pandas as pd
 
 import sideslip
 from sideslip.agents.rollout import rollout
@@ -65,3 +66,20 @@ def decimated(log: Log, every: int = EVERY) -> Log:
     truth = {name: values[1:][every - 1 :: every] for name, values in log.truth.items()}
     slow = {name: sensor for name, sensor in log.slow.items() if name == "gps"}
     return dataclasses.replace(log, record=record, slow=slow, truth=truth)
+
+
+def as_table(log: Log) -> pd.DataFrame:
+    fast = log.record.fast
+    course = np.full(len(fast), np.nan)
+    packets = log.record.packets
+    course[(packets[:, PACKET.captured] - log.record.first).astype(int)] = packets[:, PACKET.value]
+    return pd.DataFrame(
+        {
+            "time_s": log.time,
+            "speed_x_mps": fast[:, FAST.wheel_left],
+            "yaw_rate_radps": fast[:, FAST.gyro],
+            "accel_y_mps2": fast[:, FAST.accel_y],
+            "steer_rad": np.append(fast[1:, FAST.steer], fast[-1, FAST.steer]),
+            "course_rad": course,
+        }
+    )
