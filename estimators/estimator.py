@@ -148,10 +148,18 @@ class Estimator:
 
         The rows follow the last ones taken; the packets are ordered as in a `Record`.
         """
-        fast, packets = checked(fast, packets)
-        arrived = len(packets) if count is None else count
-        if not 0 <= arrived <= len(packets):
-            raise ValueError(f"count is 0 to {len(packets)}, as many as packets, got {count}")
+        fast = np.ascontiguousarray(fast, np.float64)
+        packets = np.ascontiguousarray(packets, np.float64)
+        try:
+            (_, wide), (arrived, long) = fast.shape, packets.shape
+        except ValueError:
+            wide, arrived, long = 0, 0, 0
+        if wide != FAST_WIDTH or long != PACKET_WIDTH:
+            raise ValueError(_misshapen(fast, packets))
+        if count is not None:
+            if not 0 <= count <= arrived:
+                raise ValueError(f"count is 0 to {arrived}, as many as packets, got {count}")
+            arrived = count
         self._step(fast, packets, arrived)
 
     def _step(self, fast: Array, packets: Array, count: int) -> None:
@@ -279,12 +287,7 @@ class Estimator:
         return f"<{self.name}: {', '.join(self.names)} at tick {self.tick}>"
 
 
-def checked(fast: Array, packets: Array) -> tuple[Array, Array]:
-    """Fast rows and packets as compiled code takes them; ValueError for other shapes."""
-    fast = np.ascontiguousarray(fast, np.float64)
-    packets = np.ascontiguousarray(packets, np.float64)
+def _misshapen(fast: Array, packets: Array) -> str:
     if fast.shape[1:] != (FAST_WIDTH,):
-        raise ValueError(f"fast rows have shape (k, {FAST_WIDTH}), got {fast.shape}")
-    if packets.shape[1:] != (PACKET_WIDTH,):
-        raise ValueError(f"packets have shape (k, {PACKET_WIDTH}), got {packets.shape}")
-    return fast, packets
+        return f"fast rows have shape (k, {FAST_WIDTH}), got {fast.shape}"
+    return f"packets have shape (k, {PACKET_WIDTH}), got {packets.shape}"

@@ -159,12 +159,9 @@ def add(suite: Suite, effort: Effort) -> tuple[dict[str, Taken], dict[str, str]]
 
 
 def add_filters(suite: Suite, effort: Effort) -> None:
-    """Add two rows for each filter of the catalogue, and a table, by a third of the rounds.
-
-    Filters come one after the other, each beside the environments without it.
-    """
+    """Add rows and a table of what each filter adds to a step, in a third of the rounds each."""
     envs = {"one": episode(gym.make(FUSION_ID)), "many": batch(gym.make_vec(FUSION_ID, FEWER))}
-    header = ("", "added to a step", "range", f"where there are {FEWER}", "range")
+    header = ("", "one", "range", f"of {FEWER}", "range")
     fewer, cells = replace(effort, rounds=max(1, effort.rounds // 3)), []
     for name in (*FILTERS, *(f"learned-{base}" for base in shipped())):
         taken = interleaved(envs | _filtered(name), fewer)

@@ -73,8 +73,8 @@ def stack_at(net: Any) -> Any:
 
 
 def memory_size(net: Net, states: int) -> int:
-    """Numbers of a car's memory, of which the last are lent by a filter with so many states."""
-    return int(stack_at(net) + net.sizes.sum()) + states + 1
+    """Numbers of a car's memory, in whole cache lines; at its end a filter's, states + 1."""
+    return (int(stack_at(net) + net.sizes.sum()) + states + 8) // 8 * 8
 
 
 @jit
