@@ -59,8 +59,9 @@ def replay_file(
     vehicle: of `vehicle_from`; "identify": found in the log, or in its first `until` s, of which
     the rest is then replayed, with the mass and arms of `nominal` and linear tyres, which
     estimators have; None: the Ferrari 250 LM of the Stanford log, with the fitted tyres x 0.7, and
-    the corners of the nominal one. mapping: texts such as "steer_rad=Delta". wires: what is known beside the car; identified ones stand behind
-    it. settings: of `replay`. Raises what `read_parts`, `vehicle_from`, `identify`, `replay` do.
+    the corners of the nominal one. mapping: texts such as "steer_rad=Delta". wires: what is known
+    beside the car; identified ones stand behind it.
+    settings: of `replay`. Raises what `read_parts`, `vehicle_from`, `identify`, `replay` do.
     """
     if is_nmea(log):
         from .receiver_suite import receiver_suite, replay_nmea

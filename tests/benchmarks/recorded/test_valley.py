@@ -135,7 +135,7 @@ def test_a_car_that_cannot_be_is_not_identified(tmp_path: Path) -> None:
     run = CliRunner().invoke(app, again)
     assert run.exit_code == 0, run.output
     text = " ".join(run.output.split())
-    assert "WARNING: the car is not identified" in text and "passenger-car-identified" not in text
+    assert "the car is not identified" in text and "passenger-car-identified" not in text
 
 
 def test_five_rows_identify_nothing(tmp_path: Path) -> None:
