@@ -84,6 +84,7 @@ def replay_file(
         car = design = vehicle_from(vehicle)
     remarks += [f"WARNING: {text}." for text in warnings_of(logs, design)]
     settings = {"noise": wires.noise} | settings
+    settings["emulated"] = not any(part.slow for part in logs)
     parts = [part for part in logs if part.time[-1] - part.time[0] >= SETTLED] or logs[:1]
     suite, *others = [replay(part, design, **settings) for part in parts]
     others += [corners(part, car, **settings) for part in parts if "beta" in part.truth]
@@ -92,5 +93,6 @@ def replay_file(
         suite.tables += each.tables
         suite.figures += each.figures
     suite.tables += tables
-    suite.text = "\n\n".join([suite.text, *remarks])
+    urgent = [text for text in remarks if text.startswith("WARNING")]
+    suite.text = "\n\n".join([*urgent, suite.text, *(t for t in remarks if t not in urgent)])
     return suite
