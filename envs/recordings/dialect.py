@@ -61,18 +61,20 @@ def read_text(
     tables = []
     for separator in declared[1] if declared else _SEPARATORS:
         rows = {i: _split(line, separator) for i, line in body.items()}
-        n_rows, width = max((n, w) for w, n in Counter(map(len, rows.values())).items())
-        tables.append(
-            (width > 1 and separator != " ", n_rows * (width > 1), width, separator, rows)
-        )
-    *_, width, separator, rows = max(tables, key=lambda table: table[:3])
+        widths = Counter(len(row) for row in rows.values() if len(row) > 1)
+        n_rows, width = max(((n, w) for w, n in widths.items()), default=(0, 1))
+        share = 0.5 if separator == " " else 1.0  # spaces stand beside other separators
+        tables.append((share * n_rows, width, separator, rows))
+    _, width, separator, rows = max(tables, key=lambda table: table[:2])
     named = [
         i for i, row in rows.items()
         if abs(len(row) - width) <= 1 and 2 * sum(map(bool, row)) >= len(row)
         and not any(map(_NUMBER.fullmatch, row))
     ]  # fmt: skip
-    wanted = [i for i, row in rows.items() if any(map(is_wanted, row))]
-    at = next((i for i in wanted if i in named), (named or wanted or list(rows))[0])
+    best, other = (
+        [i for i in of if any(map(is_wanted, rows[i]))] for of in (named, () if named else rows)
+    )
+    at = (best or named or other or list(rows))[0]
     header, below = rows[at], {i: row for i, row in rows.items() if i > at}
     if any(header[width:]) or any(any(row[len(header) :]) for row in below.values()):
         raise ValueError(
@@ -97,7 +99,7 @@ def read_text(
         encoding=encoding,
         header=0,
         names=list(range(len(header))),
-        skiprows=[*range(at), *skipped],
+        skiprows=[*range(at), *skipped] or None,
         index_col=False,
         skipinitialspace=True,
         low_memory=False,
@@ -125,7 +127,7 @@ def _find_encoding(data: bytes) -> str:
     if even or odd:
         raise ValueError("it is a binary file")
     try:
-        data.decode("utf-8")
+        data.isascii() or data.decode("utf-8")
     except UnicodeDecodeError:
         if re.search(rb"[\x01-\x08\x0e-\x1f]", head[:-1]):
             raise

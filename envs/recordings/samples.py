@@ -89,11 +89,11 @@ def _keep_samples(values: dict[str, Array], kinds: Mapping[str, str]) -> list[st
 
 
 def _find_knots(values: Array) -> npt.NDArray[np.int64]:
-    """Where an angle's slope changes: not where a line crosses +-180 deg, whichever way it goes."""
+    """Where an angle's slope changes, +-180 deg being one, by more than values are rounded."""
     gaps, scale = np.diff(np.unique(values)), float(np.abs(values).max())
     resolution = gaps[gaps > 1e-12 * scale].min(initial=np.pi)
-    bends = [np.abs(np.diff(angle, 2)) for angle in (values, np.unwrap(values))]
-    return np.flatnonzero(np.min(bends, axis=0) > 2.5 * resolution + 4e-7 * scale) + 1
+    bends = np.abs(np.diff(np.unwrap(values), 2))
+    return np.flatnonzero(bends > 2.5 * resolution + 4e-7 * scale) + 1
 
 
 def _find_period(lengths: Array) -> float:

@@ -58,6 +58,9 @@ SECTIONS = f"made by hand\n\n[column names]\n{SPACED[2:]}".replace("rad\n", "rad
         (SPACED.encode(), "columns between spaces"),
         (SECTIONS.encode(), "columns between spaces, the header in line 4"),
         (PLAIN.replace("\n", ",\n").encode(), ""),
+        (PLAIN.replace(",", ", ").encode(), ""),
+        (f"Hello, world\n{60 * chr(10)}{SECTIONS}".encode(), "the header in line 65"),
+        ("".join(f"note {i}\n" for i in range(60)).encode() + PLAIN.encode(), "line 61"),
     ],
 )
 def test_a_dialect_is_recognised_and_said(tmp_path: Path, content: bytes, said: str) -> None:
@@ -105,6 +108,9 @@ def test_a_decimal_comma_is_not_guessed(tmp_path: Path) -> None:
     path.write_text(PLAIN.replace(",", ";").replace("0.", "0,").replace("20,", "20."))
     with pytest.raises(ValueError, match=r"a number with a decimal point alone, got '-?0,"):
         read_log(path)
+    table = drive(300).assign(speed_x_mps=drive(300)["speed_x_mps"].map(str).str.replace(".", ","))
+    with pytest.raises(ValueError, match=r"speed_x_mps', row 1: .* point alone, got '20,1"):
+        read_log(saved(table, tmp_path, sep=";"))
     path.write_text(PLAIN.replace(".", ","))
     with pytest.raises(ValueError, match=r"header in line 1 has 8 names, and rows have 1\d fields"):
         read_log(path)
