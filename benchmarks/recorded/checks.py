@@ -16,7 +16,7 @@ from .emulate import moving as moving
 
 LEAST_RELATED = 0.5  # correlation, below which steering and yaw rate have nothing in common
 TRUTH = "the sideslip truth"  # how a warning begins that puts the score in doubt
-COMPASS = "degrees from north, clockwise? map it as course from north"
+COMPASS = "degrees from north, clockwise? --map course_degnorth=COLUMN reads it"
 FACTOR = 1.8  # by which a column may differ from what the others imply
 _SURE = 3.0  # standard errors beyond it
 _TURNING = 0.3  # m/s2 RMS, below which nothing is judged

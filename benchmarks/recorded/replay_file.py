@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from ...envs.recordings.columns import parse_mapping
-from ...envs.recordings.parts import read_parts
+from ...envs.recordings.parts import URGENT, read_parts
 from ...envs.recordings.sources import is_nmea
 from ...envs.vehicle.vehicles import VehicleSource, vehicle_from
 from ..harness.drives import SETTLED
@@ -18,6 +18,12 @@ from .wires import Wires, corrected
 FITTED, NOMINAL = "ferrari-250lm-fitted", "ferrari-250lm-nominal"
 FACTOR = 0.7  # of the fitted tyres, where no vehicle is named
 DOUBT = "The truth of this log is in doubt, and with it all errors: see the warnings."
+
+
+def urgent_first(remarks: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Split a reader's remarks into warnings, without their mark, and the rest."""
+    urgent = [text.removeprefix(URGENT).rstrip(".") for text in remarks if text.startswith(URGENT)]
+    return urgent, [text for text in remarks if not text.startswith(URGENT)]
 
 
 def identify_file(
@@ -36,9 +42,10 @@ def identify_file(
     logs, remarks = read_parts(log, parse_mapping(mapping), end=until)
     car = vehicle_from(vehicle)
     found = identify(logs, car, wires, tyres)
+    urgent, remarks = urgent_first(remarks)
     found.remarks = [*remarks, *remarks_of(logs), *found.remarks]
     suite = suite_of(found, logs[0].name)
-    suite.warnings = warnings_of(logs, car)
+    suite.warnings = urgent + warnings_of(logs, car)
     return found, suite
 
 
@@ -88,6 +95,7 @@ def replay_file(
         car = design = vehicle_from(vehicle)
     remarks += remarks_of(logs)
     settings = {"noise": wires.noise} | settings
+    settings["emulated"] = not any(part.slow for part in logs)
     parts = [part for part in logs if part.time[-1] - part.time[0] >= SETTLED] or logs[:1]
     suite, *others = [replay(part, design, **settings) for part in parts]
     others += [corners(part, car, **settings) for part in parts if "beta" in part.truth]
@@ -96,8 +104,9 @@ def replay_file(
         suite.tables += each.tables
         suite.figures += each.figures
     suite.tables += tables
+    urgent, remarks = urgent_first(remarks)
     suite.text = "\n\n".join([suite.text, *remarks])
-    suite.warnings = warnings_of(logs, design)
+    suite.warnings = urgent + warnings_of(logs, design)
     if unknown:
         suite.warnings.append(f"the car is not identified, {unknown}: it stays as stated")
     if any(text.startswith(TRUTH) for text in suite.warnings):

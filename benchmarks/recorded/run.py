@@ -45,7 +45,7 @@ class Settings(Emulation):
     course noise they assume is `course_noise_deg`. seeds: how many noises of the emulated course,
     from `seed` on. options: more options of estimators, by name. noise: standard deviations by
     option, which estimators assume. stiffness_factor: of both tyre stiffnesses of the estimators.
-    figures: whether to draw.
+    figures: whether to draw. emulated: whether a log with truth and no slow sensor gets a course.
 
     Raises ValueError for a value out of range and an unknown estimator.
     """
@@ -58,6 +58,7 @@ class Settings(Emulation):
     seed: int = 0
     stiffness_factor: float = 1.0
     figures: bool = True
+    emulated: bool = True
     options: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     noise: Mapping[str, float] = field(default_factory=dict)
 
@@ -79,7 +80,7 @@ class Settings(Emulation):
     def as_dict(self) -> dict[str, Any]:
         """JSON types: everything that moves a number."""
         plain = dataclasses.asdict(self)
-        del plain["figures"]
+        del plain["figures"], plain["emulated"]
         plain["estimators"] = list(self.estimators or ESTIMATORS)
         return plain
 
@@ -123,7 +124,7 @@ def drives_of(log: Log, how: Settings) -> list[Log]:
         raise ValueError(
             f"{log.name}: the drive lasts {lasts:.3g} s, errors count from {SETTLED:g} s on"
         )
-    if log.slow or "beta" not in log.truth:
+    if log.slow or "beta" not in log.truth or not how.emulated:
         return [how.with_gyro_bias(log)]
     return [how.with_course(log, how.seed + i) for i in range(how.seeds)]
 

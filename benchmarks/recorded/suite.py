@@ -123,7 +123,7 @@ def _text(log: Log, drives: Sequence[Log], car: Vehicle, how: Settings) -> str:
             f"integral of the logged yaw rate: noise {how.course_noise_deg:g} deg, "
             f"{gps.longest_delay:.4g} s late, bias {how.bias_deg:g} deg."
         )
-    else:
+    elif how.emulated:
         text.append("The log has no slow sensor and no truth to emulate one from.")
     if how.gyro_bias_degps:
         text.append(f"{how.gyro_bias_degps:g} deg/s are added to the gyro.")
