@@ -96,8 +96,8 @@ def seeds_of(contest: Contest, count: int = SEEDS) -> list[int]:
 
 
 def solve(case: Case) -> Episode:
-    """The best of the plans from zero, nominal's and the oracle's runs; from the folder of
-    finished cases where it is there."""
+    """The best of the plans from nominal's and the oracle's runs; from the folder of finished cases
+    where it is there."""
     from ...agents.clairvoyant.plan import actions_of, ceiling
     from ...agents.rungs import make_rung
 

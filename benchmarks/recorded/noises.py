@@ -5,9 +5,9 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import t as student
 
 from ...envs.record import FAST, PACKET, Array, Log
+from ..harness.stats import margin_of_error
 from .emulate import ground_speed, heading
 
 WIDE = "its interval is too wide"
@@ -37,8 +37,7 @@ def jackknife(blocks: Array, statistic: Callable[[Array], float]) -> tuple[float
     """(value, half of the 95 % interval) of a statistic of the sum of blocks, (count, ...)."""
     total, count = blocks.sum(axis=0), len(blocks)
     without = np.array([statistic(total - block) for block in blocks])
-    sd = math.sqrt((count - 1) / count * float(np.sum((without - without.mean()) ** 2)))
-    return statistic(total), float(student.ppf(0.975, count - 1)) * sd
+    return statistic(total), margin_of_error((count - 1.0) * without)
 
 
 def _root_mean(sums: Array) -> float:
