@@ -26,7 +26,7 @@ HOUR = 3600.0  # s, from which a step forward is counted
 CONTINUOUS = 60.0  # s: a time of day within these goes on, whatever its date
 ROLLOVER = 7 * 1024  # days, after which a receiver's count of weeks begins anew
 _EPOCH = date(1970, 1, 1).toordinal()
-_FIRST_DAY = date(1980, 1, 6).toordinal() - _EPOCH  # of GPS: no date is earlier
+_FIRST = DAY * (date(1980, 1, 6).toordinal() - _EPOCH)  # s: GPS has no earlier date
 _NOT_MEASURED = (0, 6, 7)  # GGA's quality: no fix, dead reckoning, typed in
 _TIMED = ("GLL", "RMC", "GNS", "GGA")  # with a position
 
@@ -187,7 +187,7 @@ class Decoder:
                 self._next[kind] = values
             return done
         if time is not None and "date" in values:
-            self._set_date(values["date"].toordinal() - _EPOCH, time)
+            self._date = values["date"].toordinal() - _EPOCH, time
         if kind == "ZDA":
             return done
         self._parts[kind] = values
@@ -209,9 +209,7 @@ class Decoder:
     def _epoch(self) -> Epoch:
         self._sent = True
         t = math.nan if self._time is None else self._since_1970(self._time)
-        known: dict[str, Any] = {}
-        for kind in DECODED:
-            known |= self._parts.get(kind, {})
+        known = {k: v for kind in DECODED for k, v in self._parts.get(kind, {}).items()}
         flags = [known["status"] == "A"] if "status" in known else []
         flags += [known["quality"] not in _NOT_MEASURED] if "quality" in known else []
         latitude, longitude = signed(known, "lat", "NS", "S"), signed(known, "lon", "EW", "W")
@@ -238,31 +236,16 @@ class Decoder:
         )
 
     def _since_1970(self, time: float) -> float:
-        day = self._day(time)
+        day, at = self._date
+        day += (time < at - DAY / 2) - (time > at + DAY / 2)  # midnight, without a date
         self._date = day, time
         self._leaps += self._in_leap and time < DAY
         self._in_leap = time >= DAY
         t = day * DAY + time + self._leaps
         self.counts.backward += t < self._last
-        self.counts.forward += t >= self._last + HOUR
+        self.counts.forward += t >= self._last + HOUR and (self._last >= _FIRST or t < _FIRST)
         self._last = t
         return t
-
-    def _day(self, time: float) -> int:
-        """The day of a time without a date."""
-        day, at = self._date
-        day += (time < at - DAY / 2) - (time > at + DAY / 2)  # midnight, without a date
-        return day
-
-    def _set_date(self, day: int, time: float) -> None:
-        """Take a date that was sent; where it jumps, an age remains the time that went by."""
-        before, at = self._date
-        jump = (day - self._day(time)) * DAY
-        if before < _FIRST_DAY:
-            self._last += jump  # the first date is no step of time
-        if before < _FIRST_DAY or abs(math.remainder(time - at, DAY)) <= CONTINUOUS:
-            self._fix += jump
-        self._date = day, time
 
 
 def mend_dates(epochs: list[Epoch]) -> list[Epoch]:
@@ -272,19 +255,17 @@ def mend_dates(epochs: list[Epoch]) -> list[Epoch]:
         epochs: Those of a whole log, as `Decoder` hands them out.
 
     Returns:
-        The epochs, dated by the last date of theirs, or a newer one by whole rollovers of the
-        weeks. Epochs before the first date have it; a pause in real time remains.
+        The epochs by their last date, or one newer by whole rollovers. A real pause remains.
     """
     t = np.array([epoch.t for epoch in epochs])
     rows = np.flatnonzero(np.isfinite(t))
     step = np.diff(t[rows])
     jump = np.rint(step / DAY)
-    dated = t[rows[:-1]] >= _FIRST_DAY * DAY
+    dated = t[rows[:-1]] >= _FIRST
     pause = dated & (jump != 0.0) & (np.abs(step - jump * DAY) > CONTINUOUS)
     days = np.append(0.0, np.cumsum(np.where(pause, 0.0, jump)))
     for part in np.split(np.arange(len(rows)), np.flatnonzero(pause) + 1):
-        if len(part):
-            later = days[part[-1]] - days[part]
-            later += max(-later[later % ROLLOVER == 0.0])
-            t[rows[part]] += later * DAY
+        later = days[part[-1:]] - days[part]
+        later += max(-later[later % ROLLOVER == 0.0], default=0.0)
+        t[rows[part]] += later * DAY
     return [epoch._replace(t=float(new)) for epoch, new in zip(epochs, t, strict=True)]

@@ -126,9 +126,9 @@ def read_nmea(path: str | Path) -> tuple[list["Epoch"], "Counts"]:
         raise ValueError(f"{path}: the file is empty")
     if not counts.sentences:
         raise ValueError(
-            f"{path}: no valid NMEA sentence in {counts.received} bytes; {counts.bad_checksum} with "
-            f"a bad checksum, {counts.unchecked} without a checksum, {counts.truncated} cut short, "
-            f"{counts.overlong} overlong"
+            f"{path}: no valid NMEA sentence in {counts.received} bytes; {counts.bad_checksum} "
+            f"with a bad checksum, {counts.unchecked} without a checksum, "
+            f"{counts.truncated} cut short, {counts.overlong} overlong"
         )
     if not any(epoch.fixed and epoch.t == epoch.t for epoch in epochs):
         lacks = "both a fix and a time" if any(epoch.fixed for epoch in epochs) else "a fix"
