@@ -238,7 +238,8 @@ def test_no_plan_is_dearer_than_the_regulators_own() -> None:
     plan = LIMIT * (-1.0) ** np.arange(len(blocks))
     zeros = cost_of(agent, found, np.zeros(len(blocks)))
     assert cost_of(agent, found, plan) > 2.0 * zeros
-    J, _, _ = improved(agent.design.model, *found, blocks, plan, 1)
+    start, K, T = found
+    J, _, _ = improved(agent.design.model, start, K, T, blocks, plan, 1)
     assert zeros >= J
 
 
