@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -50,6 +51,41 @@ def test_an_engine_that_is_none_is_refused() -> None:
         pass
     with pytest.raises(ValueError, match="an address is of a Ray cluster"), engine(address="x:1"):
         pass
+
+
+class Deadly:
+    """Ray's calls that `completed` makes; the worker of each case dies so many times."""
+
+    def __init__(self, deaths: int) -> None:
+        self.deaths = deaths
+
+    def put(self, value: Any) -> Any:
+        return value
+
+    def remote(self, num_cpus: int, max_retries: int) -> Any:
+        def ask(function: Any, *args: Any) -> Any:
+            if self.deaths > max_retries:
+                raise ChildProcessError(f"the worker died {self.deaths} times")
+            return function(*args)
+
+        return lambda function: SimpleNamespace(remote=lambda *args: partial(ask, function, *args))
+
+    def wait(self, asked: list[Any], num_returns: int) -> tuple[list[Any], list[Any]]:
+        return asked[:num_returns], asked[num_returns:]
+
+    def get(self, asked: Any) -> Any:
+        return asked()
+
+
+def test_a_case_outlives_so_many_deaths_of_its_worker_and_no_more() -> None:
+    token = engines._CLUSTER.set(Deadly(engines.RETRIES))
+    try:
+        assert dict(completed(abs, [-1, -2, -3])) == {0: 1, 1: 2, 2: 3}
+        engines._CLUSTER.set(Deadly(engines.RETRIES + 1))
+        with pytest.raises(ChildProcessError):
+            list(completed(abs, [-1]))
+    finally:
+        engines._CLUSTER.reset(token)
 
 
 @pytest.fixture

@@ -237,6 +237,25 @@ def test_learning_runs_on_one_thread() -> None:
         assert torch.get_num_threads() == 1
 
 
+def test_targets_are_held_beside_all_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What each of them measured, and what it could not for want of a package."""
+    held: list[Any] = []
+
+    def judge(found: Any, *numbers: Any) -> None:
+        found.tables.append(None)
+        held.extend(numbers)
+
+    for part in (env_steps, plant, learning, first_use):
+        own = {part.__name__: (1.0,)}, {part.__name__: "not there"}
+        monkeypatch.setattr(part, "add", lambda *_, own=own, **__: own)
+    monkeypatch.setattr(targets, "add", judge)
+    monkeypatch.setattr(suite, "answer", lambda *_: "")
+    suite.run(quick=True)
+    taken, seconds, absent = held
+    assert list(taken) == [part.__name__ for part in (env_steps, plant, learning)]
+    assert list(absent) == [*taken, first_use.__name__] and list(seconds) == [first_use.__name__]
+
+
 @pytest.mark.long
 def test_the_quick_form_gives_all_tables(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(suite, "QUICK", SHORT)

@@ -13,6 +13,7 @@ import cv2
 
 from sideslip.envs.backend.decorators import plain
 from sideslip.envs.sensors.camera import View, lane_offset
+from sideslip.envs.sensors.camera.consensus import Place, search
 from sideslip.envs.sensors.camera.finder import Lane, LaneFinder
 from sideslip.envs.sensors.camera.pinhole import Pinhole
 from sideslip.envs.sensors.camera.road_image import Appearance, Painter, Scene
@@ -98,6 +99,17 @@ def test_pitch_and_roll_are_told_from_the_lane() -> None:
     lane = FINDER.find(CLEAR.picture(Scene(y=1.5, roll=0.02)))  # in its middle nothing shows it
     assert FINDER.fit is not None and FINDER.fit.roll == pytest.approx(0.02, abs=4e-3)
     assert lane.y_l == pytest.approx(1.5, abs=0.04)
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_of_two_lanes_the_cars_own_is_taken(side: float) -> None:
+    """Even where the marking beyond the next lane is the fresher one."""
+    width = 3.7
+    x = np.tile(np.linspace(6.0, 30.0, 60), 3)
+    y = np.repeat(side * width * np.array([-0.5, 0.5, 1.5]), 60)
+    weight = np.repeat([1.0, 1.2, 1.1], 60)
+    best = search(x, y, weight, Place(1.2, 1.5, 5.0, width))[0]
+    assert best.values[1] == pytest.approx(0.0, abs=0.05)
 
 
 @pytest.mark.parametrize("noise", [0.0, 2.0, 30.0])
