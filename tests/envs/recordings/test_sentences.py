@@ -1,4 +1,4 @@
-"""Which sentences make an epoch, of one talker or several, and which none for want of a checksum."""
+"""Which sentences make an epoch, of one talker or several, and which lack their checksum."""
 
 from itertools import chain, permutations
 
