@@ -175,7 +175,12 @@ def test_a_teacher_is_told_what_was_done_and_teaches_what_it_knows() -> None:
     """What it would have done, shaken by noise of which 0.95 are left after a step."""
     plain = lesson()
     watched, done, step = Watched(plain.teacher, 3), list[Any](), plain.cars.step
-    plain.cars.step = lambda action: (done.append(action.copy()), step(action))[1]
+
+    def noted(action: Any) -> Any:
+        done.append(action.copy())
+        return step(action)
+
+    plain.cars.step = noted
     seen = drive(plain._replace(teacher=watched), None, range(CARS), 0.01)
     assert np.array_equal(watched.acts, done) and len(done) == seen.labels.shape[1]
     assert not seen.weights[3].any() and (np.delete(seen.weights, 3, axis=0) > 0.0).all()
