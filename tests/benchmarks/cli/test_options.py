@@ -116,6 +116,8 @@ CASES = [
          ("--step", "step", True)),
     *_of("train --algo ppo", "agents.training.train.train",
          ("--reads gyro", "task.reads", ["gyro"]),
+         ("--num-envs 8", "task.num_envs", 8),
+         ("--n-eval-envs 4", "task.n_eval_envs", 4),
          ("--tensorboard-log logs", "means.tensorboard_log", "logs"),
          ("--track", "means.track", "sideslip"),
          ("--trust", "trust", True)),

@@ -91,6 +91,7 @@ def episodes(cell: Cell, n: int) -> Driven:
     levels = {NOMINAL: 4.0, "oracle-state": 1.0, "none": 20.0}
     numbers = np.zeros((n, len(NUMBERS)))
     numbers[:, COST] = levels.get(cell.controller, 2.0) * (1.0 + 0.1 * np.arange(n) % 3)
+    numbers[: n // 3, FAILURE] = cell.controller.endswith("e.py")
     if "broken" in cell.controller:
         return Driven(np.full_like(numbers, np.nan), np.nan, error="ValueError: no (pd.py, line 3)")
     return Driven(numbers, 0.0)
@@ -203,6 +204,7 @@ def test_the_verdict_has_a_sentence_for_each_and_five_lines_at_most(
     assert lines[0] == f"Place 3 of 9: {sentence(mine)}."
     assert "50 % [50, 50] of nominal's cost (tier 1: 50, tier 2a: 50, tier 2b: 50" in lines[0]
     assert "closes 50 % [50, 50] of the gap" in lines[0] and "fails in 0.0 %" in lines[0]
+    assert "fails in 33.3 % (nominal 0.0 %)" in sentence(found.of(pairs[4]))
     broken = sentence(found.of(pairs[1]))
     assert "not driven: " in broken and broken.endswith("ValueError: no (pd.py, line 3)")
     cells = table(found).cells
