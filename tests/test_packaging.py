@@ -90,6 +90,21 @@ def test_import_loads_no_heavy_module_and_none_of_ours(tmp_path: Path) -> None:
 
 
 @pytest.mark.smoke
+SLOW = ("control", "cv2", "matplotlib", "pandas", "plotly", "scipy.signal", "scipy.stats", "torch")
+
+
+@pytest.mark.parametrize("command", ["--help", "--version", "list", "bench --help", "run --help"])
+def test_a_command_that_drives_nothing_loads_nothing_slow(command: str, tmp_path: Path) -> None:
+    code = (
+        "import sys\n"
+        f"sys.argv = ['sideslip', *{command.split()!r}]\n"
+        "from sideslip.__main__ import main\n"
+        "try:\n    main()\nexcept SystemExit:\n    pass\n"
+        f"print('loaded', [name for name in {SLOW!r} if name in sys.modules])"
+    )
+    assert python(code, tmp_path).splitlines()[-1] == "loaded []"
+
+
 def test_lazy_names_are_listed_and_others_refused() -> None:
     assert {"rollout", "make_agent", "make_estimator"} <= set(dir(sideslip))
     with pytest.raises(AttributeError, match="no attribute 'make_coffee'"):
