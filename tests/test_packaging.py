@@ -35,6 +35,9 @@ HEAVY = {
     "vehiclemodels",
 }
 
+SLOW = ("control", "cv2", "matplotlib", "pandas", "plotly", "scipy.signal", "scipy.stats", "torch")
+"""Modules that a command without a drive does not load."""
+
 
 def python(code: str, cwd: Path) -> str:
     """Run code in a fresh interpreter that finds the same `sideslip`, and return what it prints."""
@@ -89,10 +92,6 @@ def test_import_loads_no_heavy_module_and_none_of_ours(tmp_path: Path) -> None:
     assert python(code, tmp_path).split() == ["sideslip"]
 
 
-@pytest.mark.smoke
-SLOW = ("control", "cv2", "matplotlib", "pandas", "plotly", "scipy.signal", "scipy.stats", "torch")
-
-
 @pytest.mark.parametrize("command", ["--help", "--version", "list", "bench --help", "run --help"])
 def test_a_command_that_drives_nothing_loads_nothing_slow(command: str, tmp_path: Path) -> None:
     code = (
@@ -105,6 +104,7 @@ def test_a_command_that_drives_nothing_loads_nothing_slow(command: str, tmp_path
     assert python(code, tmp_path).splitlines()[-1] == "loaded []"
 
 
+@pytest.mark.smoke
 def test_lazy_names_are_listed_and_others_refused() -> None:
     assert {"rollout", "make_agent", "make_estimator"} <= set(dir(sideslip))
     with pytest.raises(AttributeError, match="no attribute 'make_coffee'"):
