@@ -4,7 +4,6 @@ import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
-from zipfile import ZipFile
 
 import numpy as np
 import pandas as pd
@@ -220,20 +219,6 @@ def test_an_agent_drives_on_the_estimators_and_these_under_lqr() -> None:
         ("lqr", "dakf"),
     ]
     assert pairs_of(["ppo-yaw-vision"], [])[0].estimator == ""
-
-
-def test_a_zip_is_read_where_it_is_trusted(tmp_path: Path) -> None:
-    """Alone, without a filter that it did not see in training."""
-    mine = str(tmp_path / "mine.zip")
-    with ZipFile(mine, "w") as archive:
-        archive.writestr("data", "{}")
-        archive.writestr("policy.pth", "")
-    (pair, other) = pairs_of([mine, "esc"], [], trust=True)
-    assert pair.estimator == "" and pair.cell(Contest()).best["controller"] == {"trust": True}
-    assert not other.trust
-    Challenge((pair,))
-    with pytest.raises(PermissionError, match=r"`sideslip export .*mine.zip --trust`"):
-        Challenge(tuple(pairs_of([mine], [])))
 
 
 def test_contests_are_those_of_the_id() -> None:
