@@ -17,7 +17,7 @@ import pytest
 from rich.console import Console
 
 from sideslip.benchmarks.estimation import run
-from sideslip.benchmarks.harness import engines
+from sideslip.benchmarks.harness import engines, parallel
 from sideslip.benchmarks.harness.engines import completed, engine
 from sideslip.benchmarks.harness.parallel import one_bar, run_cases
 
@@ -186,3 +186,16 @@ def test_a_run_has_one_progress_bar() -> None:
     last = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", written.getvalue()).splitlines()[-1]
     assert "third" in last and "2/2" in last
     assert "\n" not in re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", written.getvalue()).strip()
+
+
+def test_off_a_terminal_a_line_says_how_far_it_is(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At once, and again and again while cases run; none without a console."""
+    monkeypatch.setattr(parallel, "_EVERY", 0.01)
+    wait = partial(time.sleep, 0.05)
+    run_cases(lambda _: wait(), [1, 2], "mine", jobs=1, console=Console(file=io.StringIO()))
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0] == "mine: 0 of 2 cases, 0 s" and "mine: 1 of 2 cases, 0 s" in lines
+    run_cases(lambda _: wait(), [1], "mine", jobs=1)
+    assert capsys.readouterr().err == ""
