@@ -134,12 +134,12 @@ import sys
 from pathlib import Path
 from sideslip.benchmarks.control.cells import Cell
 from sideslip.benchmarks.control.contests import contests
-from sideslip.benchmarks.control.run import measure
+from sideslip.benchmarks.control.run import CHUNK, measure
 from sideslip.benchmarks.harness.engines import engine
 
 with engine("ray", sys.argv[1]):
     cells = [Cell(contest, "", "none") for contest in contests()[:6]]
-    measure(cells, range(500), keep=Path(sys.argv[2]))
+    measure(cells, range(4 * CHUNK), keep=Path(sys.argv[2]))
 """
 
 
@@ -149,11 +149,12 @@ def test_a_driver_that_is_killed_goes_on(cluster: Any, tmp_path: Path) -> None:
     command = [sys.executable, "-c", DRIVER, nodes.address, str(tmp_path)]
     with subprocess.Popen(command) as driver:
         while len(done := list(tmp_path.glob("*.npz"))) < 3:
+            assert driver.poll() is None, "the driver ended before it was killed"
             time.sleep(0.02)
         driver.kill()
     before = {path: path.stat().st_mtime_ns for path in done}
     subprocess.run(command, check=True)
-    assert len(list(tmp_path.glob("*.npz"))) == 12
+    assert len(list(tmp_path.glob("*.npz"))) == 4 * 6  # chunks of each cell
     assert all(path.stat().st_mtime_ns == when for path, when in before.items())
 
 
