@@ -67,6 +67,7 @@ CASES = [
     *_of("bench control --agent mine.py:Mine", f"{CLI}.main.run_suites",
          ("--limit 5", "request.challenge.limit", 5.0),
          ("--fresh", "request.challenge.fresh", True),
+         ("--salt ab12", "request.challenge.salt", "ab12"),
          ("--episodes 8", "request.challenge.episodes", 8),
          ("--env sideslip/YawGps-v0", "request.challenge.env_id", "sideslip/YawGps-v0"),
          ("--scenario gust", "request.challenge.scenarios", ("gust",)),
@@ -163,7 +164,7 @@ CASES = [
          ("--log logs", "path", Path("logs/coms-model.lqr.json"))),
 ]
 # fmt: on
-NOTHING = SimpleNamespace(spec=None, search={}, car=None, wires=None)
+NOTHING = SimpleNamespace(spec=None, search={}, car=None, wires=None, reason="")
 RETURNED: dict[str, dict[str, Any]] = {
     "run": {
         f"{CLI}.contestant.Contestant.on": (NOTHING, None),
