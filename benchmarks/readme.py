@@ -62,14 +62,14 @@ SHOWN: Mapping[str, tuple[str, str]] = {
 }
 """(controller, estimator) of each line, by what it is called."""
 FIRST: Mapping[str, Sequence[tuple[str, str]]] = {
-    "given the true state and car": [(STATE, "")],
+    "a controller given the true state and car": [(STATE, "")],
     "policy on `joint`": [("distill-car-steering", "joint"), ("ppo-coms-steering", "joint")],
     "policy on the late sensors alone": [("raw-car-steering", ""), ("raw-coms-steering", "")],
     "`adaptive-nmpc` on `joint`": [("adaptive-nmpc", "joint, friction")],
     "`adaptive-lqr` on `joint`": [("adaptive-lqr", "joint")],
     "tuned LQG: `lqr` on `exact-kf`": [(NOMINAL, "")],
     "`model-following` (dakf-stability)": [("model-following", REFERENCE_FILTER)],
-    "`two-dof` (tie-vision)": [("two-dof", REFERENCE_FILTER)],
+    "`two-dof` (tie-vision), motors alone": [("two-dof", REFERENCE_FILTER)],
     "no control": [("none", "")],
 }
 """The lines of README's table: of each tier the first entry that drove it."""

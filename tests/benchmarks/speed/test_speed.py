@@ -146,7 +146,7 @@ def test_learning_without_torch_is_absent(monkeypatch: pytest.MonkeyPatch) -> No
 
 def test_compilation_is_counted_at_the_top_alone() -> None:
     code = """
-from sideslip.envs.backend import jit
+from sideslip.envs.backend.decorators import jit
 @jit
 def inner(x):
     return x + 1
