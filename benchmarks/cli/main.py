@@ -237,7 +237,7 @@ def bench(
         done += run_suites(names, request)
     order = [*names, "replay"]
     done.sort(key=lambda suite: order.index(suite.name))
-    write_output(console, done, html, json, parquet)
+    write_output(console, done, html, json, parquet, brief=True)
     if picture is not None:
         from ..picture import write_picture
 

@@ -23,7 +23,7 @@ from ..harness.results import (
     write_parquet,
     write_text,
 )
-from ..report.terminal import print_suite
+from ..report.terminal import print_run, print_suite
 from .options import command_line
 
 if TYPE_CHECKING:
@@ -112,9 +112,12 @@ def write_output(
     html: Path | None = None,
     json: Path | None = None,
     parquet: Path | None = None,
+    brief: bool = False,
 ) -> None:
-    """Print the tables and write the files that have a path."""
-    for suite in suites:
+    """Print tables, or verdicts and a table if `brief`; write the files that have a path."""
+    if brief:
+        print_run(console, suites, html is not None)
+    for suite in () if brief else suites:
         print_suite(console, suite)
     rows: list[Row] = [row for suite in suites for row in suite.rows]
     if json is not None:

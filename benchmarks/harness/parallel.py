@@ -48,7 +48,7 @@ def _lines(
     console: Console | None, title: str, count: int, found: Mapping[int, object]
 ) -> Iterator[None]:
     """Say on standard error how many cases are done, at once and every 15 s, without a bar."""
-    if console is None or console.is_terminal:
+    if console is None or console.is_terminal or count < 2:
         yield
         return
     ended, begun, speech = Event(), time.monotonic(), Console(stderr=True)

@@ -198,5 +198,5 @@ def test_off_a_terminal_a_line_says_how_far_it_is(
     run_cases(lambda _: wait(), [1, 2], "mine", jobs=1, console=Console(file=io.StringIO()))
     lines = capsys.readouterr().err.splitlines()
     assert lines[0] == "mine: 0 of 2 cases, 0 s" and "mine: 1 of 2 cases, 0 s" in lines
-    run_cases(lambda _: wait(), [1], "mine", jobs=1)
+    run_cases(lambda _: wait(), [1, 2], "mine", jobs=1)
     assert capsys.readouterr().err == ""
