@@ -132,8 +132,9 @@ def _elsewhere(found: Mapping[str, Sequence[Standing]]) -> str:
     drivers, overall_best = _controllers(found), best_controller(found)
     parted = drivers.keys() - everywhere(drivers).keys() if overall_best else ()
     ahead = {name: _over(drivers[name], drivers[overall_best]) for name in parted}
-    parts += [f"{name} on its own manoeuvres" for name in sorted(ahead, key=lambda who: ahead[who].value)
-              if ahead[name].high < 1.0]  # fmt: skip
+    cheaper = (name for name in ahead if ahead[name].high < 1.0)
+    ordered = sorted(cheaper, key=lambda who: ahead[who].value)
+    parts += [f"{name} on its own manoeuvres" for name in ordered]
     return f"Cheaper there: {some(parts)}. " if parts else ""
 
 
