@@ -152,26 +152,24 @@ def _verdict(found: Enjoyed) -> str:
 
 def _table(found: Enjoyed) -> Table:
     first = found.policy.name
-    own, none = found.costs(first), found.costs("none").mean()
-    cells = []
+    own, cells = found.costs(first), []
     for name, driven in found.driven.items():
-        cost = interval(driven.costs)
-        better = f"{100.0 * won(own, driven.costs).value:.0f} %"
+        rival = name != first
+        ratio = percent(geometric_mean(np.log(cost_ratios(own, driven.costs)))) if rival else ""
         cells.append(
             [
                 name,
-                *cost.text(),
-                f"{100.0 * cost.value / none:.1f} %",
-                "" if name == first else better,
+                ratio,
+                f"{100.0 * won(own, driven.costs).value:.0f} %" if rival else "",
                 f"{1e3 * driven['rms_slip'].mean():.2f}",
                 f"{driven['largest_step'].mean():.0f}",
                 f"{100.0 * np.mean(driven['failure'] != 0.0):.1f} %",
             ]
         )
-    header = ("cost", "95 % interval", "of none", "better", "RMS slip", "step", "fails")
+    header = (f"{first} costs, of it", "better", "RMS slip", "step", "fails")
     note = (
-        "Mean cost of an episode. of none: share of the uncontrolled car's. better: share "
-        f"of the seeds on which {first} costs less. Slip in mrad. step: "
+        f"{first}'s cost over each other's: paired geometric means with 95 % intervals. "
+        f"better: share of the seeds on which {first} costs less. Slip in mrad. step: "
         "the largest between two decisions, in N m."
     )
     left_out = [f"{name} was not driven: {error}." for name, error in found.left_out.items()]
