@@ -15,16 +15,22 @@ INSTALL := PIP_CONSTRAINT=constraints.txt PIP_BUILD_CONSTRAINT=constraints.txt \
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
-.PHONY: help bench bench-full test test-plain test-long test-stock coverage lint types docs wheel clean
+.PHONY: help bench bench-all bench-full test test-plain test-long test-stock coverage lint types docs wheel clean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1\t\2/p' Makefile | expand -t 18
 
-bench: .venv/ready-bench ## compare estimators and controllers on few seeds; writes report.html and results.json (LOG=file adds a recorded drive)
-	$(BIN)/sideslip bench --quick --html report.html --json results.json $(if $(LOG),--log "$(LOG)")
+# What every run writes, and a recorded drive (LOG=file) beside.
+WRITTEN := --html report.html --json results.json $(if $(LOG),--log "$(LOG)")
 
-bench-full: .venv/ready-bench ## the same on all seeds, hours on two cores; goes on where it was stopped
-	$(BIN)/sideslip bench --html report.html --json results.json --keep .bench $(if $(LOG),--log "$(LOG)")
+bench: .venv/ready-bench ## compare estimators and controllers on few seeds; writes report.html and results.json (LOG=file adds a recorded drive)
+	$(BIN)/sideslip bench estimation control --quick $(WRITTEN)
+
+bench-all: .venv/ready-bench ## every suite on few seeds, half an hour on two cores
+	$(BIN)/sideslip bench --quick $(WRITTEN)
+
+bench-full: .venv/ready-bench ## every suite on all seeds, hours on two cores; goes on where it was stopped
+	$(BIN)/sideslip bench --keep .bench $(WRITTEN)
 
 test: .venv/ready-all ## the tests and the examples in docstrings
 	$(PYTEST) $(TOGETHER) -m "not long" $(DOCTESTS)

@@ -1,14 +1,17 @@
 """Facts of an environment, single or vector, that controllers are designed from."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import gymnasium as gym
+import numpy as np
 from gymnasium.vector import VectorEnv, VectorWrapper
+from gymnasium.vector.utils import batch_space
 
+from ..envs.arguments import brief
 from ..envs.engine.config import EnvConfig
-from ..envs.task.observation import Entry
+from ..envs.task.observation import Entry, space_of
 from ..envs.vehicle.vehicle import Vehicle
 
 if TYPE_CHECKING:
@@ -17,6 +20,19 @@ if TYPE_CHECKING:
     AnyEnv = gym.Env[Any, Any] | VectorEnv[Any, Any, Any] | VecEnv
 else:
     AnyEnv = Any  # stable-baselines3 comes with an extra, and needs a second to load
+
+# Not loaded here; vector twins have the same names. Ours describe what they change by `layout`.
+_TRANSPARENT = {
+    "gymnasium": "Wrapper VectorWrapper OrderEnforcing PassiveEnvChecker TimeLimit Autoreset "
+    "RewardWrapper VectorRewardWrapper ClipReward NormalizeReward TransformReward AddWhiteNoise "
+    "DictInfoToList HumanRendering ObstructView RecordEpisodeStatistics RecordVideo "
+    "RenderCollection VectorizeTransformReward",
+    "stable_baselines3": "Monitor VecCheckNan VecMonitor VecNormalize VecVideoRecorder",
+    __name__.partition(".")[0]: "EstimateObservation OwnObservation Prepared Rated Remembered "
+    "TruthObservation",
+}
+_CHANGES = {"reset", "step", "step_async", "step_wait", "observation", "observations", "action",
+            "actions"}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -37,6 +53,72 @@ class EnvFacts:
     width: int
 
 
+class PlantKind(NamedTuple):
+    """The text of a plant, as nonlinear MPC predicts with it."""
+
+    tyres: str
+    """The tyre law, of `TYRE_LAWS`."""
+    small_angle: bool
+    roll: bool
+    lags: bool
+    """Whether the actuators lag."""
+    yaw_first: bool
+    """Whether the yaw moment comes before the drive torque."""
+
+
+@dataclass(frozen=True)
+class EnvView:
+    """The spaces and facts of a vector environment, from which an agent is built elsewhere.
+
+    `make_agent`, `facts_of` and our controllers take it for an env. It has no `reset`, no `step`
+    and no seed: an agent built from it learns of the true car by observations alone.
+
+    Attributes:
+        num_envs: Number of rows, a car each.
+        facts: Observation layout, nominal car and limits of the actuators.
+        plants: The kinds of plant among the rows.
+        single_observation_space: Of one row.
+        single_action_space: Of one row.
+    """
+
+    num_envs: int
+    facts: "EnvFacts"
+    plants: frozenset[PlantKind]
+    single_observation_space: gym.Space[Any]
+    single_action_space: gym.Space[Any]
+
+    @classmethod
+    def from_env(cls, env: VectorEnv[Any, Any, Any]) -> "EnvView":
+        """Take the view of a vector env, with its wrappers."""
+        spaces = env.single_observation_space, env.single_action_space
+        return cls(env.num_envs, facts_of(env), plants_of(env), *spaces)
+
+    @property
+    def unwrapped(self) -> "EnvView":
+        """The view itself: nothing lies inside."""
+        return self
+
+    @property
+    def observation_space(self) -> gym.Space[Any]:
+        """Of all rows."""
+        return batch_space(self.single_observation_space, self.num_envs)
+
+    @property
+    def action_space(self) -> gym.Space[Any]:
+        """Of all rows."""
+        return batch_space(self.single_action_space, self.num_envs)
+
+    @property
+    def layout(self) -> tuple[Entry, ...]:
+        """The observation's entries: names, units and bounds."""
+        return self.facts.layout
+
+    @property
+    def nominal(self) -> Vehicle:
+        """The car as controllers know it."""
+        return self.facts.nominal
+
+
 def made(env_id: str, options: Mapping[str, Any]) -> gym.Env[Any, Any]:
     """The env of an id; what its arguments lack is said as the env says it, and no longer."""
     try:
@@ -45,17 +127,32 @@ def made(env_id: str, options: Mapping[str, Any]) -> gym.Env[Any, Any]:
         raise TypeError(str(error).partition(" was raised from the environment")[0]) from None
 
 
-def facts_of(env: AnyEnv) -> EnvFacts:
-    """The facts of an env, a vector env or a stable-baselines3 `VecEnv`.
+def facts_of(env: AnyEnv | EnvView) -> EnvFacts:
+    """The facts of an env, a vector env, a stable-baselines3 `VecEnv` or an `EnvView`.
 
-    Raises ValueError where the rows of a vector env have different nominal cars or limits, or where
-    a wrapper of stable-baselines3 changes the observations.
+    Every wrapper is of a class that is known to leave observations and actions as they are, or has
+    `transparent = True`, as an attribute of its own or of its class. A subclass that defines how it
+    steps, resets, observes or acts anew is none of that class until it says so itself.
+
+    Raises TypeError for what is no env of this package; ValueError for another wrapper, and where
+    the rows of a vector env have different nominal cars or limits.
     """
+    try:
+        return _facts(env)
+    except AttributeError as error:
+        made_by = "an agent is built for an env as of gym.make('sideslip/YawVision-v0')"
+        raise TypeError(f"{made_by}, got {brief(env)}") from error
+
+
+def _facts(env: Any) -> EnvFacts:
     nominals: Sequence[Any]
     vehicles: Sequence[Any]
+    if isinstance(env, EnvView):
+        return env.facts
     if isinstance(env, gym.Env):
         base: Any = env.unwrapped
         layout, width = env.get_wrapper_attr("layout"), base.action_space.shape[0]
+        _check_wrappers(env, layout)
         nominals, vehicles = [base.nominal], [base.vehicle]
         period, kind = base.control_period, base.reference
     elif isinstance(env, VectorEnv):
@@ -65,7 +162,8 @@ def facts_of(env: AnyEnv) -> EnvFacts:
         period, kind = _common(base, "control_period"), _common(base, "reference")
     else:
         base = env.unwrapped
-        layout, width = _plain(env, _common(base, "layout")), base.action_space.shape[0]
+        layout, width = _common(base, "layout"), base.action_space.shape[0]
+        _check_wrappers(env, layout)
         nominals, vehicles = base.get_attr("nominal"), base.get_attr("vehicle")
         period, kind = _common(base, "control_period"), _common(base, "reference")
     limits = [(car.yaw_moment_limit, car.steering_authority) for car in vehicles]
@@ -78,34 +176,73 @@ def facts_of(env: AnyEnv) -> EnvFacts:
     return EnvFacts(layout, nominals[0], *limits[0], period, kind, width)
 
 
+def plants_of(env: AnyEnv | EnvView) -> frozenset[PlantKind]:
+    """The kinds of plant among the rows of an env."""
+    if isinstance(env, EnvView):
+        return env.plants
+    scenarios = ((config.scenario, config.yaw_first) for config in configs_of(env))
+    return frozenset(
+        PlantKind(each.tyres, each.small_angle, each.roll, each.lags, first)
+        for each, first in scenarios
+    )
+
+
 def configs_of(env: AnyEnv) -> Sequence[EnvConfig]:
     """The arguments of an env, or of each environment in a vector env that has no one for all."""
     base: Any = env.unwrapped
     return [base.config] if hasattr(base, "config") else base.get_attr("config")
 
 
-def _plain(env: Any, layout: tuple[Entry, ...]) -> tuple[Entry, ...]:
-    """The layout, if the outermost observations of a stable-baselines3 env have it."""
-    layer = env
-    while layer is not None:
-        if vars(layer).get("norm_obs") or layer.observation_space.shape != (len(layout),):
-            raise ValueError(
-                f"{type(layer).__name__} changes the observations, which a controller reads by "
-                "name: design and drive it on the env inside"
-            )
-        layer = vars(layer).get("venv")
-    return layout
+def _wrappers(env: Any) -> Iterator[Any]:
+    """The wrappers from the outermost in, and those of sub-environments in this process."""
+    inner = vars(env)
+    if isinstance(env, gym.Wrapper | VectorWrapper) or "venv" in inner:
+        yield env
+        yield from _wrappers(inner["venv"] if "venv" in inner else env.env)  # noqa: SIM401
+    for each in (*inner.get("envs", ()), *filter(None, [inner.get("vector_env")])):
+        yield from _wrappers(each)
+
+
+def _is_transparent(wrapper: Any) -> bool:
+    """Whether a wrapper is known, or says itself, to leave observations and actions alone."""
+    if "transparent" in vars(wrapper):
+        return wrapper.transparent is True
+    for each in type(wrapper).__mro__:
+        if "transparent" in vars(each):
+            return vars(each)["transparent"] is True
+        if each.__name__ in _TRANSPARENT.get(each.__module__.partition(".")[0], "").split():
+            return not getattr(wrapper, "norm_obs", False)  # of VecNormalize
+        if not _CHANGES.isdisjoint(vars(each)):
+            return False
+    return False
+
+
+def _check_wrappers(env: Any, layout: tuple[Entry, ...]) -> None:
+    """ValueError for a wrapper that is not known to be transparent, with its name."""
+    wrong = [type(each).__name__ for each in _wrappers(env) if not _is_transparent(each)]
+    base = env.unwrapped
+    if {"layout", "envs", "vector_env"}.isdisjoint(dir(base)):  # elsewhere: spaces show wrappers
+        single = "single_" if isinstance(env, VectorEnv) else ""
+        seen, acts = (getattr(base, f"{single}{of}_space") for of in ("observation", "action"))
+        if seen != space_of(layout) or acts != gym.spaces.Box(-1.0, 1.0, acts.shape, np.float32):
+            wrong.append(f"a wrapper within {type(base).__name__}")
+    if wrong:
+        raise ValueError(
+            f"{wrong[0]} may change observations or actions, which an agent reads and gives by "
+            "name and unit: build and drive the agent on the env inside of it; one that changes "
+            "neither says so by transparent = True, on it or in its class"
+        )
 
 
 def layout_of(env: VectorEnv[Any, Any, Any]) -> tuple[Entry, ...]:
-    """The outermost layout that a layer offers, else that of the sub-environments."""
+    """The outermost layout that a layer offers, else that of the sub-environments; ValueError for
+    a wrapper that `facts_of` refuses."""
     layer: Any = env
-    while True:
-        if "layout" in vars(layer):
-            return tuple(layer.layout)
-        if not isinstance(layer, VectorWrapper):
-            return tuple(_common(layer, "layout"))
+    while "layout" not in vars(layer) and isinstance(layer, VectorWrapper):
         layer = layer.env
+    layout = tuple(_common(layer, "layout"))
+    _check_wrappers(env, layout)
+    return layout
 
 
 def _rows(base: Any, name: str) -> Sequence[Any]:

@@ -12,6 +12,8 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.vector import VectorEnv
 
+from ..envs.arguments import brief
+from ..envs.backend.extras import extra
 from ..envs.backend.files import whole
 from ..envs.record import Log, Record, concatenate
 
@@ -149,7 +151,8 @@ class Rollout:
 
     def to_pandas(self) -> "DataFrame":
         """The table, a row a step, units in its attribute `attrs["units"]` (needs `report`)."""
-        from pandas import DataFrame
+        with extra("report", "to_pandas needs pandas"):
+            from pandas import DataFrame
 
         table = DataFrame(self.columns)
         table.attrs["units"] = dict(self.units)
@@ -157,8 +160,9 @@ class Rollout:
 
     def to_parquet(self, path: str | Path) -> None:
         """Write the table; units stand in the columns' metadata (needs the extra `report`)."""
-        import pyarrow as pa
-        import pyarrow.parquet as pq
+        with extra("report", "to_parquet needs pyarrow"):
+            import pyarrow as pa
+            import pyarrow.parquet as pq
 
         fields = [
             pa.field(name, pa.float64(), metadata={"unit": self.units[name]})
@@ -170,15 +174,21 @@ class Rollout:
 
     def plot(self) -> "Figure":
         """Sideslip angle, yaw rate, yaw moment and steering over time (needs `report`)."""
-        from matplotlib.figure import Figure
+        with extra("report", "plot needs matplotlib"):
+            from matplotlib.figure import Figure
 
         figure = Figure(figsize=(8.0, 7.0), layout="constrained")
         axes = figure.subplots(4, 1, sharex=True)
-        t = self.columns["t"]
+        t, columns = self.columns["t"], self.columns
         for axis, (names, label, scale) in zip(axes, _PANELS, strict=True):
-            for name, text in names:
-                if name in self.columns:
-                    axis.plot(t, scale * self.columns[name], label=text)
+            for name, text, style in names:
+                # a task that judges the slip alone has no reference of the yaw rate
+                if name in columns and (name != "gamma_ref" or columns[name].any()):
+                    axis.plot(t, scale * columns[name], label=text, **style)
+            std = columns.get("obs_beta_std")
+            if names[0][0] == "obs_beta_hat" and names[0][0] in columns and std is not None:
+                low, high = (scale * (columns["obs_beta_hat"] + x * std) for x in (-1.0, 1.0))
+                axis.fill_between(t, low, high, color=_ESTIMATE["color"], alpha=0.3, lw=0)
             axis.set_ylabel(label)
             axis.grid(alpha=0.3)
             axis.legend(loc="upper right", fontsize="small")
@@ -188,15 +198,26 @@ class Rollout:
 
 
 _DEGREES = 180.0 / np.pi
-_PANELS: tuple[tuple[tuple[tuple[str, str], ...], str, float], ...] = (
+_TRUE: dict[str, Any] = {"color": "#000000", "lw": 1.4, "zorder": 3}
+_ESTIMATE: dict[str, Any] = {"color": "#56B4E9", "lw": 1.0}
+_REFERENCE: dict[str, Any] = {"color": "#D55E00", "lw": 1.2, "ls": "--", "zorder": 2}
+_PANELS: tuple[tuple[tuple[tuple[str, str, dict[str, Any]], ...], str, float], ...] = (
     (
-        (("beta", "true"), ("obs_beta_hat", "estimate"), ("beta_ref", "reference")),
+        (
+            ("obs_beta_hat", "estimate, 1 std", _ESTIMATE),
+            ("beta_ref", "reference", _REFERENCE),
+            ("beta", "true", _TRUE),
+        ),
         "sideslip angle / deg",
         _DEGREES,
     ),
-    ((("gamma", "true"), ("gamma_ref", "reference")), "yaw rate / (deg/s)", _DEGREES),
-    ((("yaw_moment", "delivered"),), "yaw moment / (N m)", 1.0),
-    ((("steer", "front wheels"),), "steering angle / deg", _DEGREES),
+    (
+        (("gamma_ref", "reference", _REFERENCE), ("gamma", "true", _TRUE)),
+        "yaw rate / (deg/s)",
+        _DEGREES,
+    ),
+    ((("yaw_moment", "delivered", _TRUE),), "yaw moment / (N m)", 1.0),
+    ((("steer", "front wheels", _TRUE),), "steering angle / deg", _DEGREES),
 )
 
 
@@ -208,11 +229,17 @@ def rollout(
 ) -> Rollout:
     """Run one episode.
 
-    env: an environment or its id. agent, options: of `steps_of`; seed: of the reset.
+    env: an environment or its id. agent, options: of `steps_of`; seed: of the reset. Raises
+    TypeError for a vector env, or one that is not of this package.
     """
     if isinstance(env, str):
         with contextlib.closing(gym.make(env)) as made:
             return rollout(made, agent, seed, options)
+    if not (isinstance(env, gym.Env) and env.has_wrapper_attr("layout")):
+        raise TypeError(
+            f"rollout runs one env of this package, got {brief(env)}; agents.rollout.drives_of "
+            "runs a vector env"
+        )
     base: Any = env.unwrapped
     layout = env.get_wrapper_attr("layout")
     rows, records = [], []

@@ -1,9 +1,10 @@
-"""The README's table of the matrix, made from the rows of a run.
+"""The tables of results in README.md and docs/benchmark.md, made from the rows of runs.
 
 `sideslip bench control --json rows.json`, then `python -m sideslip.benchmarks.readme
-rows.json` writes the tiers' rows to docs/control.json and the table into README.md. A policy that
-came after the run drives its seeds with `python -m sideslip.benchmarks.readme docs/control.json
---add NAME`.
+rows.json` writes the tiers' rows to docs/control.json and the table of docs/benchmark.md. A policy
+that came after the run drives its seeds with `python -m sideslip.benchmarks.readme
+docs/control.json --add NAME`. `python -m sideslip.benchmarks.readme --first` drives README's few
+entries in the contests with steering, writes docs/first.json and README's table.
 """
 
 import re
@@ -16,15 +17,16 @@ from rich.console import Console
 
 from .. import __version__
 from .control.cells import LEARNED, REFERENCE_CONTROLLER, REFERENCE_FILTER, Cell
-from .control.contests import NOMINAL, PARAMETERS, STATE, contests
+from .control.contests import NOMINAL, PARAMETERS, STATE, STEERING, contests
 from .control.ladder import yardsticks
 from .control.run import measure
-from .control.seeds import seeds_of_contests
+from .control.seeds import salt_of, seeds_of_contests
 from .control.tables import rows_of, standings
 from .harness.errors import one_line
 from .harness.results import Row, read_json, write_json, write_text
 
-ROWS, README = Path("docs/control.json"), Path("README.md")
+README, FIRST_ROWS = Path("README.md"), Path("docs/first.json")
+PAGE, ROWS = Path("docs/benchmark.md"), Path("docs/control.json")
 METRICS = ("cost_vs_nominal", "failure_rate")
 HEADS = {"1": "COMS, 18-28 km/h", "2a": "car, dry", "2b": "any friction", "2c": "limit"}
 SHOWN: Mapping[str, tuple[str, str]] = {
@@ -59,6 +61,49 @@ SHOWN: Mapping[str, tuple[str, str]] = {
     "`lqr` on `dakf`": (REFERENCE_CONTROLLER, "dakf"),
 }
 """(controller, estimator) of each line, by what it is called."""
+FIRST: Mapping[str, Sequence[tuple[str, str]]] = {
+    "a controller given the true state and car": [(STATE, "")],
+    "policy on `joint`": [("distill-car-steering", "joint"), ("ppo-coms-steering", "joint")],
+    "policy on the late sensors alone": [("raw-car-steering", ""), ("raw-coms-steering", "")],
+    "`adaptive-nmpc` on `joint`": [("adaptive-nmpc", "joint, friction")],
+    "`adaptive-lqr` on `joint`": [("adaptive-lqr", "joint")],
+    "tuned LQG: `lqr` on `exact-kf`": [(NOMINAL, "")],
+    "`model-following` (dakf-stability)": [("model-following", REFERENCE_FILTER)],
+    "`two-dof` (tie-vision), motors alone": [("two-dof", REFERENCE_FILTER)],
+    "no control": [("none", "")],
+}
+"""The lines of README's table: of each tier the first entry that drove it."""
+EPISODES = 32  # a contest, of README's table
+
+
+def drive_first(jobs: int | None = None, console: Console | None = None) -> list[Row]:
+    """Drive README's entries in every scored contest with steering; return the tiers' rows.
+
+    Raises:
+        ValueError: An entry could not drive.
+    """
+    played = [each for each in contests() if each.tier and each.env_id == STEERING]
+    policies = {who: kind for kind, pairs in LEARNED.items() for _, who in pairs}
+    asked = [
+        Cell(contest, estimator, controller)
+        for contest in played
+        for entries in FIRST.values()
+        for controller, estimator in entries
+        if policies.get(controller, contest.kind) == contest.kind
+    ]
+    salt = salt_of()
+    seeds = seeds_of_contests(salt, EPISODES)
+    results = measure(asked, seeds, jobs=jobs, console=console, title="README")
+    rows: list[Row] = []
+    for cell, driven in results.found.items():
+        if driven.error:
+            raise ValueError(f"{cell.label} in {cell.contest.name}: {driven.error}")
+    for tier in HEADS:
+        mine = yardsticks(results, [contest for contest in played if contest.tier == tier])
+        for each in standings(results.found, tier, mine):
+            made = (row for row in rows_of(each, salt) if row.metric in METRICS)
+            rows += [row for row in made if row.scenario == f"tier {tier}"]
+    return rows
 
 
 def tier_rows(path: str | Path) -> list[Row]:
@@ -85,15 +130,56 @@ def table(rows: Sequence[Row]) -> str:
     return "\n".join(lines)
 
 
+def first_table(rows: Sequence[Row]) -> str:
+    """Make README's table: cost in % of nominal's, the best of the first tier's columns first."""
+    found = {
+        (row.scenario, row.controller, row.estimator): row.value
+        for row in rows
+        if row.metric == METRICS[0]
+    }
+    lines = ["| | " + " | ".join(f"{tier}: {text}" for tier, text in HEADS.items()) + " |"]
+    lines.append("|---" * (1 + len(HEADS)) + "|")
+    for name, entries in FIRST.items():
+        costs = [[found.get((f"tier {tier}", *each)) for each in entries] for tier in HEADS]
+        cells = [next((f"{100.0 * x:.0f}" for x in of if x is not None), "") for of in costs]
+        lines.append(f"| {name} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def headlines(root: Path) -> list[str]:
+    """Make README's sentences on estimation and speed from the files in docs.
+
+    `sideslip bench estimation --json docs/estimation.json` and `sideslip bench speed --json
+    docs/speed.json` write the files.
+    """
+    rows = read_json(root / "docs/estimation.json")
+    over = {
+        row.estimator: row
+        for row in rows
+        if (row.scenario, row.metric) == ("tie-vision-fig7", "rmse_over_bound")
+    }
+    ours, theirs = over["joint"], over["multirate-residual-kf"]
+    (step,) = (
+        row.value
+        for row in read_json(root / "docs/speed.json")
+        if (row.scenario, row.metric) == ("YawFusion-v0 x 1024", "us_per_step")
+    )
+    return [
+        f"`joint` errs {ours.value:.2f} times as much as the best possible filter, the paper's own "
+        f"filter {theirs.value:.1f} times ({ours.n} seeds).",
+        f"A 10 ms step takes {step:.1f} us of CPU time a car in a batch of 1,024.",
+    ]
+
+
 def _spread(row: Row) -> str:
     return f" [{100.0 * row.low:.0f}, {100.0 * row.high:.0f}]"
 
 
 def put(text: str, made: str) -> str:
-    """A README with another table; ValueError where it has none."""
+    """A page with another table; ValueError where it has none."""
     pattern = re.compile(r"^\| \| 1: [^\n]*\n(\|[^\n]*\n)+", re.MULTILINE)
     if len(pattern.findall(text)) != 1:
-        raise ValueError("the README has no table that begins with the tiers, or several")
+        raise ValueError("the page has no table that begins with the tiers, or several")
     return pattern.sub(lambda _: made + "\n", text)
 
 
@@ -135,16 +221,26 @@ def added(
 
 
 def main(
-    rows: Annotated[Path, typer.Argument(help="Of sideslip bench control --json.")],
+    rows: Annotated[Path | None, typer.Argument(help="Of sideslip bench control --json.")] = None,
     add: Annotated[list[str] | None, typer.Option(help="A policy that came later.")] = None,
+    first: Annotated[bool, typer.Option("--first", help="Drive README's entries.")] = False,
 ) -> None:
-    """Write the tiers' rows and the README's table, in the repository's root."""
-    found = tier_rows(rows)
-    for name in add or []:
-        found = added(found, name, console=Console(stderr=True))
-    readme = put(README.read_text(encoding="utf-8"), table(found))
-    write_json(ROWS, found)
-    write_text(README, readme)
+    """Write rows and the tables made of them, in the repository's root."""
+    console = Console(stderr=True)
+    if first:
+        found = drive_first(console=console)
+        _write(FIRST_ROWS, found, README, first_table(found))
+    if rows is not None:
+        found = tier_rows(rows)
+        for name in add or []:
+            found = added(found, name, console=console)
+        _write(ROWS, found, PAGE, table(found))
+
+
+def _write(path: Path, rows: Sequence[Row], page: Path, made: str) -> None:
+    text = put(page.read_text(encoding="utf-8"), made)
+    write_json(path, rows)
+    write_text(page, text)
 
 
 if __name__ == "__main__":

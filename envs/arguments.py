@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from gymnasium import logger
 from gymnasium.vector import AutoresetMode
 
 Mask = npt.NDArray[np.bool_]
@@ -217,6 +218,17 @@ def actions_of(actions: Any, count: int, width: int, fail: bool) -> Actions:
         got = f"in {named(bad)} {wrong[bad[0]]}" if bad else f"{len(rows)} rows"
         raise ValueError(f"actions have shape ({count}, {width}), got {got}; nothing was stepped")
     return force
+
+
+def warn_once(env: Any, actions: Actions) -> None:
+    """Warn, once an env, of actions far outside of -1 to 1."""
+    if not vars(env).get("_warned"):
+        most = np.abs(actions[np.isfinite(actions)]).max()
+        logger.warn(
+            f"an action of {most:g} is clipped to 1: actions are shares of full scale, from -1 to "
+            "1, not N m or rad; the env says so once"
+        )
+    env._warned = True
 
 
 def _action_of(action: Any, width: int) -> Actions:

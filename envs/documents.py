@@ -1,5 +1,6 @@
 """Documents: what is written about a vehicle or a scenario, as TOML or JSON, and typed objects."""
 
+import contextlib
 import json
 import math
 import os
@@ -70,8 +71,10 @@ def _parsed(path: Path, what: str) -> dict[str, Any]:
 def _base_beside(path: Path, values: Mapping[str, Any]) -> Path | None:
     """The file beside a file that it names under `base`."""
     base = values.get("base")
-    found = path.parent / base if isinstance(base, str) else None
-    return found if found is not None and found.is_file() else None
+    with contextlib.suppress(OSError, ValueError):  # a text that can be no file's name
+        if isinstance(base, str) and (path.parent / base).is_file():
+            return path.parent / base
+    return None
 
 
 def _check_ends(path: Path, base: Path | None, what: str) -> None:

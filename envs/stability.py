@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.error import ResetNeeded
 
-from .arguments import action_of
+from .arguments import action_of, warn_once
 from .backend.decorators import entry_of
 from .engine.arrays import Packed
 from .engine.config import EnvConfig
@@ -22,7 +22,7 @@ from .rendering.drawn import DrawnOne, Numbers
 from .scenarios.manoeuvres import ScenarioSource, scenario_from
 from .scenarios.scenario import Scenario
 from .sensors.link import SlowSensor
-from .task.failures import REFUSED, RUNNING
+from .task.failures import REFUSED, RUNNING, WILD
 from .task.info import info_of
 from .task.observation import Entry
 from .ticks import TICK
@@ -44,8 +44,9 @@ class StabilityEnv(
     COMS; positive turns left). With `steering` it is `Box(-1, 1, (2,), float32)`: the second
     entry is the steering angle *added* to the driver's, as a share of its full scale (0.1 rad,
     positive to the left; at most 0.8 rad/s, within the stop). Zero is the uncontrolled car; values
-    outside are clipped. What is not finite, no numbers or of a wrong shape raises ValueError and
-    steps nothing; with `on_bad_action="fail"` it ends the episode as a failure.
+    outside are clipped, the first beyond +-10 with a warning. What is not finite, no numbers or of
+    a wrong shape raises ValueError and steps nothing; with `on_bad_action="fail"` it ends the
+    episode as a failure.
 
     ## Observation
     float32, as long for every control period. `layout` has name, unit and bounds of each entry:
@@ -94,7 +95,8 @@ class StabilityEnv(
     fast: "summary" or "all". with_map: the road's curvature is seen, which estimators are always
     told. slow, by name ("camera", "gps"): fields of `SlowSensor` that replace the id's. yaw_first:
     yaw moment before acceleration where both pass the motors' limit. steering: the action may steer
-    too. vision, delay, appearance: as of `Seeing`. render_mode: of `Drawn`.
+    too. vision, delay, appearance: as of `Seeing`. render_mode: of `Drawn`. strict: whether
+    implausible numbers of scenario and vehicles are refused.
     """
 
     config: EnvConfig
@@ -116,13 +118,14 @@ class StabilityEnv(
         delay: str | None = None,
         appearance: Mapping[str, Any] | None = None,
         render_mode: str | None = None,
+        strict: bool = True,
         **slow: Mapping[str, Any] | None,
     ) -> None:
-        car = vehicle_from(vehicle)
-        believed = car if nominal is None else vehicle_from(nominal)
+        car = vehicle_from(vehicle, strict)
+        believed = car if nominal is None else vehicle_from(nominal, strict)
         self.config = EnvConfig(
             sensors, scenario_from(scenario), car, believed, control_period, reference, fast,
-            with_map, yaw_first, steering, on_bad_action, vision, delay, slow,
+            with_map, yaw_first, steering, on_bad_action, vision, delay, strict, slow,
         )  # fmt: skip
         self.control_period, self.reference = int(control_period), reference
         self._now = self.config.base
@@ -194,6 +197,9 @@ class StabilityEnv(
         if not _STEP:
             _STEP.append(entry_of(step_packed, self._work, force))
         done: int = _STEP[0](self._work, force)
+        if done >= WILD:
+            done -= WILD
+            warn_once(self, force)
         return done
 
     @property

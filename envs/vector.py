@@ -12,7 +12,7 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from .arguments import actions_of, count_of, each_of, mask_of, mode_of, named, seeds_of
+from .arguments import actions_of, count_of, each_of, mask_of, mode_of, named, seeds_of, warn_once
 from .engine.batch import step_rows
 from .engine.config import EnvConfig
 from .engine.episodes import Episodes
@@ -20,7 +20,7 @@ from .engine.layout import Z
 from .record import Array
 from .rendering.drawn import DrawnRows, Numbers
 from .stability import StabilityEnv
-from .task.failures import REFUSED
+from .task.failures import REFUSED, WILD
 from .task.info import infos_of
 
 Observations = npt.NDArray[np.float32]
@@ -164,6 +164,9 @@ class StabilityVectorEnv(DrawnRows, Episodes, VectorEnv[Observations, Any, npt.N
                 f"the action of {named(bad)} is not finite, {asked[bad[0]].tolist()}; "
                 "nothing was stepped"
             )
+        if ended >= WILD:
+            ended -= WILD
+            warn_once(self, asked)
         if resting is not None:
             self.reset_rows(resting)
         if self._longest is not None:

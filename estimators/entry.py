@@ -9,7 +9,7 @@ from numba.extending import is_jitted
 
 from ..envs.record import PACKET_WIDTH
 from .core.memory import FILTER
-from .core.run import advance, receive_all, step_all
+from .core.run import advance, receive_all, step_all, write_estimate
 
 
 def entry(function: Any, *example: Any) -> Any:
@@ -32,6 +32,12 @@ def advance_entry() -> Any:
     """`advance` as a plain call."""
     matrix, vector = np.zeros((1, 1)), np.zeros(1)
     return entry(advance, *_memory(), matrix, 0, matrix, 0, 0, matrix, matrix, vector)
+
+
+@cache
+def estimate_entry() -> Any:
+    """`write_estimate` as a plain call."""
+    return entry(write_estimate, *_memory(), np.zeros(1), np.zeros((1, 1)))
 
 
 @cache

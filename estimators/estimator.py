@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import block_diag
 
 from ..envs.record import FAST, FAST_WIDTH, PACKET_WIDTH, Log, Record
 from ..envs.sensors.link import SlowSensor
@@ -21,7 +20,7 @@ from .design.error_map import MARGINAL, designed, spectral_radius, unobservable
 from .design.models import STATES
 from .design.periodic import table_shape
 from .design.schedule import Schedule, whole_ticks
-from .entry import advance_entry, receive_entry, step_entry
+from .entry import advance_entry, estimate_entry, receive_entry, step_entry
 from .estimates import Estimates, UnobservableWarning
 
 Array = npt.NDArray[np.float64]
@@ -56,7 +55,6 @@ class Estimator:
         self.units = tuple(STATES[state].unit for state in self.names)
         self.sensors = dict(config.sensors)
         self.filters, self._schedules = filters, schedules
-        self._shown = slice(1 if filters[0].members else None)  # layers: of a bank the mixture
         f = self._f
         cells = round((f.high - f.low) / f.spacing) + 1 if f.spacing > 0.0 else 1
         shape = (cells, *table_shape(f, schedules[-1])) if f.periodic else (1, 1, 1)
@@ -250,24 +248,19 @@ class Estimator:
     @property
     def x(self) -> Array:
         """The states now, (n,)."""
-        return np.concatenate([f.x[: f.n] for f in self.filters[self._shown]])
+        return self._estimate(0)[0]
 
     @property
     def P(self) -> Array:
         """Their covariance now, (n, n); with periodic gains that of the settled cycle."""
-        blocks = map(self._covariance, self.filters[self._shown])
-        return np.asarray(block_diag(*blocks), np.float64)
+        return self._estimate(len(self.names))[1]
 
-    def _covariance(self, f: Memory) -> Array:
-        """P (n, n) of one layer."""
-        n = int(f.n)
-        if not f.periodic:
-            return np.array(f.P[:n, :n])
-        if self.gains[f.cell, 0, 0] == 0.0:
-            self._design(int(f.cell))
-        P = np.zeros((n, n))
-        P[np.triu_indices(n)] = self.gains[f.cell, 1 + f.at * max(int(f.fasts), 1), f.total :]
-        return P + np.triu(P, 1).T
+    def _estimate(self, width: int) -> tuple[Array, Array]:
+        """The states (n,) and their covariance (width, width): width is n, or 0 for none."""
+        x, P = np.empty(len(self.names)), np.zeros((width, width))
+        while not estimate_entry()(self.filters, self.gains, x, P):
+            self._design(int(self._f.cell))
+        return x, P
 
     @property
     def tick(self) -> int:

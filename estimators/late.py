@@ -8,13 +8,14 @@ import numpy as np
 
 from ..envs.record import FAST_WIDTH, PACKET, PACKET_WIDTH
 from ..envs.sensors.link import SlowSensor
-from .core.memory import FILTER, Memory
+from .core.memory import FILTER
 from .design.config import FilterConfig
 from .design.options import FIND, columns_of
 from .design.schedule import Schedule, whole_ticks
 from .entry import advance_entry, receive_entry
 from .estimator import EMPTY, NO_NIS, Array, Estimator
 from .find_latency import Search, aligned
+from .protocol import deviations
 
 _HISTORY: int = FILTER.fields["predicted"][1]  # type: ignore[index]  # where a memory's window begins, in bytes
 _PLACE = PACKET_WIDTH  # column behind a packet's: its place in the call
@@ -96,7 +97,7 @@ class LateEstimator(Estimator):
             if len(X) and stop > start:
                 self._go_ahead()
                 X[start] = self.x
-                S[start] = np.concatenate([_deviations(f) for f in self.filters[self._shown]])
+                S[start] = deviations(self.P)
             start = stop
         if not len(X):
             self._go_ahead()
@@ -161,8 +162,3 @@ class LateEstimator(Estimator):
         """As `Estimator.set_state`."""
         filters, behind, self._rows, self._waiting, self._search = copy.deepcopy(snapshot)
         self.filters[:], self.behind[:] = filters, behind
-
-
-def _deviations(f: Memory) -> Array:
-    """Of all states of a layer, (n,)."""
-    return np.sqrt(np.maximum(np.asarray(f.P.diagonal()[: f.n], np.float64), 0.0))

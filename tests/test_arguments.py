@@ -34,7 +34,8 @@ def public(room: str) -> Iterator[tuple[str, Any, str]]:
 def class_help(found: type) -> str:
     """Docstrings of a class and its bases, and the comments behind its fields."""
     ours = [each for each in found.__mro__ if each.__module__.startswith("sideslip")]
-    fields = re.compile(r'^    (\w+): .*(?:  # |_unit\(|\n    """)', re.MULTILINE)
+    text = r'quantity\("[^"]*", [^",]+, [^",]+, "'
+    fields = re.compile(rf'^    (\w+): .*(?:  # |{text}|\n    """)', re.MULTILINE)
     comments = [" ".join(fields.findall(inspect.getsource(each))) for each in ours]
     return " ".join([*(each.__doc__ or "" for each in ours), *comments])
 

@@ -60,7 +60,7 @@ def run(code: str, folder: Path, package: Path, **variables: str) -> str:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("page", "least"), [("README.md", 3), ("docs/memory.md", 2)])
+@pytest.mark.parametrize(("page", "least"), [("README.md", 1), ("docs/memory.md", 2)])
 def test_a_pages_examples_run(page: str, least: int, tmp_path: Path) -> None:
     """One after the other, as a reader types them."""
     blocks = [code for kind, _, code in FENCE.findall((ROOT / page).read_text())]

@@ -3,6 +3,7 @@
 import importlib.metadata
 import importlib.util
 import os
+import re
 import subprocess
 import sys
 import zipfile
@@ -33,6 +34,9 @@ HEAVY = {
     "torch",
     "vehiclemodels",
 }
+
+SLOW = ("control", "cv2", "matplotlib", "pandas", "plotly", "scipy.signal", "scipy.stats", "torch")
+"""Modules that a command without a drive does not load."""
 
 
 def python(code: str, cwd: Path) -> str:
@@ -88,6 +92,18 @@ def test_import_loads_no_heavy_module_and_none_of_ours(tmp_path: Path) -> None:
     assert python(code, tmp_path).split() == ["sideslip"]
 
 
+@pytest.mark.parametrize("command", ["--help", "--version", "list", "bench --help", "run --help"])
+def test_a_command_that_drives_nothing_loads_nothing_slow(command: str, tmp_path: Path) -> None:
+    code = (
+        "import sys\n"
+        f"sys.argv = ['sideslip', *{command.split()!r}]\n"
+        "from sideslip.__main__ import main\n"
+        "try:\n    main()\nexcept SystemExit:\n    pass\n"
+        f"print('loaded', [name for name in {SLOW!r} if name in sys.modules])"
+    )
+    assert python(code, tmp_path).splitlines()[-1] == "loaded []"
+
+
 @pytest.mark.smoke
 def test_lazy_names_are_listed_and_others_refused() -> None:
     assert {"rollout", "make_agent", "make_estimator"} <= set(dir(sideslip))
@@ -134,6 +150,11 @@ def test_one_version() -> None:
 
 
 @pytest.mark.smoke
+def test_the_citation_is_of_this_version() -> None:
+    text = (ROOT / "CITATION.cff").read_text()
+    assert re.findall(r"^version: (.+)$", text, re.MULTILINE) == [sideslip.__version__]
+
+
 def test_what_is_no_code_is_installed_too() -> None:
     from sideslip.agents.learned.files import load_policy, shipped
     from sideslip.benchmarks.speed.c_plant import source

@@ -18,7 +18,7 @@ from ...envs.vehicle.vehicle import GRAVITY, Vehicle
 from ..design.gain_schedule import interpolated
 from ..design.gauss_newton import MOST_VARIABLES, improved
 from ..design.prediction_model import Model, Start, blocks_of, changed_tyres, model_of
-from ..env_facts import AnyEnv, configs_of
+from ..env_facts import AnyEnv, plants_of
 from .base import Array, positive
 from .lqr import IN, Lqr
 
@@ -224,13 +224,11 @@ class Nmpc(Lqr):
 
 def _plant(env: AnyEnv, reference: int) -> tuple[Kind, bool, bool]:
     """(the plant's text, whether its actuators lag, whether the yaw moment comes first)."""
-    plants = set()
-    for config in configs_of(env):
-        scenario = config.scenario
-        law, small, roll = TYRE_LAWS.index(scenario.tyres), int(scenario.small_angle), scenario.roll
-        shifting = shifts(small, law, int(roll))
-        kind = Kind(small, law, reference, int(roll), follows=0, lag=2, shifting=shifting, road=0)
-        plants.add((kind, scenario.lags, config.yaw_first))
+    plants = plants_of(env)
     if len(plants) != 1:
         raise ValueError("the rows of a vector env share one prediction, but their plants differ")
-    return plants.pop()
+    (plant,) = plants
+    law, small, roll = TYRE_LAWS.index(plant.tyres), int(plant.small_angle), int(plant.roll)
+    shifting = shifts(small, law, roll)
+    kind = Kind(small, law, reference, roll, follows=0, lag=2, shifting=shifting, road=0)
+    return kind, plant.lags, plant.yaw_first

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from safetensors.numpy import save
 
+from ...envs.arguments import unknown_names
 from ...envs.backend.files import write_whole
 from ...envs.documents import made_of
 from ...estimators.learned.network import Network
@@ -116,9 +117,11 @@ def _found(path: str | Path) -> Path:
         return FOLDER / f"{name}{ENDING}"
     file = Path(path)
     if not file.is_file():
-        what = "is a folder" if file.is_dir() else "does not exist"
-        names = ", ".join(shipped()) or "none"
-        raise FileNotFoundError(f"policy {name} {what}; shipped policies: {names}")
+        if file.is_dir():
+            raise FileNotFoundError(f"policy {name} is a folder")
+        raise FileNotFoundError(
+            f"there is no such file and {unknown_names('policy', [name], shipped())}"
+        )
     return file
 
 

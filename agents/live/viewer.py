@@ -6,11 +6,13 @@ A process of its own, which the loop sends datagrams: drawing would cost it its 
 import asyncio
 import json
 import os
+import secrets
 import signal
 from collections import deque
 from contextlib import suppress
 from functools import partial
 from html import escape
+from ipaddress import ip_address
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -23,7 +25,8 @@ PAGE = Path(__file__).with_name("page.html")
 SECONDS = 20.0  # of the strips
 _DEGREES = 57.29577951308232
 _POLICY = (
-    "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; connect-src 'self'"
+    "default-src 'none'; script-src 'nonce-{0}'; style-src 'nonce-{0}'; connect-src 'self'; "
+    "frame-ancestors 'none'"
 )
 
 
@@ -66,12 +69,13 @@ def unit_of(name: str) -> str:
 def table_of(seen: Seen, title: str) -> Any:
     """The estimates, and what the loop has counted."""
     from rich.table import Table
+    from rich.text import Text
 
-    table = Table("state", "estimate", "std", "unit", title=title, title_justify="left")
+    table = Table("state", "estimate", "std", "unit", title=Text(title), title_justify="left")
     n = len(seen.names)
     newest = seen.samples[-1] if seen.samples else []
     for name, x, std in zip(seen.names, newest[1 : 1 + n], newest[1 + n :], strict=False):
-        table.add_row(name, f"{x:+.3f}", f"{std:.3f}", unit_of(name))
+        table.add_row(Text(name), f"{x:+.3f}", f"{std:.3f}", unit_of(name))
     counts = seen.status
     time = f"t {newest[0]:.1f} s; " if newest else "no inertial data yet; "
     table.caption = (
@@ -114,10 +118,26 @@ async def _page(title: str, seen: Seen, _: Any) -> Any:
     from aiohttp import web
 
     text, _ = news_of(seen, 0)  # so that it is drawn as soon as it is loaded
-    page = PAGE.read_text(encoding="utf-8").replace("TITLE", escape(title))
+    nonce = secrets.token_urlsafe(16)
+    page = PAGE.read_text(encoding="utf-8").replace("NONCE", nonce).replace("TITLE", escape(title))
     text = page.replace("FIRST", text.replace("<", "\\u003c"))
-    headers = {"Content-Security-Policy": _POLICY}
+    headers = {"Content-Security-Policy": _POLICY.format(nonce), "Cache-Control": "no-store"}
     return web.Response(text=text, content_type="text/html", headers=headers)
+
+
+def is_ours(host: str, origin: str | None) -> bool:
+    """Say whether a request is for this server and from its own page.
+
+    A page elsewhere that lets its name resolve to this address has that name as the host.
+
+    Args:
+        host: The request's Host, "name:port".
+        origin: Its Origin, None where it has none.
+    """
+    name = host.rpartition(":")[0].strip("[]") or host
+    with suppress(ValueError):
+        name = "localhost" if ip_address(name) else name
+    return name == "localhost" and origin in (None, f"http://{host}")
 
 
 async def _view(title: str, page: tuple[str, int] | None, screen: bool, pipe: Any) -> None:
@@ -126,7 +146,13 @@ async def _view(title: str, page: tuple[str, int] | None, screen: bool, pipe: An
     if page is not None:
         from aiohttp import web
 
-        app = web.Application()
+        @web.middleware
+        async def guard(request: Any, handler: Any) -> Any:
+            if not is_ours(request.host, request.headers.get("Origin")):
+                raise web.HTTPForbidden(text="this page is served by its address, to itself alone")
+            return await handler(request)
+
+        app = web.Application(middlewares=[guard])
         app.router.add_get("/", partial(_page, title, seen))
         app.router.add_get("/events", partial(_events, seen))
         runner = web.AppRunner(app, access_log=None, shutdown_timeout=0.5)

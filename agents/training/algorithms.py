@@ -78,8 +78,7 @@ ALGORITHMS = {
 
 def algorithm_of(name: str) -> Algorithm:
     """An algorithm by its name; ValueError for another."""
-    if name not in ALGORITHMS:
-        raise ValueError(f"unknown algorithm {name!r}; known: {', '.join(ALGORITHMS)}")
+    check_choice("algorithm", name, ALGORITHMS)
     return ALGORITHMS[name]
 
 

@@ -27,8 +27,9 @@ Scenarios = Annotated[
 ]
 EnvId = Annotated[str, typer.Option("--env", help="The contests of this id alone.")]
 Fresh = Annotated[
-    bool, typer.Option("--fresh", help="Seeds that follow your files too: publishable.")
+    bool, typer.Option("--fresh", help="Seeds drawn after your files are hashed: publishable.")
 ]
+Salt = Annotated[str, typer.Option(help="Of a fresh run, whose seeds are driven again.")]
 Limit = Annotated[float, typer.Option(help="s of wall time for a contestant in a contest.")]
 
 
@@ -40,6 +41,7 @@ def challenge_of(
     scenarios: Sequence[str],
     env_id: str,
     fresh: bool,
+    salt: str,
     limit: float,
     episodes: int | None,
     quick: bool,
@@ -48,8 +50,8 @@ def challenge_of(
     """The challenge of a command line, None without contestants; ValueError for options that go
     with them alone, or with the suite `control` alone."""
     if not (agents or estimators):
-        if scenarios or env_id or fresh:
-            raise ValueError("--scenario, --env and --fresh go with --agent or --estimator")
+        if scenarios or env_id or fresh or salt:
+            raise ValueError("--scenario, --env, --fresh and --salt go with --agent or --estimator")
         return None
     if list(suites) not in ([], ["control"]):
         raise ValueError("--agent and --estimator go with the suite control alone")
@@ -61,5 +63,5 @@ def challenge_of(
         raise ValueError("--estimator none goes with --agent")
     driven = episodes or (QUICK_EPISODES if quick else EPISODES)
     return Challenge(
-        tuple(pairs), vehicle, tuple(scenarios), env_id, driven, fresh=fresh, limit=limit
+        tuple(pairs), vehicle, tuple(scenarios), env_id, driven, None, fresh, salt, limit
     )

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from ...envs.sensors.camera.pinhole import Pinhole
     from ...envs.sensors.camera.road_image import Image
 
-NEAR, FAR = 6.0, 30.0  # m: beyond a bonnet, and where markings are still wide enough
 TRIES = 60  # frames in which a lane is looked for that shows how the camera is mounted
 
 
@@ -106,8 +105,9 @@ def _finder(
 
     Raises ValueError for intrinsics of another size, and where no picture shows a lane.
     """
+    from ...envs.sensors.camera.analytic import View
     from ...envs.sensors.camera.finder import LaneFinder
-    from ...envs.sensors.camera.mounting import default_camera, mounted
+    from ...envs.sensors.camera.mounting import FAR, HEADING, NEAR, default_camera, mounted
     from ...envs.sensors.camera.pinhole import Pinhole
 
     height, width = pictures[0].shape[:2]
@@ -130,7 +130,7 @@ def _finder(
             failed = error
     if failed is not None:
         raise ValueError(f"{source}: {failed}")
-    return LaneFinder(camera, lane_width, near=NEAR, far=FAR)
+    return LaneFinder(camera, lane_width, NEAR, FAR, view=View(HEADING, 0.5 * lane_width))
 
 
 def _still(picture: "Image", finder: "LaneFinder", out: Path | None) -> tuple[list["Lane"], float]:

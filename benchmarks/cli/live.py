@@ -19,7 +19,6 @@ from rich.markup import escape
 from ...envs.arguments import check_choice
 from ...envs.backend.files import write_whole
 from ..harness.verdict import verdict
-from .contestant import Contestant
 from .export import Trust
 from .names import check_env, complete
 from .options import options_of
@@ -125,6 +124,8 @@ class _Ends:
 
 def _contestant(setup: dict[str, Any], trust: bool) -> tuple[Any, Any]:
     names = setup["agent"], setup["agent_options"], setup["estimator"], setup["estimator_options"]
+    from .contestant import Contestant
+
     return Contestant(*names, trust).on(setup["env"], setup["options"])
 
 

@@ -15,30 +15,33 @@ from ..harness.errors import one_line
 from ..report.page import check_page, write_page
 from ..suites import SUITES, Request, run_suites
 from .calibrate import calibrate_command
-from .challenge import Agents, EnvId, Estimators, Fresh, Limit, Scenarios, challenge_of
+from .challenge import Agents, EnvId, Estimators, Fresh, Limit, Salt, Scenarios, challenge_of
 from .enjoy import enjoy_command
 from .export import Trust, export_command
 from .lane import lane_command
 from .live import live_command
 from .names import KINDS, complete
 from .options import Address, EngineName, options_of
-from .output import check_files, show_episode, write_output, wrote
+from .output import check_files, goes_on, show_episode, write_output, wrote
 from .recorded import Mapping, identify_command, replay_command
 from .train import distill_command, train_command, train_estimator_command
 from .tune import tune_app
 
-app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False)
+app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode=None)
 app.add_typer(tune_app, name="tune")
-app.command("calibrate")(calibrate_command)
-app.command("enjoy")(enjoy_command)
-app.command("export")(export_command)
-app.command("identify")(identify_command)
-app.command("lane")(lane_command)
-app.command("live")(live_command)
-app.command("replay")(replay_command)
-app.command("train")(train_command)
-app.command("distill")(distill_command)
-app.command("train-estimator")(train_estimator_command)
+for _name, _command, _line in (
+    ("train", train_command, "Train a policy."),
+    ("distill", distill_command, "Train a policy to imitate a controller."),
+    ("enjoy", enjoy_command, "Drive a policy beside other controllers."),
+    ("export", export_command, "Make a policy's file of a zip."),
+    ("train-estimator", train_estimator_command, "Train a network that corrects a filter."),
+    ("replay", replay_command, "Run estimators over a recorded drive."),
+    ("identify", identify_command, "Find the car of a recorded drive."),
+    ("lane", lane_command, "Find the lane in a picture or film."),
+    ("live", live_command, "Run an estimator on a car's wires."),
+    ("calibrate", calibrate_command, "Find the cost of perfect foresight."),
+):
+    app.command(_name, short_help=_line)(_command)
 console = Console()
 
 Quick = Annotated[bool, typer.Option("--quick", help="Few seeds: a first look in minutes.")]
@@ -76,7 +79,7 @@ def face(
     """Lateral stability of electric vehicles: environments, estimators, controllers."""
 
 
-@app.command("list")
+@app.command("list", short_help="List everything that has a name.")
 def list_names(
     kinds: Annotated[
         list[str] | None,
@@ -96,7 +99,7 @@ def list_names(
         console.print(table)
 
 
-@app.command()
+@app.command(short_help="Drive one episode and draw it.")
 def run(
     env_id: Annotated[
         str | None,
@@ -164,7 +167,7 @@ def run(
     film_drive(video, driver, beside, seed, console)
 
 
-@app.command()
+@app.command(short_help="Compare estimators and controllers.")
 def bench(
     suites: Annotated[
         list[str] | None,
@@ -196,6 +199,7 @@ def bench(
     scenario: Scenarios = None,
     env_id: EnvId = "",
     fresh: Fresh = False,
+    salt: Salt = "",
     limit: Limit = 600.0,
     trust: Trust = False,
     engine_name: EngineName = PROCESSES,
@@ -211,6 +215,7 @@ def bench(
         scenario or [],
         env_id,
         fresh,
+        salt,
         limit,
         episodes,
         quick,
@@ -227,11 +232,12 @@ def bench(
 
         done.append(replay_file(log, vehicle, mapping=mapping))
     request = Request(quick, jobs, console, episodes, keep, clairvoyant, challenge)
-    with engine(engine_name, address):
+    how = "the same command" if keep else "add --keep FOLDER, which keeps finished cases"
+    with engine(engine_name, address), goes_on(how):
         done += run_suites(names, request)
     order = [*names, "replay"]
     done.sort(key=lambda suite: order.index(suite.name))
-    write_output(console, done, html, json, parquet)
+    write_output(console, done, html, json, parquet, brief=True)
     if picture is not None:
         from ..picture import write_picture
 

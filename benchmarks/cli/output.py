@@ -2,12 +2,14 @@
 
 import json
 import platform
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
@@ -21,7 +23,7 @@ from ..harness.results import (
     write_parquet,
     write_text,
 )
-from ..report.terminal import print_suite
+from ..report.terminal import print_run, print_suite
 from .options import command_line
 
 if TYPE_CHECKING:
@@ -56,6 +58,16 @@ def check_files(**paths: Path | None) -> None:
         if path and path.suffix.lower() not in known and not path.is_char_device():
             raise ValueError(f"{path}: expected a file that ends in {' or '.join(known)}")
     check_writable(*paths.values())
+
+
+@contextmanager
+def goes_on(how: str) -> Iterator[None]:
+    """End with exit status 130 where the user interrupts, and say how to continue."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        Console(stderr=True, soft_wrap=True).print(f"stopped; to go on: {how}", highlight=False)
+        raise typer.Exit(130) from None
 
 
 def wrote(console: Console, path: Path) -> None:
@@ -100,9 +112,12 @@ def write_output(
     html: Path | None = None,
     json: Path | None = None,
     parquet: Path | None = None,
+    brief: bool = False,
 ) -> None:
-    """Print the tables and write the files that have a path."""
-    for suite in suites:
+    """Print tables, or verdicts and a table if `brief`; write the files that have a path."""
+    if brief:
+        print_run(console, suites, html is not None)
+    for suite in () if brief else suites:
         print_suite(console, suite)
     rows: list[Row] = [row for suite in suites for row in suite.rows]
     if json is not None:

@@ -165,7 +165,8 @@ def identify_command(
     steering_offset: Offset = None,
 ) -> None:
     """Find a car's stiffness, inertia, steering, noise and latencies in a recorded drive, with
-    intervals, and which of them the log cannot tell."""
+    intervals, and which of them the log cannot tell; exit status 1, and no file, where nothing is
+    identified."""
     from ..recorded.replay_file import identify_file
     from ..recorded.wires import write_vehicle
 
@@ -175,6 +176,8 @@ def identify_command(
     wires = _wires(vehicle, None, ratio=steering_ratio, sign=steering_sign, offset=offset)
     found, suite = identify_file(log, vehicle, mapping or (), wires, tyres, until)
     print_suite(console, suite)
+    if found.reason:
+        raise typer.Exit(1)
     if out is not None:
         write_vehicle(out, found.car, found.wires)
         wrote(console, out)

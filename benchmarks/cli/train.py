@@ -13,8 +13,6 @@ from rich.console import Console
 from rich.table import Table
 
 from ... import __version__
-from ...agents.learned.files import Policy, load_policy
-from ...envs.sensors.slow import SENSOR_SETS
 from .enjoy import judged
 from .export import Trust
 from .names import check_env, complete
@@ -125,6 +123,8 @@ def train_command(
     if varied and resume:
         raise ValueError(f"--varied {varied} is for a new training: an old one keeps its contests")
     agent, new = start_and_task(trained_agent, varied)
+    from ...agents.learned.files import Policy
+
     if log_folder is not None and isinstance(agent, Policy) and agent.network.memory:
         raise ValueError(f"the zoo's `enjoy` drives nothing that remembers as {agent.name}: --out")
     task = task_in(out) if resume and out else new(**options)
@@ -155,6 +155,8 @@ def train_command(
                 shutil.rmtree(folder)  # it has nothing but the zoo's description
             raise
     console.print(_table(trained))
+    from ...agents.learned.files import load_policy
+
     kind = load_policy(folder / POLICY).card.algorithm_options.get("class")
     if kind is not None:
         console.print(judged(folder / POLICY, kind, CONTESTS))
@@ -274,6 +276,8 @@ def train_estimator_command(
     drives = [(c.env_id, c.env_options) for c in contests() if c.scenario in wanted]
     known = {c.scenario for c in contests()}
     drives += [(YAW, {"scenario": each}) for each in wanted if each not in known]
+    from ...envs.sensors.slow import SENSOR_SETS
+
     both, options = SENSOR_SETS["fusion"], options_of(option)
     there = make_estimator(base, sensors=both, slow=list(both), **options).names
     card = CorrectionCard(

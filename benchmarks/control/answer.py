@@ -83,7 +83,8 @@ def _gains(
 ) -> dict[str, Gains]:
     made: dict[str, Gains] = {}
     for each in (each for standings in found.values() for each in standings if among(each.cell)):
-        mine = made.setdefault(getattr(each.cell, attribute), {})
+        name = getattr(each.cell, attribute).replace(", ", " with ")  # in a list of names
+        mine = made.setdefault(name, {})
         mine |= {contest: r for contest, (r, _) in each.pairs.items()}
     return {name: each for name, each in made.items() if each}
 
@@ -131,9 +132,10 @@ def _elsewhere(found: Mapping[str, Sequence[Standing]]) -> str:
     drivers, overall_best = _controllers(found), best_controller(found)
     parted = drivers.keys() - everywhere(drivers).keys() if overall_best else ()
     ahead = {name: _over(drivers[name], drivers[overall_best]) for name in parted}
-    parts += [f"{name} where it drives" for name in sorted(ahead, key=lambda who: ahead[who].value)
-              if ahead[name].high < 1.0]  # fmt: skip
-    return f"But {some(parts)}. " if parts else ""
+    cheaper = (name for name in ahead if ahead[name].high < 1.0)
+    ordered = sorted(cheaper, key=lambda who: ahead[who].value)
+    parts += [f"{name} on its own manoeuvres" for name in ordered]
+    return f"Cheaper there: {some(parts)}. " if parts else ""
 
 
 def _why(

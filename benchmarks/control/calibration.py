@@ -30,6 +30,7 @@ from .scores import gains, survived
 
 FILE = Path(__file__).with_name("clairvoyant.json")
 SEEDS = 64
+USUAL = 5  # s of CPU time an episode, the mean of the file
 _FIRST = 2**30  # tests and tunings count their seeds from 0
 _SAME = 1e-9  # of a cost
 

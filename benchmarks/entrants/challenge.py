@@ -19,6 +19,7 @@ from ...estimators.make import ESTIMATORS
 from ...estimators.user_files import find_class, is_user_file
 from ..control.cells import REFERENCE_CONTROLLER, REFERENCE_FILTER, SETUPS, TRUTH, Cell, some_of
 from ..control.contests import NOMINAL, STEERING, TIERS, YAW, Contest, contests
+from ..control.seeds import salted_seeds
 from .worker import LIMIT
 
 EPISODES = 64
@@ -87,13 +88,13 @@ def pairs_of(agents: Sequence[str], estimators: Sequence[str], trust: bool = Fal
     pairs = [
         Pair(agent, each, trust and agent.endswith(ZIP))
         for agent in agents
-        for each in estimators or [_usual(agent)]
+        for each in estimators or [usual_estimator(agent)]
     ]
     pairs += [Pair(REFERENCE_CONTROLLER, each) for each in estimators if each]
     return list(dict.fromkeys(pairs))
 
 
-def _usual(agent: str) -> str:
+def usual_estimator(agent: str) -> str:
     """The estimator for an agent: a policy's own, none for what saw an env alone."""
     if is_policy(agent):
         return load_policy(agent).card.estimator or ""
@@ -109,10 +110,11 @@ class Challenge:
     scored means its contests; another one is driven in both ids with a yaw moment on camera and
     GPS, by the COMS, or by `vehicle` with the references of the passenger car. env_id: the
     contests of one id alone. episodes: a contest. seeds: instead of salted ones. fresh: the seeds
-    follow the user's files too, and everybody drives anew. limit: s of wall time a cell.
+    are drawn after the user's files are hashed, and everybody drives anew. salt: of a fresh
+    challenge that is repeated. limit: s of wall time a cell.
 
-    Raises ValueError for an unknown id, less than two episodes, or a fresh challenge without files,
-    and what `Pair.check`, `vehicle_from` and `scenario_from` raise.
+    Raises ValueError for an unknown id, less than two episodes, a fresh challenge without files,
+    or a salt beside other seeds, and what `Pair.check`, `vehicle_from` and `scenario_from` raise.
     """
 
     pairs: tuple[Pair, ...]
@@ -122,6 +124,7 @@ class Challenge:
     episodes: int = EPISODES
     seeds: tuple[int, ...] | None = None
     fresh: bool = False
+    salt: str = ""
     limit: float = LIMIT
 
     def __post_init__(self) -> None:
@@ -133,6 +136,10 @@ class Challenge:
             raise ValueError("an interval needs two episodes or more")
         if self.fresh and not self.files:
             raise ValueError("fresh seeds follow the files of the contestants, and there is none")
+        if self.salt:
+            salted_seeds(self.salt, 1)
+            if self.fresh or self.seeds:
+                raise ValueError("a salt repeats its seeds: no fresh ones, and no others beside it")
         if not self.limit > 0.0:
             raise ValueError(f"a limit is in s and above 0, got {self.limit!r}")
         _ = self.contests
@@ -145,7 +152,7 @@ class Challenge:
     @property
     def is_as_shipped(self) -> bool:
         """Whether all contests are the package's own, on its seeds."""
-        return not (self.fresh or self.seeds or any(self.contests.values()))
+        return not (self.fresh or self.salt or self.seeds or any(self.contests.values()))
 
     @cached_property
     def contests(self) -> dict[Contest, dict[str, Any]]:

@@ -1,24 +1,29 @@
 """A user's contestants and the package's, on the same episodes."""
 
 import hashlib
+import os
+import secrets
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
-import joblib
 from rich.console import Console
 
 from ..control.cells import REFERENCE_CONTROLLER, Cell
 from ..control.contests import Contest
+from ..control.episodes import Chunk
 from ..control.ladder import yardsticks
 from ..control.run import Results, measure
-from ..control.seeds import salt_of, seeds_of_contests
+from ..control.seeds import salt_of, seeds_of_contests, tuning_seeds
 from ..control.tables import Standing, standings
+from ..harness.parallel import run_cases
 from .baselines import cells_of, on_file
 from .challenge import Challenge, Pair
-from .worker import drive_apart, drive_users
+from .worker import drive_apart, drive_users, rehearse
+
+REHEARSED = 2  # episodes of a contest in which contestants show what they open
 
 
 @dataclass(frozen=True)
@@ -68,21 +73,29 @@ def compare(
         Cell(cell.contest, cell.estimator, cell.controller, played[cell.contest])
         for cell in cells_of(list(played), controllers, filters)
     ]
-    found = on_file(rivals, challenge.episodes, **shared) if challenge.is_as_shipped else None
-    salt = found[0] if found else _salt(challenge)
-    seeds = challenge.seeds or seeds_of_contests(salt, challenge.episodes)
-    results = found[1] if found else measure(rivals, seeds, title="baselines", **shared)
     own = [pair.cell(contest, options) for contest, options in played.items() for pair in pairs]
     apart = [cell for cell in own if not cell.objects]
-    with joblib.parallel_config("threading"):  # threads that wait for processes
-        there = measure(apart, seeds, jobs=jobs, console=console, title="entrants",
-                        by=partial(drive_apart, limit=challenge.limit))  # fmt: skip
+    found = on_file(rivals, challenge.episodes, **shared) if challenge.is_as_shipped else None
+    allowed: frozenset[str] | None = None
+    salt = found[0] if found else challenge.salt or salt_of()
+    if challenge.fresh:
+        allowed = _rehearsed(challenge, apart, jobs, console)
+        digests = [hashlib.sha256(Path(each).read_bytes()).hexdigest() for each in sorted(allowed)]
+        salt = salt_of(*digests, secrets.token_hex(16))
+    seeds = challenge.seeds or seeds_of_contests(salt, challenge.episodes)
+    results = found[1] if found else measure(rivals, seeds, title="baselines", **shared)
+    by = partial(drive_apart, limit=challenge.limit, allowed=allowed)
+    there = measure(apart, seeds, jobs=jobs, console=console, title="entrants", by=by)
     here = measure([cell for cell in own if cell.objects], seeds, jobs=1, by=drive_users)
     every = Results(results.found | there.found | here.found)
     return Comparison(challenge, "" if challenge.seeds else salt, bool(found), every)
 
 
-def _salt(challenge: Challenge) -> str:
-    """The salt of the package's contestants and, in a fresh challenge, of the user's files."""
-    files: Sequence[Path] = challenge.files if challenge.fresh else ()
-    return salt_of(*(hashlib.sha256(path.read_bytes()).hexdigest() for path in files))
+def _rehearsed(
+    challenge: Challenge, cells: Sequence[Cell], jobs: int | None, console: Console | None
+) -> frozenset[str]:
+    """Find the files that contestants open, theirs included, by a drive on tuning seeds."""
+    chunks = [Chunk(cell, tuple(tuning_seeds(REHEARSED))) for cell in cells]
+    by = partial(rehearse, limit=challenge.limit)
+    opened = [files for _, files in run_cases(by, chunks, "rehearsal", jobs, console)]
+    return frozenset().union(*opened, (os.path.realpath(each) for each in challenge.files))

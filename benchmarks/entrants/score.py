@@ -5,9 +5,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from ...envs.backend.extras import extra
 from ..control.cells import REFERENCE_FILTER
 from ..harness.stats import Estimate
-from .challenge import EPISODES, Challenge, Pair
+from .challenge import EPISODES, Challenge, Pair, usual_estimator
 from .compare import compare
 from .verdict import sentence
 from .worker import LIMIT
@@ -42,7 +43,8 @@ class Score:
 
     def to_pandas(self) -> "pd.DataFrame":
         """A row a contest (needs pandas)."""
-        import pandas as pd
+        with extra("report", "to_pandas needs pandas"):
+            import pandas as pd
 
         return pd.DataFrame(list(self.contests))
 
@@ -62,7 +64,7 @@ def score(
     *,
     scenarios: Sequence[Any] = (),
     vehicle: Any = None,
-    estimator: Any = REFERENCE_FILTER,
+    estimator: Any = None,
     episodes: int = EPISODES,
     seeds: Sequence[int] | None = None,
     fresh: bool = False,
@@ -74,7 +76,8 @@ def score(
 
     agent: a name, a file's class ("my.py:MyController") or a path, as `make_agent` takes them, or
     an agent, its class or another factory. estimator: in front of it, a name, a file's class or a
-    factory, "" for none; a filter is scored under "lqr". env_id: the contests of one id; default:
+    factory, "" for none; None: the one that a policy was trained on, nominal's for others; a filter
+    is scored under "lqr". env_id: the contests of one id; default:
     both on which the matrix is driven. scenarios: names, files or mappings, or one; default: a
     contest or two of every tier. vehicle: a name, file or mapping instead of the contests' cars.
     episodes: a contest. jobs: processes, None for all processors.
@@ -87,6 +90,8 @@ def score(
     alone = isinstance(scenarios, str | os.PathLike | Mapping)
     driven_in = (scenarios,) if alone else tuple(scenarios)
     chosen = None if seeds is None else tuple(map(int, seeds))
+    if estimator is None:
+        estimator = usual_estimator(agent) if isinstance(agent, str) else REFERENCE_FILTER
     pair = Pair(agent, estimator, trust)
     challenge = Challenge(
         (pair,), vehicle, driven_in, env_id, episodes, chosen, fresh=fresh, limit=limit

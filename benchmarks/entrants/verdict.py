@@ -76,10 +76,11 @@ def _trust(found: Comparison) -> str:
     if challenge.fresh:
         files = ", ".join(path.name for path in challenge.files)
         return (
-            f"Publishable: {where} on seeds that follow {files} too (salt {found.salt}), everybody "
-            "driven anew. Not said: other cars, manoeuvres and sensors."
+            f"Publishable: {where} on seeds drawn after {files} were hashed; --salt {found.salt} "
+            "repeats them. Everybody driven anew. Not said: other cars, manoeuvres and sensors."
         )
-    seeds = f"of the package's own salt {found.salt}" if found.salt else "of the caller's choice"
+    whose = "the given" if challenge.salt else "the package's own"
+    seeds = f"of {whose} salt {found.salt}" if found.salt else "of the caller's choice"
     rows = "on file, a sample driven again" if found.on_file else "driven now"
     return (
         f"Not publishable: {where} on seeds {seeds}, which a contestant can be tuned on; --fresh "

@@ -1,6 +1,7 @@
 """A user's error as one line: what came, what was expected, where; everything else is ours and
 keeps its traceback."""
 
+import io
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,14 +15,26 @@ _OF_USERS = (
     FloatingPointError,
 )  # fmt: skip
 
+_LONGEST = 1000  # letters of a message
+
 
 @contextmanager
 def one_line() -> Iterator[None]:
     """End the process with exit status 2 and the message of a user's error."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # a result is not lost for a letter
+            stream.reconfigure(errors="backslashreplace")
     try:
         yield
     except _OF_USERS as error:
         Console(stderr=True, soft_wrap=True).print(
-            "[bold red]error:[/]", escape(str(error)), highlight=False
+            "[bold red]error:[/]", escape(_shortened(str(error))), highlight=False
         )
         sys.exit(2)
+
+
+def _shortened(text: str) -> str:
+    """A message of which the middle is left out where it is long."""
+    if len(text) <= _LONGEST:
+        return text
+    return f"{text[: _LONGEST // 2]} ... {text[-_LONGEST // 2 :]}"

@@ -148,7 +148,7 @@ _OTHERS = {
     "m": "offset prediction_error",
     "m/s": "speed",
     "s": "cpu_seconds response_time",
-    "us": "us_per_tick us_per_step us_per_decision",
+    "us": "us_per_tick us_per_step us_per_decision us_added",
     "dB": "decibels",
     "Hz": "hertz",
     "rad s2/m": "understeer_gradient",

@@ -1,8 +1,10 @@
 """A benchmark's work as a list of independent cases, run side by side with a progress bar."""
 
-from collections.abc import Callable, Iterator, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from contextvars import ContextVar
+from threading import Event, Thread
 from typing import TypeVar
 
 from rich.console import Console
@@ -12,6 +14,8 @@ from .engines import completed
 
 Case = TypeVar("Case")
 Result = TypeVar("Result")
+
+_EVERY = 15.0  # s between two lines
 
 
 def chunked(seeds: int, size: int) -> list[tuple[int, ...]]:
@@ -39,6 +43,33 @@ def one_bar(console: Console | None) -> Iterator[None]:
             _SHARED.reset(token)
 
 
+@contextmanager
+def _lines(
+    console: Console | None, title: str, count: int, found: Mapping[int, object]
+) -> Iterator[None]:
+    """Say on standard error how many cases are done, at once and every 15 s, without a bar."""
+    if console is None or console.is_terminal or count < 2:
+        yield
+        return
+    ended, begun, speech = Event(), time.monotonic(), Console(stderr=True)
+
+    def speak() -> None:
+        while True:
+            passed = time.monotonic() - begun
+            text = f"{title}: {len(found)} of {count} cases, {passed:.0f} s"
+            speech.print(text.lstrip(": "), highlight=False, markup=False)
+            if ended.wait(_EVERY):
+                return
+
+    speaker = Thread(target=speak, daemon=True)
+    speaker.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        speaker.join()
+
+
 def run_cases(
     function: Callable[[Case], Result],
     cases: Sequence[Case],
@@ -50,10 +81,12 @@ def run_cases(
 
     function: importable by workers. jobs: processes (default: the processors at hand; a cluster has
     its own); 1 runs in this process. console: where the progress bar goes, unless inside
-    `one_bar`; None shows none.
+    `one_bar`; None shows none. Where it is no terminal, standard error gets a line every 15 s.
     """
     shared, found = _SHARED.get(), dict[int, Result]()
-    with progress(console) if shared is None else nullcontext(shared) as bar:
+    there = console if shared is None else shared.console
+    shown = progress(console) if shared is None else nullcontext(shared)
+    with shown as bar, _lines(None if bar.disable else there, title, len(cases), found):
         for before in bar.task_ids:
             bar.remove_task(before)
         task = bar.add_task(title, total=len(cases))

@@ -103,11 +103,12 @@ class ShareMap:
 class Suite:
     """The result of a benchmark module: rows for machines, tables and figures for people.
 
-    verdict: the answer in plain words, at most five lines (`harness.verdict`). answers: figures
-    that answer a question each: (question, plotly figure, the answer in a sentence). figures: the
-    others, (title, figure, what to see). Both are empty where the extra `report` is not installed
-    or pictures were not asked for. explorers: figures with menus. maps: for the summary's PNG.
-    files: what the report offers to save, (file name, media type, text).
+    verdict: the answer in plain words, at most five lines (`harness.verdict`). warnings: of the
+    input, that stand over it. answers: figures that answer a question each: (question, plotly
+    figure, the answer in a sentence). figures: the others, (title, figure, what to see). Both are
+    empty where the extra `report` is not installed or pictures were not asked for. explorers:
+    figures with menus. maps: for the summary's PNG. files: what the report offers to save, (file
+    name, media type, text).
     """
 
     name: str
@@ -120,7 +121,14 @@ class Suite:
     maps: list[ShareMap] = field(default_factory=list)
     files: list[tuple[str, str, str]] = field(default_factory=list)
     verdict: str = ""
+    warnings: list[str] = field(default_factory=list)
     answers: list[tuple[str, Any, str]] = field(default_factory=list)
+
+    @property
+    def headlines(self) -> list[str]:
+        """The warnings and the verdict, line by line."""
+        ended = (text if text.endswith("?") else f"{text}." for text in self.warnings)
+        return [*(f"WARNING: {text}" for text in ended), *self.verdict.splitlines()]
 
     def to_pandas(self) -> "DataFrame":
         """The rows as a pandas table (needs the extra `report`)."""
@@ -130,7 +138,7 @@ class Suite:
 
     def _repr_html_(self) -> str:
         """What a notebook shows: the verdict and the first table."""
-        lines = "".join(f"<p>{escape(line)}</p>" for line in self.verdict.splitlines())
+        lines = "".join(f"<p>{escape(line)}</p>" for line in self.headlines)
         return f"<h3>{escape(self.title)}</h3>{lines}" + "".join(
             table._repr_html_() for table in self.tables[:1]
         )

@@ -12,8 +12,6 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.stats import norm
-from scipy.stats import t as student
 
 from ...envs.record import Array
 
@@ -85,6 +83,8 @@ def margin_of_error(*strata: Array) -> float:
         uncertainty += (square / (n - 1.0)) ** 2 / freedom
     if uncertainty == 0.0:
         return 0.0
+    from scipy.stats import t as student  # half a second, which a command's help need not take
+
     return float(student.isf(_TAIL, variance**2 / uncertainty)) * math.sqrt(variance)
 
 
@@ -164,6 +164,8 @@ def share(hits: npt.ArrayLike) -> Estimate:
 
     NaN where one is, or of none.
     """
+    from scipy.stats import norm
+
     values, z = np.asarray(hits, np.float64), float(norm.isf(_TAIL))
     n = len(values)
     value = float(np.mean(values)) if n else math.nan
@@ -227,6 +229,8 @@ def chance_of_no_less(logs: Array) -> float:
     middle = float(np.mean(logs)) if len(logs) else math.nan
     if not spread > 0.0:
         return 1.0
+    from scipy.stats import t as student
+
     return float(student.cdf(middle * math.sqrt(len(logs)) / spread, len(logs) - 1))
 
 

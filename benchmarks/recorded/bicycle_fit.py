@@ -15,12 +15,13 @@ from scipy.optimize import least_squares
 from scipy.stats import t as student
 
 from ...envs.backend.decorators import jit
-from ...envs.record import FAST, Array, Log
+from ...envs.record import FAST, PACKET, Array, Log
 from ...envs.vehicle.dynamics import Car, Motion, Push, Road, derivative
 from ...envs.vehicle.integration import rk4
 from ...envs.vehicle.tyres import LINEAR, TYRE_LAWS, Inputs, load_of
 from ...envs.vehicle.vehicle import GRAVITY, Vehicle
-from .emulate import ground_speed
+from .emulate import ground_speed, heading
+from .noises import noise_levels
 
 STEP, SMOOTH = 0.01, 0.03  # s: of the fit's grid, of the mean over a log's rows
 BURN, WINDOW, MARGIN = 1.0, 4.0, 0.3  # s: forgets the start, counts, lets channels be late
@@ -41,21 +42,29 @@ class Theta(NamedTuple):
     accel_gain: float = 1.0  # above 1 where the body rolls more than the stated one
     steer_delay: float = 0.0  # s that the logged steering is later than the gyro
     accel_delay: float = 0.0  # s
+    gps_delay: float = 0.0  # s
 
 
-_STEPS = np.array([1e-3, 1e-3, 1e-3, 1e-3, 1e-4, 1e-4, 1e-3, 1e-3, 4e-3, 4e-3])  # of slopes
-_LOW = np.array([-2.0, -2.0, -2.0, -np.inf, -0.5, -0.5, -5.0, 0.3, -MARGIN, -MARGIN])
-_HIGH = np.array([2.0, 2.0, 2.0, np.inf, 0.5, 0.5, 5.0, 3.0, MARGIN, MARGIN])
+_STEPS = np.array([1e-3, 1e-3, 1e-3, 1e-3, 1e-4, 1e-4, 1e-3, 1e-3, 4e-3, 4e-3, 4e-3])  # of slopes
+_LOW = np.array([-2.0, -2.0, -2.0, -np.inf, -0.5, -0.5, -5.0, 0.3, -MARGIN, -MARGIN, -MARGIN])
+_HIGH = np.array([2.0, 2.0, 2.0, np.inf, 0.5, 0.5, 5.0, 3.0, MARGIN, MARGIN, BURN])
+STATED = Theta()
+PRIOR = Theta(0.4, 0.4, 0.2, 0.05, 0.01, 0.01, 0.5, 0.1, 0.1, 0.1, 0.3)
+"""Standard deviations of the priors, whose centres are stated; of the gain its share. Both
+stiffnesses and the inertia scaled together leave the yaw rate nearly as it is, so that of the
+inertia, which is one of I/(m l_f l_r), is narrow."""
 
 
 @dataclass(frozen=True)
 class Windows:
     """Drives on the fit's grid and where windows start on it.
 
-    rows: (6, n), smoothed gyro, accel_y, speed, steering, left and right torque; the last three
-    acted until their row. starts: (count,). stretch: (count,), of which stretch of the log each
-    window is. dt: s. accel: whether the acceleration was logged. tyres: of `TYRE_LAWS`;
-    the body rolls where they are not linear.
+    rows: (8, n), smoothed gyro, accel_y, speed, steering, left and right torque, of which the last
+    three acted until their row; the integral of the gyro, and the GPS's course less that, NaN in
+    rows without a fix. starts: (count,). stretch: (count,), of which stretch of the log each
+    window is. dt: s. accel: whether the acceleration was logged. course: whether a window has
+    fixes. tyres: of `TYRE_LAWS`; the body rolls where they are not linear. centre, spread: means
+    and standard deviations of the priors.
     """
 
     rows: Array
@@ -63,7 +72,10 @@ class Windows:
     stretch: npt.NDArray[np.int64]
     dt: float
     accel: bool
+    course: bool
     tyres: str = "linear"
+    centre: Theta = STATED
+    spread: Theta = PRIOR
 
     @property
     def counted(self) -> npt.NDArray[np.int64]:
@@ -86,13 +98,14 @@ def windows_of(logs: Sequence[Log], left_out: Sequence[npt.NDArray[np.bool_]]) -
         fast = log.record.fast.T
         rows = np.stack([
             fast[FAST.gyro], fast[FAST.accel_y], ground_speed(log), fast[FAST.steer],
-            fast[FAST.torque_left], fast[FAST.torque_right],
+            fast[FAST.torque_left], fast[FAST.torque_right], heading(log), np.zeros(len(log.time)),
         ])  # fmt: skip
         rows = uniform_filter1d(rows, width, axis=1, mode="nearest")
         if every > 1:  # an input acts for the whole step up to its row
-            rows[3:] = uniform_filter1d(rows[3:], every, axis=1, origin=(every - 1) // 2)
+            rows[3:6] = uniform_filter1d(rows[3:6], every, axis=1, origin=(every - 1) // 2)
         bad = np.maximum.reduceat(out, np.arange(0, len(out), every))
         rows = rows[:, ::every]
+        rows[7] = _courses(log, every, rows.shape[1])
         for start in range(before, rows.shape[1] - after, round(WINDOW / (every * dt))):
             piece = slice(start, start + after)
             if not bad[piece].any() and rows[2, piece].min() >= LEAST_SPEED:
@@ -103,7 +116,21 @@ def windows_of(logs: Sequence[Log], left_out: Sequence[npt.NDArray[np.bool_]]) -
     stretch = np.arange(count) * min(STRETCHES, count) // max(count, 1)
     accel = all("accel_y" in log.record.present for log in logs)
     rows = np.ascontiguousarray(np.concatenate(pieces, axis=1))
-    return Windows(rows, np.array(starts, np.int64), stretch, every * dt, accel)
+    made = Windows(rows, np.array(starts, np.int64), stretch, every * dt, accel, False)
+    return replace(made, course=bool(np.isfinite(rows[7][made.counted]).any()))
+
+
+def _courses(log: Log, every: int, count: int) -> Array:
+    """(count,): the GPS's course less the gyro's integral, in every so-manieth row of the log, NaN
+    in those without a fix."""
+    courses = np.full(count, np.nan)
+    packets = log.record.packets_of("gps")
+    fixes = packets[(packets[:, PACKET.quality] > 0.0) & np.isfinite(packets[:, PACKET.value])]
+    places = fixes[:, PACKET.captured] - log.record.first
+    turned = np.interp(places, np.arange(len(log.time)), heading(log))
+    near = np.clip(np.rint(places / every).astype(np.int64), 0, count - 1)
+    courses[near] = np.unwrap(fixes[:, PACKET.value] - turned)
+    return courses
 
 
 @jit
@@ -118,7 +145,8 @@ def _load(rows: Any, i: Any, place: Any, theta: Any, car: Any) -> Any:
 def _drive(
     rows: Any, starts: Any, theta: Any, fixed: Any, law: int, roll: int, h: float, out: Any
 ) -> None:
-    """Fill out (2, windows, rows) with yaw rate and lateral specific force by the plant."""
+    """Fill out (3, windows, rows) with yaw rate, lateral specific force and sideslip angle at the
+    GPS's antenna by the plant."""
     m, l_f, l_r, mu = fixed[0], fixed[2], fixed[3], fixed[9]
     car = Car(
         m, fixed[1] * np.exp(theta[2]), l_f, l_r, fixed[4] * np.exp(theta[0]),
@@ -144,31 +172,49 @@ def _drive(
             motion = Motion(V, v_y, gamma, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, phi, phi_dot)
             slope = derivative(motion, after, push, car, road, 0, law, roll)
             out[0, w, k], out[1, w, k] = gamma, slope.v_y + V * gamma + GRAVITY * phi
+            out[2, w, k] = np.arctan2(v_y + fixed[15] * gamma, V)
 
 
 def residual(car: Vehicle, theta: Theta, w: Windows) -> Array:
-    """(windows, channels, rows): measured less predicted yaw rate and, if logged, acceleration."""
+    """(windows, channels, rows): measured less predicted yaw rate and, if logged, acceleration and
+    course, which begins anew in each window and is 0 in rows without a fix."""
     first, count = round(BURN / w.dt), round(WINDOW / w.dt)
-    out = np.empty((2, len(w.starts), first + count + round(MARGIN / w.dt)))
+    out = np.empty((3, len(w.starts), first + count + round(MARGIN / w.dt)))
     fixed = np.array([
         car.mass, car.yaw_inertia, car.front_arm, car.rear_arm, car.front_stiffness,
         car.rear_stiffness, car.front_track, car.rear_track, car.wheel_radius, car.friction,
         car.roll_moment_arm, car.roll_inertia, car.roll_stiffness, car.roll_damping,
-        car.gravity_height,
+        car.gravity_height, car.antenna_ahead,
     ])  # fmt: skip
     law = TYRE_LAWS.index(w.tyres)
     _drive(w.rows, w.starts, np.array(theta), fixed, law, int(law != LINEAR), w.dt, out)
-    late = np.arange(first, first + count) - theta.accel_delay / w.dt
-    below = np.minimum(late.astype(np.int64), out.shape[2] - 2)
-    felt = out[1][:, below] + (late - below) * (out[1][:, below + 1] - out[1][:, below])
+
+    def late(values: Array, delay: float) -> Array:
+        places = np.arange(first, first + count) - delay / w.dt
+        below = np.clip(places.astype(np.int64), 0, out.shape[2] - 2)
+        return np.asarray(
+            values[:, below] + (places - below) * (values[:, below + 1] - values[:, below])
+        )
+
     rate = w.rows[0][w.counted] - out[0, :, first : first + count] - theta.gyro_bias
-    felt = w.rows[1][w.counted] - theta.accel_gain * felt - theta.accel_bias
-    return np.stack((rate, felt) if w.accel else (rate,), axis=1)
+    left = [rate]
+    if w.accel:
+        felt = theta.accel_gain * late(out[1], theta.accel_delay) + theta.accel_bias
+        left.append(w.rows[1][w.counted] - felt)
+    if w.course:
+        turned = w.rows[6][w.starts[:, None] + np.arange(1, out.shape[2] + 1)]
+        moved = out[2] + turned - theta.gyro_bias * w.dt * np.arange(out.shape[2])
+        course = w.rows[7][w.counted] + w.rows[6][w.counted] - late(moved, theta.gps_delay)
+        fixes = np.isfinite(course)
+        course = np.where(fixes, course, 0.0)
+        middle = course.sum(axis=1) / np.maximum(fixes.sum(axis=1), 1)
+        left.append(np.where(fixes, course - middle[:, None], 0.0))
+    return np.stack(left, axis=1)
 
 
 def errors(car: Vehicle, theta: Theta, w: Windows) -> Array:
-    """RMS of the residual of each channel, in rad/s and m/s2."""
-    return np.asarray(np.sqrt(np.mean(residual(car, theta, w) ** 2, axis=(0, 2))))
+    """RMS of the residual of yaw rate and, if logged, acceleration, in rad/s and m/s2."""
+    return np.asarray(np.sqrt(np.mean(residual(car, theta, w) ** 2, axis=(0, 2))))[: 1 + w.accel]
 
 
 @dataclass(frozen=True)
@@ -176,7 +222,8 @@ class Fit:
     """A fitted `Theta`, its free ones, and every stretch's normal equations there.
 
     scale: of the channels' residuals, by which the fit is weighted. H (stretches, n, n), g
-    (stretches, n): curvature and slope of each stretch's squares by the n free ones.
+    (stretches, n): curvature and slope of each stretch's squares by the n free ones. prior, pull
+    (n,): those of the priors, which belong to no stretch.
     """
 
     theta: Theta
@@ -184,19 +231,24 @@ class Fit:
     scale: Array
     H: Array
     g: Array
+    prior: Array
+    pull: Array
 
     def without(self, gone: npt.NDArray[np.bool_]) -> Array:
         """(n,) by how much the free ones move, to first order, when stretches are left out."""
-        rest, slope = self.H[~gone].sum(axis=0), self.g[~gone].sum(axis=0)
-        return np.asarray(-np.linalg.lstsq(rest, slope, rcond=1e-14)[0])
+        rest = self.H[~gone].sum(axis=0) + np.diag(self.prior)
+        return np.asarray(-np.linalg.solve(rest, self.g[~gone].sum(axis=0) + self.pull))
 
     def half(self, name: str) -> float:
-        """Half of the 95 % interval, by a jackknife over stretches; infinite if it is not free."""
+        """Half of the 95 % interval; infinite if it is not free: a jackknife over stretches, and
+        that the truth may lie beside the priors."""
         count = len(self.g)
         if name not in self.free or count < 2:
             return float("inf")
+        at = self.free.index(name)
         moves = np.array([self.without(one) for one in np.eye(count, dtype=bool)])
-        variance = (count - 1) / count * np.sum(moves[:, self.free.index(name)] ** 2)
+        pulled = np.linalg.inv(self.H.sum(axis=0) + np.diag(self.prior))[at]
+        variance = (count - 1) / count * np.sum(moves[:, at] ** 2) + pulled**2 @ self.prior
         return float(student.ppf(0.975, count - 1) * np.sqrt(variance))
 
 
@@ -205,13 +257,15 @@ def fit(
 ) -> Fit:
     """Least squares of the `free` ones of `start`; scale: of the channels, None: found here."""
     at = [Theta._fields.index(name) for name in free]
-    low, high, steps = _LOW[at], _HIGH[at], (_STEPS * (1, 1, 1, abs(start.gain), *6 * (1,)))[at]
+    low, high, centre, sd = _LOW[at], _HIGH[at], np.array(w.centre)[at], np.array(w.spread)[at]
+    steps = (_STEPS * (1, 1, 1, abs(start.gain), *7 * (1,)))[at]
 
     def whole(x: Array) -> Theta:
         return start._replace(**dict(zip(free, x.tolist(), strict=True)))
 
     def weighted(x: Array, scale: Array) -> Array:
-        return np.asarray((residual(car, whole(x), w) / scale[:, None]).ravel())
+        left = residual(car, whole(x), w) / scale[:, None]
+        return np.concatenate([left.ravel(), (x - centre) / sd])
 
     def jacobian(x: Array, scale: Array) -> Array:
         ahead = np.array([weighted(each, scale) for each in x + np.diag(steps)])
@@ -219,13 +273,17 @@ def fit(
 
     x = np.clip(np.array(start)[at], low, high)
     for most in (60,) if scale is not None else (10, 10, 60):
-        now = np.maximum(errors(car, whole(x), w), 1e-9) if scale is None else scale
+        now = noise_levels(residual(car, whole(x), w), w.dt) if scale is None else scale
         found = least_squares(
             weighted, x, jacobian, (low, high), x_scale=10.0 * steps, args=(now,), max_nfev=most,
             xtol=1e-6, ftol=1e-7,
         )  # fmt: skip
         x = found.x
-    J, r = found.jac.reshape(len(w.starts), -1, len(at)), found.fun.reshape(len(w.starts), -1)
+    J, r = (
+        part[: -len(at)].reshape(len(w.starts), -1, *part.shape[1:])
+        for part in (found.jac, found.fun)
+    )
     of = (w.stretch[:, None] == np.unique(w.stretch)).astype(float)  # (windows, stretches)
     H = np.einsum("ws,wki,wkj->sij", of, J, J, optimize=True)
-    return Fit(whole(x), tuple(free), now, H, np.einsum("ws,wki,wk->si", of, J, r, optimize=True))
+    g = np.einsum("ws,wki,wk->si", of, J, r, optimize=True)
+    return Fit(whole(x), tuple(free), now, H, g, sd**-2.0, (x - centre) / sd**2)

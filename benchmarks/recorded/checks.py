@@ -1,119 +1,277 @@
-"""What is wrong with a recorded drive: swapped columns, other units, a gyro at its limit."""
+"""What is wrong with a recorded drive: columns that contradict one another, a gyro at its limit."""
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import label, uniform_filter1d
+from scipy.ndimage import label, median_filter, uniform_filter1d
+from scipy.stats import linregress
 
 from ...envs.record import FAST, Array, Log
-from ...envs.vehicle.vehicle import Vehicle
-from .emulate import ground_speed
+from ...envs.vehicle.vehicle import GRAVITY, Vehicle
+from .emulate import backward, course_steps, ground_speed
+from .emulate import moving as moving
 
 LEAST_RELATED = 0.5  # correlation, below which steering and yaw rate have nothing in common
-FACTOR = 2.0  # by which steering may differ from what the yaw rate needs
-_FAST_ENOUGH = 4.0  # m/s
+TRUTH = "the sideslip truth"  # how a warning begins that puts the score in doubt
+COMPASS = "degrees from north, clockwise? --map course_degnorth=COLUMN reads it"
+FACTOR = 1.8  # by which a column may differ from what the others imply
+_SURE = 3.0  # standard errors beyond it
 _TURNING = 0.3  # m/s2 RMS, below which nothing is judged
-_LONG = 5  # rows that a sensor stays at its largest value
+_MILD = 5.0  # m/s2, up to which tyres are linear
+_FEW = 10  # samples, below which nothing is judged
+_LONG, _STEPS = 5.0, 100.0  # usual runs that a gyro stays at its limit; steps up to there
 _SMOOTH = 0.2  # s
-_GUESSES = (  # a ratio of steering angles, and what it looks like from there on
-    (300.0, "degrees of the steering wheel in a column of radians?"),
-    (35.0, "degrees in a column of radians?"),
-    (6.0, "the angle of the steering wheel?"),
-    (0.05, "another unit or another car?"),
-    (0.0, "radians in a column of degrees?"),
-)
+_BESIDE = {0.05: 4, 0.5: 2}  # rad by which a fix is beside the gyro: how often it is no chance
+_JUMPS = {  # what no column changes from row to row: so much, and so much a second
+    "speed": (3.0, 50.0), "gyro": (0.5, 20.0), "accel_y": (30.0, 0.0), TRUTH: (0.05, 3.0)
+}  # fmt: skip
+_ZEROS = {"gyro": 0.02, "accel_y": 0.02, TRUTH: 0.02, "steer": 0.1}  # share of rows
+_UNITS = {
+    180.0 / math.pi: "degrees in a column of radians?",
+    math.pi / 180.0: "radians in a column of degrees?",
+    3.6: "km/h in a column of m/s?",
+    2.237: "mph in a column of m/s?",
+    1.0 / GRAVITY: "g in a column of m/s2?",
+    1.0 / 3.6: "the speed in km/h?",
+}
+_GUESSES = {  # a ratio of steering angles, and what it looks like from there on
+    300.0: "degrees of the steering wheel in a column of radians?",
+    35.0: "degrees in a column of radians?",
+    6.0: "the angle of the steering wheel?",
+    0.05: "another unit or another car?",
+    0.0: "radians in a column of degrees?",
+}
 
 
-def moving(log: Log) -> npt.NDArray[np.bool_]:
-    """The rows that are fast enough to judge."""
-    return np.asarray(ground_speed(log) > _FAST_ENOUGH)
+def _raw(log: Log) -> dict[str, Array]:
+    """The columns that a log has, by name, (rows,) each."""
+    names = {"gyro", "accel_y", "accel_x", "steer"} & set(log.record.present)
+    found = {name: log.record.fast[:, getattr(FAST, name)] for name in names}
+    found |= {TRUTH: log.truth["beta"]} if "beta" in log.truth else {}
+    return {"speed": ground_speed(log), **found}
+
+
+def _jumps(log: Log, name: str) -> npt.NDArray[np.bool_]:
+    """The rows of a column beside a jump that no car makes, or between two."""
+    x = _raw(log)[name]
+    known = np.isfinite(x) & (moving(log) | (name == "speed")) & ~backward(log)
+    if known.sum() < _FEW:
+        return np.zeros(len(x), np.bool_)
+    x = np.interp(log.time, log.time[known], x[known])
+    steps = np.abs(np.diff(x, prepend=x[0]))
+    if name == TRUTH and np.abs(x).max() < 1.01 * math.pi:
+        steps = np.minimum(steps, np.abs(2.0 * math.pi - steps))
+    least, rate = _JUMPS[name]
+    limit = max(least + rate * log.record.dt, 10.0 * float(np.percentile(steps, 90)))
+    if (jumps := steps > limit).any():
+        usual = median_filter(x, max(round(2.0 / log.record.dt), 3), mode="nearest")
+        jumps |= np.abs(x - usual) > limit
+    return np.asarray(jumps)
 
 
 def _columns(logs: Sequence[Log], *names: str) -> list[Array]:
-    """Smoothed columns of the rows that move, in all parts; "turning" is speed x yaw rate."""
+    """Smoothed columns where the car moves and nothing jumps, in all parts; "turning" is speed x
+    yaw rate, "slipping" the change of speed x truth."""
     found: list[list[Array]] = [[] for _ in names]
     for log in logs:
-        width = max(round(_SMOOTH / log.record.dt), 1)
-        own = {name: log.record.fast[:, i] for name, i in FAST._asdict().items()}
-        own |= {"speed": ground_speed(log), "turning": ground_speed(log) * own["gyro"]}
+        dt, own = log.record.dt, _raw(log)
+        width, none = max(round(_SMOOTH / dt), 1), np.zeros(len(log.time))
+        bad = ~moving(log) | backward(log)
+        for name in _JUMPS.keys() & own.keys():
+            bad |= _jumps(log, name) | ~np.isfinite(own[name])
+        used = uniform_filter1d(bad.astype(float), width + 2, mode="nearest") < 1e-9
+        slipping = np.gradient(own["speed"] * np.nan_to_num(own.get(TRUTH, none)), dt)
+        own |= {"turning": own["speed"] * own["gyro"], "slipping": slipping}
         for name, into in zip(names, found, strict=True):
-            into.append(uniform_filter1d(own[name], width, mode="nearest")[moving(log)])
+            smooth = uniform_filter1d(own.get(name, none), width, mode="nearest")
+            into.append(smooth[used][:: max(width // 2, 1)])
     return [np.concatenate(each) for each in found]
 
 
-def _related(x: Array, y: Array) -> tuple[float, float]:
-    """(slope of y by x through the means, correlation); zeros where one of them is constant."""
-    x, y = x - x.mean(), y - y.mean()
-    x2, y2, xy = float(x @ x), float(y @ y), float(x @ y)
-    return (xy / x2, xy / math.sqrt(x2 * y2)) if x2 > 0.0 and y2 > 0.0 else (0.0, 0.0)
+def _line(y: Array, x: Array, *beside: Array) -> Any:
+    """SciPy's line of y over x, after what others explain of both; None where one is constant."""
+    others = np.column_stack([*beside, np.ones(len(y))])
+    if len(y) < _FEW:
+        return None
+    x, y = (v - others @ np.linalg.lstsq(others, v, rcond=None)[0] for v in (x, y))
+    return linregress(x, y) if min(x.std(), y.std()) > 1e-9 else None
+
+
+def _contradiction(
+    line: Any, column: str, implied: str, inverse: bool = False, factor: float = FACTOR
+) -> list[str]:
+    """A sentence if a line's slope, or its inverse, is surely not within a factor of 1."""
+    margin = _SURE * line.stderr if line else math.inf
+    if not line or 1.0 / factor - margin < line.slope < factor + margin:
+        return []
+    if abs(line.rvalue) < LEAST_RELATED:
+        return [f"{column} and {implied} are unrelated (correlation {line.rvalue:.2f})"]
+    factor = 1.0 / line.slope if inverse else line.slope
+    guess = "its sign?" if factor < 0.0 else "another unit?"
+    guess = next((text for x, text in _UNITS.items() if 0.8 < x / factor < 1.25), guess)
+    return [f"{column} is {factor:.3g} times {implied}: {guess}"]
+
+
+def _steering(logs: Sequence[Log], car: Vehicle, steady: bool, tyres: float = 1.0) -> Any:
+    """The steering that the linear car needs for its yaw rate over the logged one. steady: not in
+    hard turns, nor where accel_y is not speed x yaw rate. tyres: 0 for a neutral car."""
+    speed, gyro, steer, accel_y = _columns(logs, "speed", "gyro", "steer", "accel_y")
+    bend = car.rear_arm / car.front_stiffness - car.front_arm / car.rear_stiffness
+    under = tyres * max(car.mass * bend / (2.0 * car.wheelbase), 0.0)
+    slides = np.abs(accel_y - speed * gyro) > (1.0 if accel_y.any() else math.inf)
+    used = (np.abs(speed * gyro) < _MILD) & ~slides
+    used |= (used.sum() < _FEW) | (not steady)
+    return _line((gyro * (car.wheelbase / speed + under * speed))[used], steer[used])
 
 
 def steering_gain(logs: Sequence[Log], car: Vehicle) -> tuple[float, float]:
     """(gain, correlation): by how much the logged steering is to be multiplied to turn the car as
     its gyro shows, from steady turns of the linear car."""
-    speed, gyro, steer = _columns(logs, "speed", "gyro", "steer")
-    if len(speed) < 2:
-        return 1.0, 0.0
-    bend = car.rear_arm / car.front_stiffness - car.front_arm / car.rear_stiffness
-    under = max(car.mass * bend / (2.0 * car.wheelbase), 0.0)
-    return _related(steer, gyro * (car.wheelbase / speed + under * speed))
+    line = _steering(logs, car, steady=False)
+    return (float(line.slope), float(line.rvalue)) if line else (1.0, 0.0)
+
+
+def resolution(log: Log) -> float:
+    """The step between the values of the gyro in rad/s, 0 for one too fine to be seen."""
+    steps = np.diff(np.unique(log.record.fast[:, FAST.gyro]))
+    step = float(np.median(steps)) if 2 <= len(steps) < len(log.time) / 3 else math.inf
+    even = np.abs(steps / step - np.rint(steps / step)).max(initial=0.0) < 0.1
+    return step if even and math.isfinite(step) and steps.min() > 0.5 * step else 0.0
 
 
 def saturated(log: Log) -> npt.NDArray[np.bool_]:
-    """The rows in which the gyro stays at its largest value, of either sign."""
+    """The rows in which the gyro stays at its largest value, of either sign: much longer than at
+    others, and many steps of its resolution from 0."""
     gyro = log.record.fast[:, FAST.gyro]
-    out = np.zeros(len(gyro), np.bool_)
-    for limit in (gyro.max(), gyro.min()):
-        runs, _ = label(gyro == limit)
-        long = np.bincount(runs) >= _LONG
-        long[0] = False
-        out |= long[runs] & (abs(limit) > 0.05)
-    return out
+    runs = np.cumsum(np.diff(gyro, prepend=gyro[0]) != 0.0)
+    length = np.bincount(runs)
+    long = (length >= _LONG * np.percentile(length, 95))[runs]
+    far = np.abs(gyro) > max(0.05, _STEPS * resolution(log))
+    return np.asarray(long & far & ((gyro == gyro.max()) | (gyro == gyro.min())))
 
 
 def swapped(logs: Sequence[Log]) -> str:
     """What columns seem to be swapped, "" for none that can be seen."""
     present = set.intersection(*(set(log.record.present) for log in logs))
-    speed, turning, accel_y, accel_x, steer = _columns(
-        logs, "speed", "turning", "accel_y", "accel_x", "steer"
-    )
-    if "accel_y" not in present or len(speed) < 2:
+    names = ("speed", "turning", "accel_y", "accel_x", "steer")
+    speed, turning, accel_y, accel_x, steer = _columns(logs, *names)
+    turn, instead = _line(accel_y, turning), _line(accel_y, speed * steer)
+    across = _line(accel_x, turning)
+    if "accel_y" not in present or not turn or max(turning.std(), accel_y.std()) < _TURNING:
         return ""
-    if max(np.std(turning), np.std(accel_y)) < _TURNING:
-        return ""
-    slope, fits = _related(turning, accel_y)
-    instead, well = _related(speed * steer, accel_y)
-    if not 0.5 < abs(slope) < 2.0 and 0.5 < abs(instead) < 2.0 and abs(well) > 0.8:
+    fits = instead and 0.5 < abs(instead.slope) < 2.0 and abs(instead.rvalue) > 0.8
+    if fits and not 0.5 < abs(turn.slope) < 2.0 and abs(instead.rvalue) > abs(turn.rvalue):
         return "steering and yaw rate: speed x steering is the lateral acceleration"
-    across, well = _related(turning, accel_x)
-    if "accel_x" in present and abs(fits) < 0.5 and abs(well) > 0.7 and 0.3 < abs(across) < 3.0:
+    fits = across and 0.3 < abs(across.slope) < 3.0 and abs(across.rvalue) > 0.7
+    if fits and abs(turn.rvalue) < 0.5:
         return "accel_x and accel_y: speed x yaw rate is in accel_x"
     return ""
+
+
+def _zeros(logs: Sequence[Log], name: str) -> list[str]:
+    """A sentence if a column is filled with zeros where the car turns."""
+    x, moves = [np.zeros(0)], sum(moving(log).sum() for log in logs)
+    for log in (log for log in logs if name in _raw(log)):
+        own = _raw(log)
+        turns = np.hypot(own["speed"] * own["gyro"], own.get("accel_y", 0.0)) > 1.0
+        x.append(own[name][turns & moving(log)])
+    values, counts = np.unique(np.concatenate(x), return_counts=True)
+    zeros, others = counts[values == 0.0].sum(), counts[values != 0.0]
+    if zeros <= max(_ZEROS[name] * moves, 5 * others.max(initial=1)):
+        return []
+    return [f"{name} is 0 in {zeros} of {counts.sum()} rows in which the car turns"]
+
+
+def _fixes(logs: Sequence[Log]) -> list[str]:
+    """What a course cannot be: held while the gyro turns, and elsewhere for a fix or two."""
+    before, after, change, turned, _ = course_steps(logs, 0.0)
+    runs, _ = label(change == 0.0)
+    held = (runs > 0) & (np.bincount(runs, np.abs(turned), 1) > 0.1)[runs]
+    if held.any():
+        return [f"the course stands still in {held.sum()} fixes while the gyro turns"]
+    beside = np.angle(np.exp(1j * (change - turned)))
+    for least, few in _BESIDE.items():
+        out = np.abs(beside) > least
+        values, counts = np.unique((before[out], after[out]), return_counts=True)
+        back = abs(beside[out].sum()) < 0.2 * np.abs(beside[out]).sum()
+        if back and counts.max() >= max(few, 0.8 * np.count_nonzero(out)):
+            value = math.degrees(values[counts.argmax()])
+            return [f"the course jumps to {value:.3g} deg and back: where it is not known?"]
+    return []
+
+
+def _steering_text(logs: Sequence[Log], car: Vehicle, steady: bool) -> list[str]:
+    """What is wrong with the steering, by steady turns and all rows, by these and other tyres."""
+    line, *lines = (_steering(logs, car, *how) for how in ((steady,), (False,), (False, 0.0)))
+    found = _contradiction(line, "steering", "yaw rate")
+    if not all(_contradiction(each, "", "") for each in lines):
+        return []
+    if not found or abs(line.rvalue) < LEAST_RELATED:
+        return found
+    ratio, found = 1.0 / abs(line.slope), []
+    if line.slope < 0.0:
+        found.append("steering and yaw rate differ in sign (--steering-sign -1 turns it)")
+    if not 0.5 < ratio < 2.0:
+        guess = next(text for least, text in _GUESSES.items() if ratio >= least)
+        text = f"the logged steering is {ratio:.3g} times what the yaw rate needs: {guess}"
+        found.append(f"{text} (--steering-ratio {ratio:.3g} divides it)")
+    return found
+
+
+def _course_text(line: Any, turned: Array) -> list[str]:
+    """What is wrong with the course, by its change over the integral of the gyro."""
+    if len(turned) < _FEW or turned.std() < 0.02:
+        return []
+    related = line.rvalue if line else 0.0
+    if abs(related) < LEAST_RELATED:
+        return [f"the course does not follow the gyro (correlation {related:.2f})"]
+    if -FACTOR < line.slope < -1.0 / FACTOR:
+        return [f"the course turns against the gyro (correlation {related:.2f}): {COMPASS}"]
+    return _contradiction(line, "the change of the course", "the integral of the gyro")
+
+
+def remarks_of(logs: Sequence[Log]) -> list[str]:
+    """What is no fault of a drive, but good to know: a gyro of coarse steps."""
+    step = math.degrees(max(map(resolution, logs)))
+    return [f"The gyro's resolution is {step:.3g} deg/s."] if step > 0.1 else []
 
 
 def warnings_of(logs: Sequence[Log], car: Vehicle) -> list[str]:
     """What does not fit together in a drive, a sentence each."""
     found = [f"columns seem to be swapped, {what}"] if (what := swapped(logs)) else []
-    if count := sum(int(np.count_nonzero(saturated(log))) for log in logs):
+    if count := sum(saturated(log).sum() for log in logs):
         found.append(f"the gyro is at its limit in {count} rows")
-    turning, accel_y = _columns(logs, "turning", "accel_y")
-    if len(turning) < 2 or float(np.std(turning)) < _TURNING:
+    for name in _JUMPS:
+        if count := sum(_jumps(log, name).sum() for log in logs if name in _raw(log)):
+            found.append(f"{name} jumps as in no car, in {count} rows")
+    judged = [log for log in logs if "beta" in log.truth] or logs
+    turning, accel_y, slipping = _columns(judged, "turning", "accel_y", "slipping")
+    if len(turning) < _FEW or max(np.std(turning), np.std(accel_y)) < _TURNING:
         return found
-    gain, related = steering_gain(logs, car)
-    if abs(related) < LEAST_RELATED:
-        return [*found, f"steering and yaw rate are unrelated (correlation {related:.2f})"]
-    ratio = 1.0 / abs(gain)
-    if gain < 0.0:
-        found.append("steering and yaw rate differ in sign (--steering-sign -1 turns it)")
-    if not 1.0 / FACTOR < ratio < FACTOR:
-        guess = next(text for least, text in _GUESSES if ratio >= least)
-        found.append(
-            f"the logged steering is {ratio:.3g} times what the yaw rate needs: {guess} "
-            f"(--steering-ratio {ratio:.3g} divides it)"
-        )
-    slope, fits = _related(turning, accel_y)
-    if abs(fits) > 0.7 and not 1.0 / FACTOR < slope < FACTOR:
-        found.append(f"accel_y is {slope:.3g} times speed x yaw rate: another unit or sign?")
+    found += [text for name in _ZEROS for text in _zeros(logs, name)] + _fixes(logs)
+    used = slipping.any() | (np.abs(turning) < _MILD)
+    accel = _line(accel_y[used], turning[used], slipping[used])
+    if np.std(turning) < _TURNING and not (accel and abs(accel.rvalue) > 0.8):
+        return found
+    _, _, change, turned, slipped = course_steps(logs, 1.0)
+    course, wrong, unit = _line(change, turned, slipped), [], accel.slope if accel else 1.0
+    if accel and course and 0.67 < accel.slope / course.slope < 1.5:
+        wrong = _contradiction(accel, "the yaw rate", "what accel_y and course imply", True)
+        unit = 1.0 if wrong else unit
+    if not wrong:
+        factor = FACTOR if slipping.any() else 3.0  # the faster the turns, the more they differ
+        wrong = _contradiction(accel, "accel_y", "speed x yaw rate", factor=factor)
+        wrong += _steering_text(logs, car, steady=not wrong) + _course_text(course, turned)
+    found += wrong
+    if not slipping.any():
+        return found
+    in_course, by = _line(change, slipped, turned), "what gyro, accel_y and speed imply"
+    if not accel or abs(accel.rvalue) < LEAST_RELATED:
+        return found + _contradiction(in_course, TRUTH, "what gyro and course imply", True)
+    found += _contradiction(_line(accel_y / unit, slipping, turning), TRUTH, by, True)
+    if course and in_course and in_course.slope < 1.0 / FACTOR - _SURE * in_course.stderr:
+        found += [] if found else ["the course shows no sideslip: is it the heading?"]
     return found

@@ -1,16 +1,19 @@
-"""A GPS course for a recorded drive that has none: from its sideslip truth and its gyro."""
+"""The course of a recorded drive, and one made of sideslip truth and gyro where it has none."""
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
-from ...envs.record import FAST, Array, Log
+from ...envs.record import FAST, PACKET, Array, Log
 from ...envs.recordings.log_file import packet_rows
 from ...envs.sensors.gps import COURSE_SPEED
 from ...envs.sensors.link import SlowSensor
 
+FAST_ENOUGH = 4.0  # m/s, below which nothing of a drive is judged
 _NOT_NEGATIVE = ("course_noise_deg", "delay")
 
 
@@ -98,6 +101,17 @@ def ground_speed(log: Log) -> Array:
     return np.asarray(0.5 * (fast[:, FAST.wheel_left] + fast[:, FAST.wheel_right]))
 
 
+def moving(log: Log) -> npt.NDArray[np.bool_]:
+    """The rows that are fast enough to judge."""
+    return np.asarray(ground_speed(log) > FAST_ENOUGH)
+
+
+def backward(log: Log) -> npt.NDArray[np.bool_]:
+    """The rows that are driven backward: at a negative speed, or with a truth about half a turn."""
+    turn = np.abs(np.nan_to_num(log.truth.get("beta", np.zeros(len(log.time))))) / math.pi
+    return np.asarray((ground_speed(log) < 0.0) | ((turn > 0.75) & (turn < 1.01)))
+
+
 def path(log: Log, beta: Array) -> tuple[Array, Array]:
     """Dead reckoning: (x, y) in m from speed, heading and a sideslip angle; (rows,) each."""
     psi = heading(log)
@@ -106,3 +120,26 @@ def path(log: Log, beta: Array) -> tuple[Array, Array]:
     x_rate = v_x * np.cos(psi) - v_y * np.sin(psi)
     y_rate = v_x * np.sin(psi) + v_y * np.cos(psi)
     return np.cumsum(x_rate) * log.record.dt, np.cumsum(y_rate) * log.record.dt
+
+
+def course_steps(logs: Sequence[Log], lag: float) -> Array:
+    """(5, steps) between fixes at least `lag` s apart, in rad: the course before and after, and the
+    change of course, integral of the gyro and sideslip, by the truth or else by accel_y."""
+    found = [np.zeros((5, 0))]
+    for log in (log for log in logs if "gps" in log.slow):
+        fixes, speed, dt = log.record.packets_of("gps"), ground_speed(log), log.record.dt
+        place = fixes[:, PACKET.captured].astype(int) - log.record.first
+        good = (fixes[:, PACKET.quality] > 0.0) & (place >= 0) & (place < len(log.time))
+        good[good] &= (moving(log) & ~backward(log))[place[good]]
+        place, course = place[good], fixes[good, PACKET.value]
+        if len(place) < 2:
+            continue
+        usual = max(float(np.median(np.diff(place))), 1.0)
+        n = max(math.ceil(lag / (usual * dt) - 1e-9), 1)
+        turned = np.cumsum(log.record.fast[:, FAST.accel_y] / np.maximum(speed, FAST_ENOUGH)) * dt
+        slip = (turned - heading(log)) * ("accel_y" in log.record.present)
+        slip = log.truth.get("beta", slip)
+        columns = np.stack([np.unwrap(course), heading(log)[place], slip[place]])
+        steps = np.vstack([course[:-n], course[n:], columns[:, n:] - columns[:, :-n]])
+        found.append(steps[:, (place[n:] - place[:-n] < 1.5 * n * usual) & np.isfinite(steps[4])])
+    return np.concatenate(found, axis=1)

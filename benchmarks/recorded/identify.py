@@ -11,7 +11,7 @@ from ...envs.vehicle.vehicle import GRAVITY, Vehicle
 from ...estimators.make import make_estimator
 from ..harness.results import Suite, Table
 from ..harness.verdict import verdict
-from .bicycle_fit import Fit, Theta, Windows, errors, fit, residual, windows_of
+from .bicycle_fit import PRIOR, Fit, Theta, Windows, errors, fit, residual, windows_of
 from .checks import LEAST_RELATED, moving, saturated, steering_gain, swapped
 from .noises import LATE_WITHIN, WIDE, Finding, sensor_findings
 from .run import GYRO_ONLY
@@ -25,14 +25,17 @@ GRIPS = 0.8  # of the stated friction's acceleration, beyond which that is in do
 NEAR = 2.5  # within this factor of the stated ratio, that one may be right
 PAYS = 0.98  # of the error on held-out stretches, at most, where a latency is applied
 FOLDS = 4
-_MOST = Theta(0.3, 0.3, 0.4, 0.2, 0.0175, 0.0087, 0.5, 0.2, LATE_WITHIN, LATE_WITHIN)
-"""Half of the widest interval with which a number is told; of the gain its share."""
+POSSIBLE = (0.6, 1.3)  # I/(m l_f l_r) of cars
+TOLD = 0.5  # of the prior's interval, the widest one with which a number is told
+UNKNOWN_GAIN = 0.3  # standard deviation of its share, where no stated ratio is near
 _DELAYS = {"steer_delay": "steer", "accel_delay": "accel_y"}
+_OF_ACCEL = ("accel_bias", "accel_gain")
 _OF_CAR = {"front": "front_stiffness", "rear": "rear_stiffness", "inertia": "yaw_inertia"}
 _NOTE = (
-    "Intervals by a jackknife over 40 stretches of the log (20 for sensors). What this log does "
-    "not tell stays as stated. Latencies of steering and acceleration are applied only where they "
-    "lower the error on stretches that the fit has not seen: the lag of tyres looks like one."
+    "Intervals by a jackknife over 40 stretches of the log (20 for sensors), and by priors around "
+    "what is stated, to which numbers that this log does not tell are drawn. Latencies of steering "
+    "and acceleration are applied only where they lower the error on stretches that the fit has "
+    "not seen: the lag of tyres looks like one."
 )
 
 
@@ -83,7 +86,9 @@ def identify(
     else:
         near = 1.0 / NEAR < gain / stated.gain < NEAR
         start = Theta(gain=stated.gain if near else gain, offset=stated.offset)
-        _fit_car(found, w, start, near, TYRES if tyres is None else (tyres,))
+        sd = abs(start.gain) * (PRIOR.gain if near else UNKNOWN_GAIN)
+        w = replace(w, centre=start, spread=PRIOR._replace(gain=sd))
+        _fit_car(found, w, near, TYRES if tyres is None else (tyres,))
     slips = _slips(logs, found.car, found.wires)
     both = (_slips(logs, car, stated), slips)
     found.slips = tuple(_beside_truth(logs, each) for each in both)
@@ -119,59 +124,48 @@ def _rows(car: Vehicle, wires: Wires) -> list[tuple[str, str, float, str]]:
     ]
 
 
-def _vagueness(fitted: Fit, name: str) -> float:
-    """Half of the interval over the most with which the number is told."""
-    share = abs(fitted.theta.gain) if name == "gain" else 1.0
-    return fitted.half(name) / (share * float(getattr(_MOST, name)))
-
-
-def _settled(car: Vehicle, w: Windows, start: Theta, free: Sequence[str]) -> Fit:
-    """The fit of those that the windows determine: the vaguest goes back to its start, one by one,
-    until none is left that is too vague."""
-    now = fit(car, w, start, free)
-    while len(now.free) > 1:
-        vague = {name: _vagueness(now, name) for name in now.free}
-        worst = max(vague, key=lambda name: vague[name])
-        if vague[worst] <= 1.0:
-            break
-        back = now.theta._replace(**{worst: getattr(start, worst)})
-        now = fit(car, w, back, [name for name in now.free if name != worst], now.scale)
-    return now
-
-
-def _fit_car(found: Identified, w: Windows, start: Theta, near: bool, laws: Sequence[str]) -> None:
+def _fit_car(found: Identified, w: Windows, near: bool, laws: Sequence[str]) -> None:
     """Fill in all that the car's motion tells. near: whether the stated ratio may be right."""
     car, stated = found.car, found.wires
     hard = float(np.percentile(np.abs(w.rows[2] * w.rows[0])[w.counted], 95))
     held = ["gain"] if near and hard > MILD else []
-    free = [
-        name for name in Theta._fields[:8]
-        if name not in held and (w.accel or not name.startswith("accel"))
-    ]  # fmt: skip
+    without = (*held, *(() if w.accel else _OF_ACCEL), *(() if w.course else ("gps_delay",)))
+    free = [name for name in (*Theta._fields[:8], "gps_delay") if name not in without]
     if len(laws) > 1 and hard > GRIPS * car.friction * GRAVITY:
         laws = TYRES[:1]  # the stated friction is not this log's, and Fiala's law lives by it
-    tried = []
-    for law in laws:
-        windows = replace(w, tyres=law)
-        base = _settled(car, windows, start, free)
-        tried.append((_held_out(car, windows, base)[0] * float(base.scale[0]), windows, base))
-    _, w, base = min(tried, key=lambda each: each[0])
+    fits = [
+        (replace(w, tyres=law), fit(car, replace(w, tyres=law), w.centre, free)) for law in laws
+    ]
+    scale = fits[0][1].scale  # one for all laws
+    w, base = min(fits, key=lambda pair: np.linalg.norm(_held_out(car, *pair) / scale))
     rows, best, free_too = _with_latency(car, w, base)
-    found.findings = _car_findings(car, stated, best, free_too, held, hard) + rows
     theta, gain = best.theta, best.theta.gain
     values = {
         key: getattr(car, key) * math.exp(getattr(theta, name)) for name, key in _OF_CAR.items()
     }
-    found.car = car.replace(**values, name=f"{car.name}-identified")
+    fitted = car.replace(**values, name=f"{car.name}-identified")
+    found.findings = _car_findings(car, stated, w, (best, free_too), held, hard) + rows
+    share = fitted.yaw_inertia / (car.mass * car.front_arm * car.rear_arm)
+    if not POSSIBLE[0] <= share <= POSSIBLE[1]:
+        low, high = POSSIBLE
+        found.reason = f"its fit has I/(m l_f l_r) = {share:.2f}, and cars have {low} to {high}"
+    elif not any(row.told for row in found.findings[:3]):
+        found.reason = "it tells neither the stiffnesses nor the yaw inertia"
+    if found.reason:
+        found.findings = [row._replace(told=False, remark=found.reason) for row in found.findings]
+        return
+    found.car = fitted
     late = {channel: getattr(theta, name) for name, channel in _DELAYS.items() if name in best.free}
     found.wires = Wires(1.0 / abs(gain), 1 if gain > 0.0 else -1, theta.offset, late)
     first = Theta(gain=stated.gain, offset=stated.offset)
     rates = [float(errors(car, each, w)[0]) for each in (first, theta)]
-    found.rates = (*rates, _held_out(car, w, best)[1])
+    found.rates = (*rates, float(_held_out(car, w, best)[0]))
     found.remarks.append(
         f"{len(w.starts)} windows of 4 s, of whose rows 95 % turn with less than {hard:.1f} m/s2; "
         f"{w.tyres} tyres" + (" err least on held-out stretches" if len(laws) > 1 else "")
-        + (", whose stiffness is that of this drive" if w.tyres == "linear" else "")
+        + (", whose stiffness is that of this drive" if w.tyres == TYRES[0] else
+           ", as stiff as at small slips; estimators, whose tyres are linear, rather take "
+           "those of --tyres linear")
     )  # fmt: skip
 
 
@@ -179,14 +173,14 @@ def _with_latency(car: Vehicle, w: Windows, base: Fit) -> tuple[list[Finding], F
     """Findings of the latencies of steering and accelerometer, the fit with those that pay, and
     the one in which all are free."""
     names = tuple(_DELAYS)[: 2 if w.accel else 1]
-    usual, pays, rows = _held_out(car, w, base)[0], [], []
+    usual, pays, rows = np.linalg.norm(_held_out(car, w, base) / base.scale), [], []
     free = fit(car, w, base.theta, (*base.free, *names), base.scale)
     for name in names:
         half, value = free.half(name), float(getattr(free.theta, name))
         told, remark = half < LATE_WITHIN, "within its interval of 0"
         if told and abs(value) > half:
             alone = fit(car, w, base.theta, (*base.free, name), base.scale)
-            share = _held_out(car, w, alone)[0] / usual
+            share = np.linalg.norm(_held_out(car, w, alone) / base.scale) / usual
             pays += [name] if share < PAYS else []
             remark = f"{'' if name in pays else 'not '}applied: error held out x {share:.3f}"
         label = f"latency of {_DELAYS[name]}"
@@ -195,29 +189,27 @@ def _with_latency(car: Vehicle, w: Windows, base: Fit) -> tuple[list[Finding], F
     return rows, best, free
 
 
-def _held_out(car: Vehicle, w: Windows, best: Fit) -> tuple[float, float]:
-    """(weighted RMS, RMS of yaw rate in rad/s) on each fold of stretches, of the fit to others."""
+def _held_out(car: Vehicle, w: Windows, best: Fit) -> Array:
+    """`errors` on each fold of stretches, of the fit to others."""
     squares, labels = [], np.unique(w.stretch)
     for fold in range(FOLDS):
         moves = best.without(labels % FOLDS == fold)
         moved = {n: getattr(best.theta, n) + m for n, m in zip(best.free, moves, strict=True)}
         mine = w.some(w.stretch % FOLDS == fold)
         squares.append(np.mean(residual(car, best.theta._replace(**moved), mine) ** 2, axis=2))
-    per = np.concatenate(squares)
-    return float(np.sqrt(np.mean(per / best.scale**2))), float(np.sqrt(np.mean(per[:, 0])))
+    return np.asarray(np.sqrt(np.mean(np.concatenate(squares), axis=0)))
 
 
 def _car_findings(
-    car: Vehicle, stated: Wires, best: Fit, free: Fit, held: Sequence[str], hard: float
+    car: Vehicle, stated: Wires, w: Windows, fits: tuple[Fit, Fit], held: Sequence[str], hard: float
 ) -> list[Finding]:
     """The rows of `_rows` with what was found. An interval also has by how much its number moves
-    where the latencies are free."""
-    found = []
+    where the latencies are free, in the second fit."""
+    found, (best, free) = [], fits
     for name, label, value, unit in _rows(car, stated):
         at = float(getattr(best.theta, name))
         half = math.hypot(best.half(name), float(getattr(free.theta, name)) - at)
-        share = abs(best.theta.gain) if name == "gain" else 1.0
-        told = name in best.free and half <= 2.0 * share * float(getattr(_MOST, name))
+        told = half <= TOLD * 1.96 * getattr(w.spread, name)
         remark = "" if told else WIDE
         if name in _OF_CAR:
             at, half = value * math.exp(at), value * math.exp(at) * half
@@ -257,7 +249,10 @@ def suite_of(found: Identified, name: str) -> Suite:
     suite = Suite("identify", f"The car of a recorded drive: {name}", "; ".join(found.remarks))
     missing = [each.name for each in found.findings if not each.told]
     if found.reason:
-        answer = f"This log shows nothing of the car: {found.reason}. It stays as stated."
+        answer = (
+            f"Not identified. This log shows nothing of the car: {found.reason}. "
+            "It stays as stated."
+        )
     else:
         rates = "{:.2f} deg/s of the yaw rate, the found one {:.2f} ({:.2f} held out)".format(
             *map(math.degrees, found.rates)

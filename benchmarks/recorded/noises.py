@@ -12,6 +12,7 @@ from .emulate import ground_speed, heading
 
 WIDE = "its interval is too wide"
 BLOCKS = 20  # of a log, which the intervals take for independent
+ALIKE = (0.0, 0.1, 0.25, 0.5, 1.0)  # s, for which rows of a residual may be alike
 LATE = (-0.2, 1.2)  # s, of the GPS
 _COURSE, _SPEED = range(2)  # places in its values
 LATE_WITHIN = 0.05  # s, half of the widest interval of a latency
@@ -52,6 +53,19 @@ def white(parts: Sequence[Array]) -> tuple[float, float]:
         third = np.diff(values if new.mean() > 0.7 else values[new], 3) / math.sqrt(20.0)
         blocks += [np.array([each @ each, len(each)]) for each in np.array_split(third, BLOCKS)]
     return jackknife(np.array(blocks), _root_mean)
+
+
+def noise_levels(left: Array, dt: float) -> Array:
+    """(channels,): standard deviations of independent rows that would tell as little as those of a
+    residual, which are alike for a while: of means over up to 1 s, by the root of their rows."""
+    levels = [np.full(left.shape[1], 1e-9)]
+    shown = np.maximum(np.mean(left != 0.0, axis=(0, 2)), 1e-9)
+    for seconds in ALIKE:
+        rows = max(round(seconds / dt), 1)
+        whole = left[:, :, : left.shape[2] // rows * rows]
+        means = whole.reshape(*left.shape[:2], -1, rows).mean(axis=3)
+        levels.append(np.sqrt(rows * np.mean(means**2, axis=(0, 2)) / shown))
+    return np.asarray(np.max(levels, axis=0))
 
 
 def _fixes(log: Log, value: int, signal: Array, part: Array, times: Array) -> list[Array]:

@@ -11,7 +11,7 @@ from scipy.stats import spearmanr
 from ... import __version__
 from ...envs.backend.files import whole
 from ...envs.record import Array
-from ...envs.recordings.nmea import Counts
+from ...envs.recordings.nmea import HOUR, Counts
 from ...envs.recordings.sources import read_nmea
 from ..harness.results import Row, Suite, Table, write_text
 from ..harness.stats import Estimate
@@ -49,6 +49,8 @@ def replay_nmea(log: str | Path, *no_drive: object) -> Replay:
     epochs, counts = read_nmea(path)
     track = track_of(epochs)
     try:
+        if not len(track.t):
+            raise ValueError("no fix has an HDOP: expected GGA, GNS or GSA sentences with one")
         found = [(signal, compare(signal)) for signal in signals(track)]
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
@@ -59,8 +61,11 @@ def receiver_suite(replay: Replay) -> Suite:
     """The answer, the counts, the numbers of each law, the track."""
     track = replay.track
     low, middle, high = np.percentile(track.hdop, (5, 50, 95))
+    step = np.diff(track.t)
+    set_anew = np.abs(step) >= HOUR  # a clock that was set, or a pause
+    parts = f" in {set_anew.sum() + 1} parts" if set_anew.any() else ""
     text = (
-        f"{track.t[-1] - track.t[0]:.0f} s with {len(track.t)} fixes; HDOP {middle:.1f}, from "
+        f"{step[~set_anew].sum():.0f} s with {len(track.t)} fixes{parts}; HDOP {middle:.1f}, from "
         f"{low:.1f} to {high:.1f} in 90 % of them; {np.median(track.satellites):.0f} satellites. "
         "A filter with a constant rate, disturbed by white noise, predicts each fix from those "
         "before, where the car moves. Its two noises are those of maximum likelihood on the first "

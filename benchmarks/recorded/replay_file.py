@@ -5,18 +5,25 @@ from pathlib import Path
 from typing import Any
 
 from ...envs.recordings.columns import parse_mapping
-from ...envs.recordings.parts import read_parts
+from ...envs.recordings.parts import URGENT, read_parts
 from ...envs.recordings.sources import is_nmea
 from ...envs.vehicle.vehicles import VehicleSource, vehicle_from
 from ..harness.drives import SETTLED
 from ..harness.results import Suite
-from .checks import warnings_of
+from .checks import TRUTH, remarks_of, warnings_of
 from .identify import Identified, identify, suite_of
 from .suite import corners, replay
 from .wires import Wires, corrected
 
 FITTED, NOMINAL = "ferrari-250lm-fitted", "ferrari-250lm-nominal"
 FACTOR = 0.7  # of the fitted tyres, where no vehicle is named
+DOUBT = "The truth of this log is in doubt, and with it all errors: see the warnings."
+
+
+def urgent_first(remarks: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Split a reader's remarks into warnings, without their mark, and the rest."""
+    urgent = [text.removeprefix(URGENT).rstrip(".") for text in remarks if text.startswith(URGENT)]
+    return urgent, [text for text in remarks if not text.startswith(URGENT)]
 
 
 def identify_file(
@@ -35,8 +42,11 @@ def identify_file(
     logs, remarks = read_parts(log, parse_mapping(mapping), end=until)
     car = vehicle_from(vehicle)
     found = identify(logs, car, wires, tyres)
-    found.remarks = [*remarks, *warnings_of(logs, car), *found.remarks]
-    return found, suite_of(found, logs[0].name)
+    urgent, remarks = urgent_first(remarks)
+    found.remarks = [*remarks, *remarks_of(logs), *found.remarks]
+    suite = suite_of(found, logs[0].name)
+    suite.warnings = urgent + warnings_of(logs, car)
+    return found, suite
 
 
 def replay_file(
@@ -54,10 +64,11 @@ def replay_file(
     does.
 
     vehicle: of `vehicle_from`; "identify": found in the log, or in its first `until` s, of which
-    the rest is then replayed, with the mass and arms of `nominal`; None: the Ferrari 250 LM of the
-    Stanford log, with the fitted tyres x 0.7, and the corners of the nominal one. mapping: texts
-    such as "steer_rad=Delta". wires: what is known beside the car; identified ones stand behind
-    it. settings: of `replay`. Raises what `read_parts`, `vehicle_from`, `identify`, `replay` do.
+    the rest is then replayed, with the mass and arms of `nominal` and linear tyres, which
+    estimators have; None: the Ferrari 250 LM of the Stanford log, with the fitted tyres x 0.7, and
+    the corners of the nominal one. mapping: texts such as "steer_rad=Delta". wires: what is known
+    beside the car; identified ones stand behind it.
+    settings: of `replay`. Raises what `read_parts`, `vehicle_from`, `identify`, `replay` do.
     """
     if is_nmea(log):
         from .receiver_suite import receiver_suite, replay_nmea
@@ -65,10 +76,10 @@ def replay_file(
         return receiver_suite(replay_nmea(log, vehicle, mapping))
     if until is not None and vehicle != "identify":
         raise ValueError("--until is for --vehicle identify")
-    wires, tables = wires or Wires(), []
+    wires, tables, unknown = wires or Wires(), [], ""
     if vehicle == "identify":
-        found, shown = identify_file(log, nominal, mapping or (), wires, until=until)
-        vehicle, tables = found.car, shown.tables
+        found, shown = identify_file(log, nominal, mapping or (), wires, "linear", until)
+        vehicle, tables, unknown = found.car, shown.tables, found.reason
         latency = {**found.wires.latency, **wires.latency}
         wires = found.wires._replace(latency=latency, noise={**found.wires.noise, **wires.noise})
     logs, remarks = read_parts(log, parse_mapping(mapping or ()), start=until or 0.0)
@@ -82,8 +93,9 @@ def replay_file(
         )
     else:
         car = design = vehicle_from(vehicle)
-    remarks += [f"WARNING: {text}." for text in warnings_of(logs, design)]
+    remarks += remarks_of(logs)
     settings = {"noise": wires.noise} | settings
+    settings["emulated"] = not any(part.slow for part in logs)
     parts = [part for part in logs if part.time[-1] - part.time[0] >= SETTLED] or logs[:1]
     suite, *others = [replay(part, design, **settings) for part in parts]
     others += [corners(part, car, **settings) for part in parts if "beta" in part.truth]
@@ -92,5 +104,11 @@ def replay_file(
         suite.tables += each.tables
         suite.figures += each.figures
     suite.tables += tables
+    urgent, remarks = urgent_first(remarks)
     suite.text = "\n\n".join([suite.text, *remarks])
+    suite.warnings = urgent + warnings_of(logs, design)
+    if unknown:
+        suite.warnings.append(f"the car is not identified, {unknown}: it stays as stated")
+    if any(text.startswith(TRUTH) for text in suite.warnings):
+        suite.verdict = "\n".join([DOUBT, *suite.verdict.splitlines()[1:]])
     return suite

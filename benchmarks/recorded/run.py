@@ -14,7 +14,7 @@ from ...envs.sensors.link import SlowSensor
 from ...envs.vehicle.vehicle import Vehicle
 from ...estimators.make import make_estimator
 from ..harness.drives import SETTLED, quietly
-from .emulate import Emulation
+from .emulate import Emulation, backward
 
 GYRO_ONLY = "bicycle-kf"
 ESTIMATORS: dict[str, tuple[str, ...]] = {
@@ -45,7 +45,7 @@ class Settings(Emulation):
     course noise they assume is `course_noise_deg`. seeds: how many noises of the emulated course,
     from `seed` on. options: more options of estimators, by name. noise: standard deviations by
     option, which estimators assume. stiffness_factor: of both tyre stiffnesses of the estimators.
-    figures: whether to draw.
+    figures: whether to draw. emulated: whether a log with truth and no slow sensor gets a course.
 
     Raises ValueError for a value out of range and an unknown estimator.
     """
@@ -58,6 +58,7 @@ class Settings(Emulation):
     seed: int = 0
     stiffness_factor: float = 1.0
     figures: bool = True
+    emulated: bool = True
     options: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     noise: Mapping[str, float] = field(default_factory=dict)
 
@@ -79,7 +80,7 @@ class Settings(Emulation):
     def as_dict(self) -> dict[str, Any]:
         """JSON types: everything that moves a number."""
         plain = dataclasses.asdict(self)
-        del plain["figures"]
+        del plain["figures"], plain["emulated"]
         plain["estimators"] = list(self.estimators or ESTIMATORS)
         return plain
 
@@ -123,7 +124,7 @@ def drives_of(log: Log, how: Settings) -> list[Log]:
         raise ValueError(
             f"{log.name}: the drive lasts {lasts:.3g} s, errors count from {SETTLED:g} s on"
         )
-    if log.slow or "beta" not in log.truth:
+    if log.slow or "beta" not in log.truth or not how.emulated:
         return [how.with_gyro_bias(log)]
     return [how.with_course(log, how.seed + i) for i in range(how.seeds)]
 
@@ -131,10 +132,12 @@ def drives_of(log: Log, how: Settings) -> list[Log]:
 def run_estimators(drives: Sequence[Log], vehicle: Vehicle, how: Settings) -> Result:
     """Every wanted estimator that the drives' slow sensors serve, over every drive."""
     log, result = drives[0], Result()
-    counts = log.time >= log.time[0] + SETTLED - 1e-9
+    counts = (log.time >= log.time[0] + SETTLED - 1e-9) & ~backward(log)
     truth = log.truth.get("beta")
     if truth is not None and not (counts := counts & np.isfinite(truth)).any():
-        raise ValueError(f"{log.name}: the sideslip truth is unknown from {SETTLED:g} s on")
+        raise ValueError(
+            f"{log.name}: the sideslip truth is unknown from {SETTLED:g} s on, driven forward"
+        )
     for name, serves in ESTIMATORS.items():
         if how.estimators is not None and name not in (GYRO_ONLY, *how.estimators):
             continue

@@ -14,7 +14,7 @@ from ..harness.drives import SETTLED
 from ..harness.results import Row, Suite, Table
 from ..harness.stats import Estimate
 from ..harness.verdict import leader, verdict
-from .emulate import path
+from .emulate import backward, path
 from .run import ESTIMATORS, GYRO_ONLY, Result, Settings, drives_of, run_estimators
 
 __all__ = ["Settings", "corners", "replay"]
@@ -123,12 +123,14 @@ def _text(log: Log, drives: Sequence[Log], car: Vehicle, how: Settings) -> str:
             f"integral of the logged yaw rate: noise {how.course_noise_deg:g} deg, "
             f"{gps.longest_delay:.4g} s late, bias {how.bias_deg:g} deg."
         )
-    else:
+    elif how.emulated:
         text.append("The log has no slow sensor and no truth to emulate one from.")
     if how.gyro_bias_degps:
         text.append(f"{how.gyro_bias_degps:g} deg/s are added to the gyro.")
     if "beta" in log.truth:
         text.append(f"Errors count from {SETTLED:g} s on.")
+        if count := int(backward(log).sum()):
+            text.append(f"{count} rows are driven backward, and not scored.")
     else:
         text.append("The log has no sideslip truth, so nothing is scored.")
     return " ".join(text)

@@ -70,7 +70,7 @@ def write_report(
 
 
 def _verdict(link: str, suite: Suite) -> str:
-    lines = "\n".join(f"<li>{inline(line)}</li>" for line in suite.verdict.splitlines())
+    lines = "\n".join(f"<li>{inline(line)}</li>" for line in suite.headlines)
     title = f'<h3><a href="#{link}">{escape(suite.title)}</a></h3>'
     return f"<article>\n{title}\n<ul>\n{lines}\n</ul>\n</article>"
 

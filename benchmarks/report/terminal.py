@@ -1,5 +1,6 @@
 """A suite on the screen: its verdict first, and tables that fit whatever the width."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 from rich import box
@@ -13,16 +14,47 @@ from .tables import numeric
 _NAME = 32  # letters: a longer text in a table's first column is no name and may wrap
 _LEAST = 22  # letters that a column of text has at least, and the first one on a narrow screen
 _NARROW = 80  # columns
+_FEW, _ROWS = 2, 20  # suites of a run whose tables are printed, and the rows of all of them
 
 
-def print_suite(console: Console, suite: Suite) -> None:
-    """The title, the verdict, the text, and each table with its note, but for details."""
+def print_run(console: Console, suites: Sequence[Suite], reported: bool) -> None:
+    """Print what a run found in about 60 lines: verdicts, a table each, and where the rest is.
+
+    Args:
+        console: The screen.
+        suites: What was found. Of many a line of the verdict alone is printed.
+        reported: Whether a report has the rest.
+    """
+    few = len(suites) <= _FEW
+    for suite in suites:
+        _title(console, suite)
+        whole = suite.headlines
+        lines = whole if few else whole[1:2] or whole  # a verdict's second line is the answer
+        console.print(f"[bold]{escape(chr(10).join(lines))}[/]\n", highlight=False)
+        for table in [each for each in suite.tables if not each.detail][: int(few)]:
+            most = _ROWS // len(suites)
+            left = len(table.cells) - most
+            cut = replace(table, cells=table.cells[:most]) if left > 0 else table
+            console.print(_rich(_parts(cut, console.width)[0], console.width))
+            if left > 0:
+                console.print(f"[dim]and {left} rows more[/]\n", highlight=False)
+    count = sum(len(suite.tables) for suite in suites)
+    where = "in the report" if reported else "in a report: --html FILE"
+    console.print(f"All {count} tables, with notes and figures, are {where}.", highlight=False)
+
+
+def _title(console: Console, suite: Suite) -> None:
     if len(suite.title) + 4 <= console.width:
         console.rule(f"[bold]{escape(suite.title)}")
     else:  # a rule would cut it
         console.print(f"\n[bold]{escape(suite.title)}[/]", highlight=False)
+
+
+def print_suite(console: Console, suite: Suite) -> None:
+    """The title, the verdict, the text, and each table with its note, but for details."""
+    _title(console, suite)
     if suite.verdict:
-        console.print(f"[bold]{escape(suite.verdict)}[/]\n", highlight=False)
+        console.print(f"[bold]{escape(chr(10).join(suite.headlines))}[/]\n", highlight=False)
     console.print(f"{escape(suite.text)}\n", highlight=False)
     for table in suite.tables:
         if table.detail:

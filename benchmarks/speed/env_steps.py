@@ -6,18 +6,22 @@ reset after at most 500 steps; batches run on, and reset their rows themselves.
 
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
+from ...estimators.filters import FILTERS
+from ...estimators.learned.files import shipped
+from ...estimators.make import make_estimator
 from ...estimators.vector.estimate import EstimateObservation as EstimateObservations
 from ...estimators.wrappers.estimate import EstimateObservation
-from ..harness.results import Suite
-from .contestants import Field
-from .timing import Contestant, Effort, Taken
+from ..harness.results import Suite, Table
+from .contestants import Field, add_row, three
+from .timing import Contestant, Effort, Taken, interleaved
 
-COUNT = 1024  # environments at once
+COUNT, FEWER = 1024, 256  # environments at once, alone and with each filter
 EPISODE, CHUNK = 500, 50  # steps, the most; in one call
 STEPS, FRAMES = 10, 33  # of a batch, in one call; until camera frames fall on steps as before
 
@@ -26,10 +30,9 @@ FUSION, VISION = "YawFusion-v0", "YawVision-v0"
 PROMPT: dict[str, Any] = {"camera": {"delays": [0.0]}}
 FILTER: dict[str, Any] = {"estimator": "exact-kf", "options": {"gains": "covariance"}}
 AT_ONCE = f"{FUSION} x {COUNT}"
-ALONE_FILTERED, FILTERED = (f"{who} + exact-kf, full P" for who in (FUSION, AT_ONCE))
+FILTERED = f"{AT_ONCE} + exact-kf, full P"
 LATE, NONE_LATE = f"{VISION} x {COUNT}", f"{VISION} x {COUNT}, no delay"
 CARTPOLE, LANE = "CartPole-v1", "lane-keeping-v0 (highway-env)"
-MULTIRATE = f"{LATE} + multirate-kf"
 CARTPOLES, PENDULUMS = f"{CARTPOLE} x {COUNT}", f"Pendulum-v1 x {COUNT}"
 ENVPOOL = f"{PENDULUMS} (EnvPool)"
 
@@ -133,13 +136,8 @@ def contestants() -> Field:
     field = Field()
     field.add(FUSION, lambda: episode(gym.make(FUSION_ID)))
     field.add(AT_ONCE, lambda: batch(_vector(FUSION_ID)))
-    field.add(ALONE_FILTERED, lambda: episode(EstimateObservation(gym.make(FUSION_ID), **FILTER)))
     field.add(FILTERED, lambda: batch(EstimateObservations(_vector(FUSION_ID), **FILTER)))
     field.add(LATE, lambda: batch(_vector(VISION_ID), FRAMES))
-    field.add(
-        MULTIRATE,
-        lambda: batch(EstimateObservations(_vector(VISION_ID), "multirate-kf"), FRAMES),
-    )
     field.add(NONE_LATE, lambda: batch(_vector(VISION_ID, **PROMPT), FRAMES))
     field.add(CARTPOLE, lambda: episode(gym.make(CARTPOLE), upright))
     field.add(LANE, _lane_keeping, "highway-env")
@@ -158,3 +156,34 @@ def add(suite: Suite, effort: Effort) -> tuple[dict[str, Taken], dict[str, str]]
         "filter's own cost is the difference to the line without."
     )
     return contestants().measure(suite, "Cost of an env-step", "step", effort, note)
+
+
+def add_filters(suite: Suite, effort: Effort) -> None:
+    """Add rows and a table of what each filter adds to a step, in a third of the rounds each."""
+    envs = {"one": episode(gym.make(FUSION_ID)), "many": batch(gym.make_vec(FUSION_ID, FEWER))}
+    header = ("", "one", "range", f"of {FEWER}", "range")
+    fewer, cells = replace(effort, rounds=max(1, effort.rounds // 3)), []
+    for name in (*FILTERS, *(f"learned-{base}" for base in shipped())):
+        taken = interleaved(envs | _filtered(name), fewer)
+        bare, bare_many, one, many = (np.array(values) for values in taken.values())
+        cells.append([name])
+        for env, added in ((FUSION, one - bare), (f"{FUSION} x {FEWER}", many - bare_many)):
+            middle, *ends = add_row(suite, f"{env} + {name}", "us_added", added.tolist())
+            cells[-1] += three(middle), " .. ".join(map(three, ends))
+    note = (
+        f"CPU us that a filter adds to an env-step of {FUSION}, its first two states and their "
+        "deviations in the observation: differences round by round."
+    )
+    suite.tables.append(Table("Cost of a filter", header, cells, note, keyed=False))
+
+
+def _filtered(name: str) -> dict[str, Contestant]:
+    """One environment and a batch with a filter."""
+    env, many = gym.make(FUSION_ID), gym.make_vec(FUSION_ID, FEWER)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of what it cannot see
+        outputs = make_estimator(name, sensors=env.get_wrapper_attr("slow_sensors")).names[:2]
+        return {
+            "one filtered": episode(EstimateObservation(env, name, outputs)),
+            "many filtered": batch(EstimateObservations(many, name, outputs)),
+        }

@@ -1,11 +1,12 @@
 """What a learned env-step costs: PPO of stable-baselines3 through our bridge, and on Pendulum-v1.
 
-All learn as they go: a call is one rollout and the gradient steps on it. On Pendulum-v1 PPO has
-its defaults, as its users start; through the bridge a rollout comes from many environments, so
-that batches are large and few. `sideslip train` has the same PPO with an update by NumPy.
+All learn as they go: a call is one rollout and the gradient steps on it. All have the same number
+of environments and the same settings; those of Pendulum-v1 step in stable-baselines3's own vector
+environment. `sideslip train` has the same PPO with an update by NumPy.
 """
 
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from ...envs.ticks import TICK
@@ -13,34 +14,32 @@ from ..harness.results import Suite
 from .contestants import Field
 from .timing import Contestant, Effort, Taken
 
-YAW = "sideslip/YawFusion-v0"
+YAW, PENDULUM_ID = "sideslip/YawFusion-v0", "Pendulum-v1"
 OURS = "PPO, YawFusion-v0"
 UPDATED = f"{OURS}, update by NumPy"
-PENDULUM = "PPO, Pendulum-v1"
+PENDULUM = f"PPO, {PENDULUM_ID}"
 
-COUNT = 256  # environments of the bridge
-DEFAULTS = 2048  # steps of a rollout with the defaults
-ROUNDS = 5  # at most: a round takes seconds
+COUNT = 256  # environments
+ROUNDS = 5  # at most: a round takes long
 
 
-def _learner(env: Any, steps: int, kind: Any = None, **settings: Any) -> Contestant:
+def _learner(name: str) -> Contestant:
+    """One of the three; a call is a rollout and its update."""
     from stable_baselines3 import PPO
+    from stable_baselines3.common.env_util import make_vec_env
 
-    model = (kind or PPO)("MlpPolicy", env, seed=0, device="cpu", **settings)
+    from ...agents.training.ppo import update
+    from ...agents.vec_env import env as bridge
+
+    make, env_id = (make_vec_env, PENDULUM_ID) if name == PENDULUM else (bridge.make_vec_env, YAW)
+    kind: Any = update.PPO if name == UPDATED else PPO
+    model = kind("MlpPolicy", make(env_id, COUNT, seed=0), seed=0, device="cpu", **_settings())
+    steps = COUNT * model.n_steps
 
     def work() -> None:
         model.learn(steps, reset_num_timesteps=False)
 
     return Contestant(work, steps)
-
-
-def _ours(updated: bool) -> Contestant:
-    from ...agents.training.ppo.update import PPO
-    from ...agents.vec_env.env import make_vec_env
-
-    settings = _settings()
-    env = make_vec_env(YAW, COUNT, seed=0)
-    return _learner(env, COUNT * settings["n_steps"], PPO if updated else None, **settings)
 
 
 def _settings() -> dict[str, Any]:
@@ -54,15 +53,14 @@ def _settings() -> dict[str, Any]:
 def add(suite: Suite, effort: Effort) -> tuple[dict[str, Taken], dict[str, str]]:
     """Rows and a table; what each contestant took, and why others are absent."""
     field = Field()
-    field.add(OURS, lambda: _ours(False), "stable-baselines3")
-    field.add(UPDATED, lambda: _ours(True), "stable-baselines3")
-    field.add(PENDULUM, lambda: _learner("Pendulum-v1", DEFAULTS), "stable-baselines3")
+    for name in (OURS, UPDATED, PENDULUM):
+        field.add(name, partial(_learner, name), "stable-baselines3")
     settings = ", ".join(
         f"{name} = {value}" for name, value in (_settings() if field.contestants else {}).items()
     )
     note = (
-        "PPO of stable-baselines3, rollout and gradient steps. YawFusion-v0 through the bridge: "
-        f"{COUNT} environments, {settings}; the rest, and all on Pendulum-v1, is its default. "
+        "PPO of stable-baselines3, rollout and gradient steps, on as many environments each: "
+        f"{COUNT}, YawFusion-v0 through the bridge; {settings}, the rest is its default. "
         "Update by NumPy: the same minibatches, losses and steps to rounding, as in sideslip train."
     )
     fewer = replace(effort, rounds=max(1, min(effort.rounds // 2, ROUNDS)))

@@ -27,6 +27,7 @@ def run(quick: bool = False, console: Console | None = None) -> Suite:
     )
     effort = QUICK if quick else FULL
     taken, absent = env_steps.add(suite, effort)
+    env_steps.add_filters(suite, effort)
     for part in (plant, learning):
         more, away = part.add(suite, effort)
         taken |= more

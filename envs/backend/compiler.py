@@ -204,7 +204,11 @@ class Kernel(CPUDispatcher):
     def _built(self, args: tuple[types.Type, ...]) -> tuple[Any, dict[str, Any], list[Any]]:
         """What `_linked` returns, compiled while the user waits."""
         where = f"cached in {self.folder.parent}" if self.folder else "not cached"
-        notice("compiling", f"compiling kernels for this machine ({where}) ...", logging.INFO)
+        notice(
+            "compiling",
+            f"compiling kernels for this machine, half a minute or more ({where}) ...",
+            logging.INFO,
+        )
         start, nested = time.process_time(), _spent[0]
         with _without_collection():
             result = _linked(

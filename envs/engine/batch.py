@@ -10,7 +10,7 @@ from .arrays import Records, Rows, Start, row_of, start_of
 from .lanes import Block, step_block
 from .layout import FLAGS
 from .reset import reset_vehicle
-from .step import kind_of, shares_of, step_vehicle
+from .step import kind_of, shares_of, step_vehicle, wild_of
 
 _FEW = 2  # up to so many vehicles are stepped one by one
 
@@ -38,15 +38,19 @@ def step_rows(
     """One env-step of every row, and how many episodes ended.
 
     The first ten are `Rows`, one by one as in `step_vehicle`. Rows whose episode is `over` stand
-    still, with reward 0, and do not end again; then those that ended in this step are. Returns
-    REFUSED, and steps nothing, where an action that is not to fail its row is not finite.
+    still, with reward 0, and do not end again; then those that ended in this step are. Adds WILD
+    for an action that is. Returns REFUSED, and steps nothing, where an action that is not to fail
+    its row is not finite.
     """
+    ended = 0
     every = Rows(params, states, switches, obs, rows, packets, reports, ticks_done, delivered, over)
     for i in range(len(over)):
         if switches[i, FLAGS.fail_bad] == 0 and not over[i]:
             for share in actions[i]:
                 if float(share) - float(share) != 0.0:
                     return REFUSED
+        if not over[i]:
+            ended |= wild_of(actions[i])
     waiting, last = 0, len(over) - 1
     for m in range(len(over)):
         i = block.order[m]
@@ -67,7 +71,6 @@ def step_rows(
                 done = n if together else _step_alone(i, every, actions, n, bounds, block)
                 ticks_done[i] = done
             waiting = 0
-    ended = 0
     for i in range(len(over)):
         if over[i]:
             rewards[i], terminated[i], truncated[i], over[i] = 0.0, False, False, False

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..arguments import brief, check_choice, is_finite, listed, mapping_of, number_of, unknown_names
+from ..quantities import check_plausible
 from ..record import Array
 from ..scenarios.checks import SHORTEST_GPS_PERIOD
 from ..scenarios.draws import range_of
@@ -95,6 +96,7 @@ class EnvConfig:
     on_bad_action: str
     vision: str
     delay: str | None
+    strict: bool
     slow_changes: Mapping[str, Mapping[str, Any] | None]
 
     def __post_init__(self) -> None:
@@ -109,7 +111,7 @@ class EnvConfig:
             raise ValueError(f"control_period is 1 to 1000 ticks, got {brief(n)}")
         if not isinstance(self.fast, str) or self.fast not in ("summary", "all"):
             raise ValueError(f"fast is 'summary' or 'all', got {brief(self.fast)}")
-        for name in ("steering", "yaw_first", "with_map"):
+        for name in ("steering", "yaw_first", "with_map", "strict"):
             if not isinstance(getattr(self, name), bool):
                 raise TypeError(f"{name} is True or False, got {brief(getattr(self, name))}")
         bad = self.on_bad_action
@@ -159,6 +161,10 @@ class EnvConfig:
         self, scenario: Scenario, vehicle: Vehicle, motion: Array | None = None
     ) -> EpisodeConfig:
         """An episode of a scenario with a true vehicle and a start, as of `motion_from`."""
+        if self.strict:
+            cars = vehicle.replace(**scenario.vehicle), self.nominal.replace(**scenario.nominal)
+            for each in (scenario, *cars):
+                check_plausible(each)
         slow = in_scenario(self.slow, scenario)
         if self.vision == "image":
             slow["camera"] = detected(slow["camera"], self.delay)
@@ -186,7 +192,7 @@ class EnvConfig:
                 f"unknown reset option {', '.join(unknown)}; known: {', '.join(OPTIONS)}"
             )
         scenario = scenario_from(options.get("scenario", self.scenario))
-        vehicle = vehicle_from(options.get("vehicle", self.vehicle))
+        vehicle = vehicle_from(options.get("vehicle", self.vehicle), self.strict)
         if "friction" in options:
             friction = number_of("reset option friction", options["friction"])
             scenario = scenario.replace(friction=friction)

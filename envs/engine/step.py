@@ -18,7 +18,7 @@ from ..backend.primitives import anywhere, select
 from ..record import FAST
 from ..scenarios.steering import DRIVER
 from ..task.cost import rest_of_cost
-from ..task.failures import BAD_ACTION, REFUSED, RUNNING, failure_of
+from ..task.failures import BAD_ACTION, FAR, REFUSED, RUNNING, WILD, failure_of
 from ..task.info import REPORT
 from ..vehicle.tyres import shifts
 from .arrays import Row, Start, parts_of
@@ -227,6 +227,15 @@ def shares_of(action: Any) -> tuple[float, float]:
 
 
 @jit
+def wild_of(action: Any) -> int:
+    """WILD where a number of an action is finite and beyond FAR, else 0."""
+    for share in action:
+        if (share > FAR or share < -FAR) and share - share == 0.0:
+            return WILD
+    return 0
+
+
+@jit
 def refuse(row: Row) -> int:
     """Refuse an action that is not finite, or end the episode as a failure (`fail_bad`)."""
     z, report = row.z, row.report
@@ -274,12 +283,13 @@ def step_vehicle(
 
 @jit
 def step_packed(work: Any, action: Any) -> int:
-    """`step_vehicle` of the episode whose arrays lie in a workspace."""
+    """`step_vehicle` of the episode whose arrays lie in a workspace, and WILD."""
     row, bounds, window = parts_of(work)
     n = len(row.rows)
-    return int(
+    done = int(
         step_vehicle(
             row.p, row.z, row.switches, row.obs, row.rows, row.packets, row.report, action, n,
             bounds, window,
         )
     )  # fmt: skip
+    return done + wild_of(action) if done > 0 else done

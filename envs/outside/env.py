@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..arguments import check_choice
+from ..arguments import check_choice, warn_once
 from ..backend.arrays import at, read, write
 from ..backend.decorators import plain
 from ..engine.layout import P, Z
-from ..engine.step import conclude, fixed_of, kind_of, shares_of, write_end
+from ..engine.step import conclude, fixed_of, kind_of, shares_of, wild_of, write_end
 from ..engine.tick import Fixed, Kind, Moving, command, sense
 from ..engine.window import WINDOW, chance_at, foresee, judge
 from ..record import FAST
@@ -38,6 +38,8 @@ class PlantEnv(StabilityEnv):
         share, turn = shares_of(force)
         if share != share:
             return super()._advance(force)  # refuses or fails before it moves anything
+        if wild_of(force):
+            warn_once(self, force)
         p, z, n = self._params, self._state, self.control_period
         kind = _kind_of(p, self._switches)
         foresee(p, z, n, kind.follows, self._window)

@@ -1,20 +1,19 @@
 """A table on disk as named quantities in SI units (needs the extra `report`)."""
 
+import re
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..arguments import brief, listed
 from ..record import Array
 from ..vehicle.vehicle import GRAVITY
-from .tables import read_table
+from .dialect import find_unit
+from .samples import KINDS, find_samples
+from .tables import Table, read_table
 
-if TYPE_CHECKING:
-    import pandas as pd
-
-_LARGEST = 1e15  # a time in ms since 1970 is below
+_LARGEST = 1e15  # in SI units
 _SPEED = {"mps": 1.0, "kmh": 1.0 / 3.6}
 _ANGLE = {"rad": 1.0, "deg": np.pi / 180.0}
 _ANGLE_RATE = {"radps": 1.0, "degps": np.pi / 180.0}
@@ -25,7 +24,7 @@ _NUMBER = {"count": 1.0}
 _CURVATURE = {"radpm": 1.0}
 
 COLUMNS: dict[str, dict[str, float]] = {
-    "time": {"s": 1.0, "ms": 1e-3},
+    "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
     "speed_x": _SPEED,
     "speed_y": _SPEED,
     "yaw_rate": _ANGLE_RATE,
@@ -41,7 +40,7 @@ COLUMNS: dict[str, dict[str, float]] = {
     "steer_command": _ANGLE,
     "accel_command": _ACCELERATION,
     "curvature": _CURVATURE,
-    "course": _ANGLE,
+    "course": _ANGLE | {"degnorth": -np.pi / 180.0},
     "gps_speed": _SPEED,
     "gps_x": _LENGTH,
     "gps_y": _LENGTH,
@@ -52,7 +51,15 @@ COLUMNS: dict[str, dict[str, float]] = {
 }
 """What a log may hold and the units it may come in, with their factors to SI. A column is called
 quantity_unit (`yaw_rate_radps`). Axes are ISO 8855; angles, the course too, are positive to the
-left."""
+left; `course_degnorth` alone counts from north, clockwise, as a compass does. The names of course
+and camera_psi may end on a kind of samples: `course_deg_held`."""
+_NORTH = np.pi / 2.0  # the course towards north, rad
+_NAMES = {
+    f"{quantity}_{unit}{kind}": (quantity, factor)
+    for quantity, units in COLUMNS.items()
+    for unit, factor in units.items()
+    for kind in ("", *(f"_{kind}" * (quantity in ("course", "camera_psi")) for kind in KINDS))
+}
 
 
 def column_name(quantity: str) -> str:
@@ -62,9 +69,9 @@ def column_name(quantity: str) -> str:
 
 def quantity_of(name: str) -> tuple[str, float]:
     """(quantity, factor to SI) of a column's name; ValueError if it is none of ours."""
-    quantity, _, unit = name.rpartition("_")
-    if unit in COLUMNS.get(quantity, {}):
-        return quantity, COLUMNS[quantity][unit]
+    if name in _NAMES:
+        return _NAMES[name]
+    quantity = name.rpartition("_")[0]
     near = next((known for known in (name, quantity) if known in COLUMNS), None)
     known = (
         [column_name(q) for q in COLUMNS]
@@ -93,82 +100,143 @@ def parse_mapping(texts: Sequence[str]) -> dict[str, str]:
 
 def read_quantities(
     path: Path, mapping: Mapping[str, str], needed: Sequence[str], gaps: Collection[str] | None
-) -> dict[str, Array]:
-    """The file's known quantities in SI units, (n,) each; other columns are ignored.
+) -> tuple[dict[str, Array], list[str]]:
+    """The file's known quantities in SI units, (n,) each, and sentences on how they were read.
 
-    mapping: our column name, unit included, to the file's. needed: quantities that must be there.
-    gaps: quantities that may hold NaN, any other is complete; None: all but the time. An empty
-    column counts as absent.
+    mapping: our column name, unit included, to the file's; other columns are ignored. needed:
+    quantities that must be there. gaps: quantities that may hold NaN, any other is complete; None:
+    all but the time, and shuffled rows are sorted. An empty column counts as absent.
 
     Raises what `read_table` does, and ValueError for a missing column, one given twice, a value
     that is no finite number, NaN, and fewer than two rows. Rows count from 1 below the header.
     """
-    table = read_table(path)
+    wanted = {*COLUMNS, *map(str.casefold, mapping.values())}
+    table = read_table(path, lambda name: name.casefold() in wanted or bool(_match(name, "")))
+    remarks = [*table.remarks]
     try:
-        found = _find(table, mapping)
-        missing = [column_name(name) for name in needed if name not in found]
+        columns = _find(table, mapping, remarks)
+        missing = [column_name(name) for name in needed if name not in columns]
         if missing:
-            raise ValueError(f"no column {' nor '.join(missing)}; {_there(table)}")
-        if len(table) < 2:
-            rows = "no rows" if table.empty else "one row"
+            raise ValueError(
+                f"no column {' nor '.join(missing)}; {_there(table)}; "
+                f"--map {missing[0]}=COLUMN names one"
+            )
+        if len(table.frame) < 2:
+            rows = "no rows" if table.frame.empty else "one row"
             raise ValueError(f"the log has {rows}; a drive needs two or more")
         values = {}
-        for quantity, (name, factor) in found.items():
-            column = _numbers(table, name)
-            unknown = np.isnan(column)
-            if unknown.all() and quantity not in needed:
-                continue
-            if unknown.any() and (quantity not in gaps if gaps is not None else quantity == "time"):
-                row = int(np.argmax(unknown)) + 1
-                raise ValueError(f"column {name!r} has no value (NaN) in row {row}")
-            values[quantity] = factor * column
+        for quantity, (place, name) in columns.items():
+            column = _numbers(table, place, name, remarks)
+            if quantity in needed or not np.isnan(column).all():
+                values[quantity] = column
+        _check_complete(values, ["time"])
+        kinds = {quantity: name.rpartition("_")[2] for quantity, (_, name) in columns.items()}
+        kinds = {quantity: kind for quantity, kind in kinds.items() if kind in KINDS}
+        remarks += find_samples(values, needed, kinds, gaps is not None)
+        if gaps is not None:
+            _check_complete(values, [name for name in values if name not in gaps])
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
-    return values
+    return values, remarks
 
 
-def _there(table: "pd.DataFrame") -> str:
-    return f"the log has {listed(map(str, table.columns))}"
+def _check_complete(values: Mapping[str, Array], quantities: Sequence[str]) -> None:
+    for quantity in quantities:
+        if (unknown := np.isnan(values[quantity])).any():
+            row = int(np.argmax(unknown)) + 1
+            raise ValueError(f"column {column_name(quantity)!r} has no value (NaN) in row {row}")
 
 
-def _find(table: "pd.DataFrame", mapping: Mapping[str, str]) -> dict[str, tuple[str, float]]:
-    """(column, factor) of each quantity: as mapped, else by our names."""
-    found: dict[str, tuple[str, float]] = {}
-    for ours, theirs in mapping.items():
-        quantity, factor = quantity_of(ours)
-        if quantity in found:
-            raise ValueError(f"{quantity} is mapped twice")
-        if theirs not in table.columns:
-            raise ValueError(f"no column {theirs!r} for {ours}; {_there(table)}")
-        found[quantity] = theirs, factor
-    for quantity, units in COLUMNS.items():
-        names = [f"{quantity}_{unit}" for unit in units if f"{quantity}_{unit}" in table.columns]
-        if quantity in found or not names:
-            continue
-        if len(names) > 1:
-            raise ValueError(f"{quantity} is given twice, as {' and '.join(names)}")
-        found[quantity] = names[0], quantity_of(names[0])[1]
-    return found
+def _there(table: Table) -> str:
+    return f"the log has {listed(table.names)}"
 
 
-def _numbers(table: "pd.DataFrame", name: str) -> Array:
-    """A column as float64; ValueError names the first value that is no finite number."""
+def _match(name: str, unit: str) -> str:
+    """Our name of a file's column, in whatever case, with its unit in it, in brackets or beside it;
+    "" where it is none of ours."""
+    folded = name.casefold()
+    if folded not in _NAMES:
+        base, _, bracket = folded.rstrip("])").replace("(", "[").partition("[")
+        folded = f"{re.sub('[ -]+', '_', base.strip())}_{find_unit(bracket) or unit}"
+    return folded if folded in _NAMES else ""
+
+
+def _find(
+    table: Table, mapping: Mapping[str, str], remarks: list[str]
+) -> dict[str, tuple[int, str]]:
+    """(place, our name) of each quantity's column: as mapped, else by our names, else by names and
+    units; adds to the remarks."""
+    names, quantities = [str(name) for name in table.frame.columns], set()
+    for name, column in mapping.items():
+        if column.casefold() not in map(str.casefold, names):
+            raise ValueError(f"no column {column!r} for {name}; {_there(table)}")
+        if quantity_of(name)[0] in quantities:
+            raise ValueError(f"{quantity_of(name)[0]} is mapped twice")
+        quantities.add(quantity_of(name)[0])
+    best: dict[str, tuple[int, list[tuple[int, str]]]] = {}
+    for place, (label, unit) in enumerate(zip(names, table.units, strict=True)):
+        match = _match(label, unit)
+        options = [(name, 0) for name, c in mapping.items() if c.casefold() == label.casefold()]
+        for name, level in (*options, (match, 1 if match == label.casefold() else 2)):
+            quantity = quantity_of(name)[0] if name else ""
+            if name and level < best.get(quantity, (3,))[0]:
+                best[quantity] = level, [(place, name)]
+            elif name and level == best[quantity][0]:
+                best[quantity][1].append((place, name))
+    columns = {}
+    for quantity, (level, ((place, name), *others)) in best.items():
+        label, unit = names[place], table.units[place]
+        own_unit = name.replace("degnorth", "deg").removeprefix(f"{quantity}_").split("_")[0]
+        if unit not in ("", "count", own_unit):
+            if level:
+                raise ValueError(
+                    f"{label} has the unit {unit} in the file; --map {quantity}_{unit}={label} or "
+                    f"--map {name}={label} says which it is"
+                )
+            remarks.append(f"{label} is read as {name}, though its unit in the file is {unit}.")
+        for other, alias in others:
+            if alias != name:
+                raise ValueError(f"{quantity} is given twice, as {name} and {alias}")
+            if not table.frame.iloc[:, place].equals(table.frame.iloc[:, other]):
+                raise ValueError(
+                    f"{label} is given twice, in columns {place + 1} and {other + 1}, with other "
+                    "values; rename or delete one"
+                )
+            remarks.append(f"{label} is given twice, with the same values.")
+        columns[quantity] = place, name
+    return columns
+
+
+def _numbers(table: Table, place: int, name: str, remarks: list[str]) -> Array:
+    """A column in SI units; ValueError names the first value that is no finite number. A time that
+    is far off in its unit, but not in another since 1970, is read in that, which is remarked."""
     import pandas as pd
 
-    column = table[name]
+    column, label = table.frame.iloc[:, place], str(table.frame.columns[place])
     for kind in ("datetime64_any", "timedelta64", "bool"):
         if getattr(pd.api.types, f"is_{kind}_dtype")(column.dtype):
-            raise ValueError(f"column {name!r} holds {column.dtype}; expected numbers")
+            raise ValueError(f"column {label!r} holds {column.dtype}; expected numbers")
     numbers = column
     if not pd.api.types.is_numeric_dtype(column.dtype):
         try:
             numbers = pd.to_numeric(column, errors="coerce")
         except OverflowError as error:
-            raise ValueError(f"column {name!r}: expected numbers, got {error}") from None
-    values = np.asarray(numbers.to_numpy(np.float64, na_value=np.nan))
-    bad = (np.abs(values) > _LARGEST) | (np.isnan(values) & column.notna().to_numpy())
-    if bad.any():
+            raise ValueError(f"column {label!r}: expected numbers, got {error}") from None
+    values = np.array(numbers.to_numpy(np.float64, na_value=np.nan))
+    quantity, factor = quantity_of(name)
+    if quantity == "time" and abs(values[0]) * factor > 1e11:
+        for unit, scale in COLUMNS["time"].items():
+            if 3e8 < values[0] * scale < 4e9:
+                factor = scale
+                remarks.append(f"{label} is read in {unit} since 1970; no other unit fits.")
+    values *= factor
+    if name.startswith("course_degnorth"):
+        values += _NORTH
+    is_none = np.isinf(values) | (np.isnan(values) & column.notna().to_numpy())
+    if (bad := is_none | (np.abs(values) > _LARGEST)).any():
         row = int(np.argmax(bad))
-        text = brief(str(column.iloc[row]))
-        raise ValueError(f"column {name!r}, row {row + 1}: expected a number, got {text}")
+        text, expected = str(column.iloc[row]), f"a number up to {_LARGEST / abs(factor):g}"
+        if is_none[row]:
+            expected = "a number" + " with a decimal point alone" * ("," in text)
+        raise ValueError(f"column {label!r}, row {row + 1}: expected {expected}, got {brief(text)}")
     return values

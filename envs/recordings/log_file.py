@@ -11,6 +11,7 @@ from ..sensors.link import SlowSensor
 from ..sensors.slow import SLOW_NAMES
 from ..ticks import TICK
 from .columns import COLUMNS, column_name, parse_mapping, read_quantities
+from .samples import SENSORS, SLOW_QUANTITIES, TRUTH
 
 __all__ = ["COLUMNS", "NEEDED", "column_name", "packet_rows", "parse_mapping", "read_log"]
 
@@ -26,12 +27,7 @@ _SAMPLED = {  # column of the record: quantity of the log
     "wheel_right": "wheel_right",
 }
 _INPUTS = ("steer", "torque_left", "torque_right", "steer_command", "accel_command", "curvature")
-_SLOW = {  # the values of a packet, as in SLOW_VALUES; the first tells where there is a sample
-    "camera": ("camera_psi", "camera_y_l"),
-    "gps": ("course", "gps_speed", "gps_x", "gps_y", "gps_hdop", "gps_satellites"),
-}
-SLOW_QUANTITIES = {*_SLOW["camera"], *_SLOW["gps"]}
-GAPS = {"sideslip", "speed_y", *SLOW_QUANTITIES}
+GAPS = {*TRUTH, *SLOW_QUANTITIES}
 """Quantities that need not be known in every row."""
 _GAP = 1.5  # steps of time
 _STILL = 1e-3  # of a step of time
@@ -61,16 +57,18 @@ def read_log(path: str | Path, mapping: Mapping[str, str] | None = None) -> Log:
     below the header.
     """
     source = Path(path)
-    values = read_quantities(source, mapping or {}, NEEDED, GAPS)
+    values, _ = read_quantities(source, mapping or {}, NEEDED, GAPS)
     try:
         return log_of(values, source)
     except ValueError as error:
         raise ValueError(f"{source}: {error}") from None
 
 
-def log_of(values: dict[str, Array], source: Path) -> Log:
-    """The log of quantities in SI units, (n,) each; ValueError for a bad clock."""
-    first, dt = clock_of(values["time"])
+def log_of(values: dict[str, Array], source: Path, dt: float | None = None) -> Log:
+    """The log of quantities in SI units, (n,) each, with the dt of its clock, or this one in s;
+    ValueError for a bad clock."""
+    dt = clock_of(values["time"])[1] if dt is None else dt
+    first = max(round(float(values["time"][0]) / dt), 0)
     fast, present = _fast(values)
     packets, slow = _slow(values, first, dt)
     record = Record(fast, packets, first, dt, present)
@@ -146,8 +144,8 @@ def _fast(values: dict[str, Array]) -> tuple[Array, tuple[str, ...]]:
 def _slow(values: dict[str, Array], first: int, dt: float) -> tuple[Array, dict[str, SlowSensor]]:
     """The packets of all slow sensors and their clocks."""
     packets, clocks = [np.zeros((0, PACKET_WIDTH))], {}
-    for sensor, names in _SLOW.items():
-        if names[0] not in values:
+    for sensor, names in SENSORS.items():
+        if not np.isfinite(values.get(names[0], np.nan)).any():
             continue
         known = np.flatnonzero(np.isfinite(values[names[0]]))
         ticks = (first + known).astype(np.float64)

@@ -14,14 +14,21 @@ from dataclasses import dataclass, field
 from datetime import date
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from ..sensors.gps import COURSE_SPEED
-from .sentences import DECODED, Sentence, read_sentence, signed
+from .sentences import DECODED, Sentence, is_unchecked, read_sentence, signed
 
 LONGEST = 1024  # bytes of a sentence; the standard has 82, some vendors' are longer
 KNOT = 1852.0 / 3600.0  # m/s
 DAY = 86_400.0  # s
+HOUR = 3600.0  # s, from which a step forward is counted
+CONTINUOUS = 60.0  # s: a time of day within these goes on, whatever its date
+ROLLOVER = 7 * 1024  # days, after which a receiver's count of weeks begins anew
 _EPOCH = date(1970, 1, 1).toordinal()
+_FIRST = DAY * (date(1980, 1, 6).toordinal() - _EPOCH)  # s: GPS has no earlier date
 _NOT_MEASURED = (0, 6, 7)  # GGA's quality: no fix, dead reckoning, typed in
+_TIMED = ("GLL", "RMC", "GNS", "GGA")  # with a position
 
 
 class Epoch(NamedTuple):
@@ -59,12 +66,15 @@ class Counts:
     sentences: Counter[str] = field(default_factory=Counter)
     bad_checksum: int = 0
     truncated: int = 0
+    unchecked: int = 0
     overlong: int = 0
     emptied: Counter[str] = field(default_factory=Counter)
     epochs: int = 0
     without_fix: int = 0
     without_time: int = 0
     backward: int = 0
+    forward: int = 0
+    redated: int = 0
     repeated: int = 0
 
     def rows(self) -> list[tuple[str, int]]:
@@ -74,6 +84,7 @@ class Counts:
             *((f"sentences {name}", n) for name, n in sorted(self.sentences.items())),
             ("sentences with a bad checksum", self.bad_checksum),
             ("sentences cut short", self.truncated),
+            ("sentences without a checksum", self.unchecked),
             ("sentences overlong", self.overlong),
             ("sentences repeated in an epoch", self.repeated),
             ("bytes outside sentences", self.garbage),
@@ -82,23 +93,27 @@ class Counts:
             ("epochs without a fix", self.without_fix),
             ("epochs without a time", self.without_time),
             ("steps of time backward", self.backward),
+            ("steps of time forward by an hour or more", self.forward),
+            ("epochs dated by others", self.redated),
         ]
 
 
 class Decoder:
     """Decodes a stream of bytes, cut anywhere, into epochs; never raises on what it is fed.
 
-    An epoch is handed out with the sentence that completes it: motion (RMC or VTG) and GGA, and GSA
-    where GGA has no HDOP; an incomplete one when the next begins. At most `LONGEST` bytes and one
-    epoch are held.
+    An epoch is handed out with the sentence that completes it: motion (RMC or VTG) and GGA or GNS,
+    and GSA where these have no HDOP; an incomplete one when the next begins. Of several talkers the
+    first makes the epoch. At most `LONGEST` bytes and one epoch are held.
     """
 
     def __init__(self) -> None:
         self.counts = Counts()
         self._tail = b""  # a sentence that has not ended, from its "$"
         self._parts: dict[str, dict[str, Any]] = {}  # of the epoch, by type
+        self._next: dict[str, dict[str, Any]] = {}  # of the next one, before its time is known
         self._time: float | None = None  # of the epoch, s of the day
         self._sent = False
+        self._others: set[str] = set()  # talkers that repeat what the epoch has
         self._date = (0, math.nan)  # the newest day known, and the time of that day
         self._last, self._fix = math.nan, math.nan  # t of the newest epoch and the newest fix
         self._in_leap, self._leaps = False, 0
@@ -138,7 +153,9 @@ class Decoder:
         try:
             sentence = read_sentence(text)
         except ValueError:
-            self.counts.truncated += 1
+            unchecked = is_unchecked(text)
+            self.counts.unchecked += unchecked
+            self.counts.truncated += not unchecked
             return []
         if sentence is None:
             self.counts.bad_checksum += 1
@@ -149,53 +166,58 @@ class Decoder:
 
     def _take(self, sentence: Sentence) -> list[Epoch]:
         """Add a sentence to its epoch; those without a time belong to the one at hand."""
-        _, kind, values, _ = sentence
-        if kind not in DECODED:
-            return []
-        if kind == "GSV":
-            self._view[sentence.talker] = values.get("numSV", 0)
-            return []
+        talker, kind, values, _ = sentence
         done: list[Epoch] = []
-        time = values.get("time")
-        if kind in ("RMC", "GGA"):
-            other = None not in (time, self._time) and time != self._time
-            if kind in self._parts and time is not None and time == self._time:
+        time, same = values.get("time"), self._parts.get(kind)
+        if kind not in DECODED or (kind == "GLL" and time is None):
+            return done
+        if kind == "GSV":
+            self._view[talker] = values.get("numSV", 0)
+            return done
+        values = values | {"talker": talker}
+        if kind in _TIMED:
+            if same and time is not None and time == self._time:
                 self.counts.repeated += 1
-                return []
-            if other or kind in self._parts:
+                self._others |= {talker} - {same["talker"]}
+                return done
+            if same or (None not in (time, self._time) and time != self._time):
                 done = self._close()
-        elif kind in self._parts and self._sent:
-            self._close()
-        self._parts[kind] = values
-        self._time = self._time if time is None else time
+        elif same and self._sent:
+            if talker not in self._others:
+                self._next[kind] = values
+            return done
         if time is not None and "date" in values:
             self._date = values["date"].toordinal() - _EPOCH, time
-        has = self._parts
-        motion = "RMC" in has or "VTG" in has
-        if motion and "GGA" in has and ("HDOP" in has["GGA"] or "GSA" in has) and not self._sent:
+        if kind == "ZDA":
+            return done
+        self._parts[kind] = values
+        self._time = self._time if time is None else time
+        has = self._parts.keys()
+        hdop = "GSA" in has or any("HDOP" in part for part in self._parts.values())
+        if has & {"RMC", "VTG"} and has & {"GGA", "GNS"} and hdop and not self._sent:
             done.append(self._epoch())
         return done
 
     def _close(self) -> list[Epoch]:
         """End the epoch at hand: itself, if it was not handed out and is one."""
-        left = not self._sent and not self._parts.keys().isdisjoint(("RMC", "GGA"))
+        left = not self._sent and not self._parts.keys().isdisjoint(_TIMED)
         done = [self._epoch()] if left else []
-        self._parts, self._time, self._sent = {}, None, False
+        self._parts, self._next, self._time, self._sent = self._next, {}, None, False
+        self._others.clear()
         return done
 
     def _epoch(self) -> Epoch:
         self._sent = True
         t = math.nan if self._time is None else self._since_1970(self._time)
-        rmc, gga, gsa, vtg = (self._parts.get(kind, {}) for kind in ("RMC", "GGA", "GSA", "VTG"))
-        known = vtg | rmc | gga
-        flags = [rmc["status"] == "A"] if "status" in rmc else []
-        flags += [gga["quality"] not in _NOT_MEASURED] if "quality" in gga else []
+        known = {k: v for kind in DECODED for k, v in self._parts.get(kind, {}).items()}
+        flags = [known["status"] == "A"] if "status" in known else []
+        flags += [known["quality"] not in _NOT_MEASURED] if "quality" in known else []
         latitude, longitude = signed(known, "lat", "NS", "S"), signed(known, "lon", "EW", "W")
         fixed = bool(flags) and all(flags) and math.isfinite(latitude + longitude)
         knots = known.get("spd", known.get("sogn", known.get("sogk", math.nan) / 1.852))
         speed = KNOT * knots if fixed else math.nan
         north = known.get("cog", known.get("cogt", math.nan)) if fixed else math.nan
-        hdop = gga.get("HDOP", gsa.get("HDOP", 0.0))
+        hdop = known.get("HDOP", 0.0)
         self._fix = t if fixed else self._fix
         self.counts.epochs += 1
         self.counts.without_fix += not fixed
@@ -207,7 +229,7 @@ class Decoder:
             math.radians(math.remainder(90.0 - north, 360.0)),
             speed,
             hdop if hdop > 0.0 else math.nan,
-            gga.get("numSV", gsa.get("numSV", 0)),
+            known.get("numSV", 0),
             sum(self._view.values()),
             int(speed >= COURSE_SPEED and math.isfinite(north)),
             max(t - self._fix, 0.0),
@@ -221,5 +243,29 @@ class Decoder:
         self._in_leap = time >= DAY
         t = day * DAY + time + self._leaps
         self.counts.backward += t < self._last
+        self.counts.forward += t >= self._last + HOUR and (self._last >= _FIRST or t < _FIRST)
         self._last = t
         return t
+
+
+def mend_dates(epochs: list[Epoch]) -> list[Epoch]:
+    """Date a log's epochs alike where the day jumps while the time of day goes on.
+
+    Args:
+        epochs: Those of a whole log, as `Decoder` hands them out.
+
+    Returns:
+        The epochs by their last date, or one newer by whole rollovers. A real pause remains.
+    """
+    t = np.array([epoch.t for epoch in epochs])
+    rows = np.flatnonzero(np.isfinite(t))
+    step = np.diff(t[rows])
+    jump = np.rint(step / DAY)
+    dated = t[rows[:-1]] >= _FIRST
+    pause = dated & (jump != 0.0) & (np.abs(step - jump * DAY) > CONTINUOUS)
+    days = np.append(0.0, np.cumsum(np.where(pause, 0.0, jump)))
+    for part in np.split(np.arange(len(rows)), np.flatnonzero(pause) + 1):
+        later = days[part[-1:]] - days[part]
+        later += max(-later[later % ROLLOVER == 0.0], default=0.0)
+        t[rows[part]] += later * DAY
+    return [epoch._replace(t=float(new)) for epoch, new in zip(epochs, t, strict=True)]

@@ -9,10 +9,13 @@ import numpy as np
 
 from ..record import Array, Log
 from .columns import read_quantities
-from .log_file import GAPS, NEEDED, SLOW_QUANTITIES, clock_of, log_of
+from .log_file import GAPS, NEEDED, clock_of, log_of
+from .samples import LONGEST_GAP, SLOW_QUANTITIES
 
+URGENT = "WARNING: "  # begins a remark that concerns the result
 HOLE = 0.25  # s, the longest hole that is filled by interpolation
 LEAST = 2.0  # s, of a part
+_SAME_STEP = 1e-3  # of a step, by which those of parts may differ
 
 
 def read_parts(
@@ -23,29 +26,46 @@ def read_parts(
 ) -> tuple[list[Log], list[str]]:
     """Read a recorded drive as `read_log` does, but mend its clock: (whole drives, what was done).
 
-    Rows without a value in a column that must be complete, and rows whose time is not after that of
-    those before, are dropped. Holes up to `HOLE` s are filled by interpolation on an even clock;
-    longer ones, and a clock that is set back by more, divide the log, and parts under `LEAST` s are
-    left out. start, end: s after the first row, what is read. Raises what `read_log` does for all
-    else, and ValueError where no part is left.
+    Shuffled rows are sorted. Rows without a value in a column that must be complete, and rows whose
+    time is not after that of those before, are dropped; a file that has mostly such rows here and
+    there is refused. Holes up to `HOLE` s are filled by interpolation on an even clock; longer
+    ones, and a clock that is set back by more, divide the log, and parts under `LEAST` s are left
+    out. All parts have the dt of the longest; one without a slow sensor's sample lacks the sensor.
+    start, end: s after the first row, what is read. Raises what `read_log` does for all else, and
+    ValueError where no part is left.
     """
     source = Path(path)
-    values = read_quantities(source, mapping or {}, NEEDED, None)
-    known = np.all([np.isfinite(v) for name, v in values.items() if name not in GAPS], axis=0)
+    values, remarks = read_quantities(source, mapping or {}, NEEDED, None)
+    gaps = {name: np.isnan(v) for name, v in values.items() if name not in GAPS}
+    known = ~np.any(list(gaps.values()), axis=0)
     since = np.append(0.0, np.cumsum(np.maximum(np.diff(values["time"]), 0.0)))
     used = known & (since >= start) & (since < (math.inf if end is None else end))
+    count = int(np.count_nonzero(~known))
+    lost = "rows lack a value and were dropped"
     try:
+        if count > len(known) / 2:
+            names = ", ".join(name for name, gap in gaps.items() if gap.any())
+            lost = f"of {len(known)} rows lack a value of {names}"
+            if np.count_nonzero(known[1:] & known[:-1]) < np.count_nonzero(known) / 2:
+                regular = f"regular gaps up to {LONGEST_GAP:g} s could be filled"
+                raise ValueError(f"{count} {lost}; {regular}")
+            remarks, count = [f"{URGENT}{count} {lost} and were dropped.", *remarks], 0
         if np.count_nonzero(used) < 2:
             raise ValueError("fewer than two rows are complete, or are in the time asked for")
         pieces, done = _pieces({name: column[used] for name, column in values.items()})
-        logs = [log_of(piece, source) for piece in pieces]
+        dt = None
+        if len(pieces) > 1:
+            dt = clock_of(max((piece["time"] for piece in pieces), key=len))[1]
+            pieces = [_even(piece, dt, _SAME_STEP) for piece in pieces]
+        logs = [log_of(piece, source, dt) for piece in pieces]
     except ValueError as error:
         raise ValueError(f"{source}: {error}") from None
-    if len(logs) > 1:
-        named = enumerate(logs, 1)
-        logs = [dataclasses.replace(log, name=f"{log.name}, part {i}") for i, log in named]
-    done.append((int(np.count_nonzero(~known)), "rows lack a value and were dropped"))
-    return logs, [f"{count} {text}." for count, text in done if count]
+    remarks += [f"{count} {text}." for count, text in [*done, (count, lost)] if count]
+    sensors = set[str]().union(*(log.slow for log in logs))
+    for i, log in enumerate(logs if len(logs) > 1 else ()):
+        logs[i] = dataclasses.replace(log, name=f"{log.name}, part {i + 1}")
+        remarks += [f"Part {i + 1} has no sample of {name}." for name in sensors - log.slow.keys()]
+    return logs, remarks
 
 
 def _pieces(values: dict[str, Array]) -> tuple[list[dict[str, Array]], list[tuple[int, str]]]:
@@ -66,6 +86,11 @@ def _pieces(values: dict[str, Array]) -> tuple[list[dict[str, Array]], list[tupl
             continue
         holes += int(np.count_nonzero(np.diff(time[rows]) > 1.5 * usual))
         pieces.append(_even({name: column[rows] for name, column in values.items()}, usual))
+    if dropped > len(time) / 2:
+        raise ValueError(
+            f"time stands still or steps back in {dropped} of {len(time)} rows: have its stamps "
+            "lost digits?"
+        )
     if not pieces:
         raise ValueError(f"no part of the log lasts {LEAST:g} s without a hole of {HOLE:g} s")
     return pieces, [
@@ -77,15 +102,16 @@ def _pieces(values: dict[str, Array]) -> tuple[list[dict[str, Array]], list[tupl
     ]
 
 
-def _even(values: dict[str, Array], dt: float) -> dict[str, Array]:
+def _even(values: dict[str, Array], dt: float, within: float = math.inf) -> dict[str, Array]:
     """The quantities on an even clock: interpolated, a slow sensor's samples in the nearest row;
-    those whose clock is even already as they are."""
+    those whose clock is even already, and within this share of dt, as they are."""
     time = values["time"]
     try:
-        clock_of(time)
-        return values
+        if abs(clock_of(time)[1] / dt - 1.0) <= within:
+            return values
     except ValueError:
-        even = np.linspace(time[0], time[-1], round((time[-1] - time[0]) / dt) + 1)
+        pass
+    even = np.linspace(time[0], time[-1], round((time[-1] - time[0]) / dt) + 1)
     found = {name: np.interp(even, time, column) for name, column in values.items()}
     for name in SLOW_QUANTITIES & values.keys():
         known = np.isfinite(values[name])

@@ -8,6 +8,7 @@ tunnel), while here that field alone is left out.
 import math
 import re
 from collections.abc import Iterator
+from datetime import date
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -19,13 +20,13 @@ with extra("wires", "decoding NMEA needs pynmeagps"):
     from pynmeagps.nmeatypes_core import NMEA_TALKERS
     from pynmeagps.nmeatypes_get import NMEA_PAYLOADS_GET
 
-DECODED = ("RMC", "VTG", "GGA", "GSA", "GSV")
+DECODED = ("GLL", "GSA", "VTG", "RMC", "GNS", "GGA", "GSV", "ZDA")  # later ones overrule
+_NO_FIX = "NEMS"  # modes of GNS: none, dead reckoning, typed in, simulated
 VENDOR, OTHER = "of vendors", "other"
-_SKIPPED = ("GLL",)
 _RANGES = {
     "lat": (0.0, 90.0), "lon": (0.0, 180.0), "cog": (0.0, 360.0), "cogt": (0.0, 360.0),
     "spd": (0.0, 1e4), "sogn": (0.0, 1e4), "sogk": (0.0, 1e4), "HDOP": (0.0, 1e4),
-    "numSV": (0, 999), "quality": (0, 9),
+    "numSV": (0, 999), "quality": (0, 9), "year": (1980, 9999), "month": (1, 12), "day": (1, 31),
 }  # fmt: skip
 _ANY = (-1e12, 1e12)
 _TIME = re.compile(r"(\d\d)(\d\d)(\d\d(?:\.\d*)?)", re.ASCII)
@@ -37,7 +38,7 @@ class Sentence(NamedTuple):
     talker: str
     """The system: GP, GL, GN, ..."""
     kind: str
-    """One of `DECODED`, GLL, `VENDOR` or `OTHER`."""
+    """One of `DECODED`, `VENDOR` or `OTHER`."""
     values: dict[str, Any]
     """The fields that hold something, by pynmeagps's names; empty for a kind not in `DECODED`."""
     bad: list[str]
@@ -52,11 +53,9 @@ def read_sentence(text: bytes) -> Sentence | None:
         raise ValueError("the sentence is cut short or no text") from None
     if calc_checksum(content) != checksum.strip().upper():
         return None
-    if talker == "P" or kind not in (*DECODED, *_SKIPPED):
+    if talker == "P" or kind not in DECODED:
         return Sentence("", VENDOR if talker == "P" else OTHER, {}, [])
     talker = talker if talker in NMEA_TALKERS else ""
-    if kind in _SKIPPED:
-        return Sentence(talker, kind, {}, [])
     if kind == "GSV":  # a number of the signal may follow the satellites
         fields = fields[: 3 + (len(fields) - 3) // 4 * 4]
     used = {"numSV": sum(map(bool, fields[2:14]))} if kind == "GSA" else {}
@@ -68,7 +67,21 @@ def read_sentence(text: bytes) -> Sentence | None:
                 found.bad.append(name)
             else:
                 found.values[name] = value
+    if kind == "GNS":
+        found.values["quality"] = int(bool(set(found.values.get("posMode", "N")) - set(_NO_FIX)))
+    if kind == "ZDA" and {"year", "month", "day"} <= found.values.keys():
+        try:
+            found.values["date"] = date(*(found.values[name] for name in ("year", "month", "day")))
+        except ValueError:
+            found.bad.append("day")
     return found
+
+
+def is_unchecked(text: bytes) -> bool:
+    """Whether a sentence of `DECODED` lacks its checksum alone; its last two fields are newer."""
+    address, *fields = text.split(b",")
+    kind = address[2:].decode("ascii", "replace")
+    return b"*" not in text and kind in DECODED and len(fields) >= len(_forms(kind)) - 2
 
 
 def signed(values: dict[str, Any], name: str, side: str, negative: str) -> float:

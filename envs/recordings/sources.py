@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 BAUD = 4800  # of NMEA 0183
 PAUSE = 0.5  # s without a byte after which b"" is handed out
 _MOST = 65_536  # bytes of a chunk, and those that show what a file holds
-_LINE = re.compile(rb"\$[A-Z]{3,6},[^$*\r\n]*\*[0-9A-Fa-f]{2}")
+_LINE = re.compile(rb"\$(?:[A-Z]{2}(?:RMC|GGA|GNS|GLL),|[A-Z]{3,6},[^$*\r\n]*\*[0-9A-Fa-f]{2})")
 
 
 class Line(NamedTuple):
@@ -109,28 +109,31 @@ def is_nmea(path: str | Path) -> bool:
 
 
 def read_nmea(path: str | Path) -> tuple[list["Epoch"], "Counts"]:
-    """All epochs of a file, and what was found in it (needs the extra `wires`).
+    """All epochs of a file, their dates mended, and what was found in it (extra `wires`).
 
     Raises FileNotFoundError, and ValueError, with the path, for a folder and a file that is empty,
     has no valid sentence, or no epoch with a fix and a time.
     """
-    from .nmea import Decoder
+    from .nmea import Decoder, mend_dates
 
-    decoder, epochs = Decoder(), []
+    decoder, sent = Decoder(), []
     for chunk in open_source(str(Path(path).absolute())):
-        epochs += decoder.feed(chunk)
-    epochs += decoder.finish()
-    counts = decoder.counts
+        sent += decoder.feed(chunk)
+    sent += decoder.finish()
+    epochs, counts = mend_dates(sent), decoder.counts
+    counts.redated = sum(abs(new.t - old.t) > 0.0 for new, old in zip(epochs, sent, strict=True))
     if not counts.received:
         raise ValueError(f"{path}: the file is empty")
     if not counts.sentences:
-        wrong = counts.bad_checksum, counts.truncated, counts.overlong
         raise ValueError(
-            f"{path}: no valid NMEA sentence in {counts.received} bytes; {wrong[0]} with a bad "
-            f"checksum, {wrong[1]} cut short, {wrong[2]} overlong"
+            f"{path}: no valid NMEA sentence in {counts.received} bytes; {counts.bad_checksum} "
+            f"with a bad checksum, {counts.unchecked} without a checksum, "
+            f"{counts.truncated} cut short, {counts.overlong} overlong"
         )
     if not any(epoch.fixed and epoch.t == epoch.t for epoch in epochs):
-        raise ValueError(f"{path}: none of {len(epochs)} epochs has a fix and a time")
+        lacks = "both a fix and a time" if any(epoch.fixed for epoch in epochs) else "a fix"
+        kinds = ", ".join(f"{n} {kind}" for kind, n in sorted(counts.sentences.items()))
+        raise ValueError(f"{path}: none of {len(epochs)} epochs has {lacks}; sentences: {kinds}")
     return epochs, counts
 
 

@@ -1,22 +1,38 @@
 """Tables on disk, as they stand there: CSV, Parquet, MATLAB and MDF."""
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from ..backend.extras import extra
+from .dialect import find_unit, read_text
 
 if TYPE_CHECKING:
     import pandas as pd
 
 
-def read_table(path: Path) -> "pd.DataFrame":
+class Table(NamedTuple):
+    """A file's columns as they stand there.
+
+    frame: the values; names may repeat. units: what the file says beside a column's name, "" for
+    nothing. names: of all columns; an MDF's frame has only those that are wanted. remarks: what the
+    file was taken for.
+    """
+
+    frame: "pd.DataFrame"
+    units: list[str]
+    names: list[str]
+    remarks: list[str]
+
+
+def read_table(path: Path, is_wanted: Callable[[str], bool]) -> Table:
     """The file's columns as they stand there.
 
-    CSV (comma, semicolon or tab), Parquet, MATLAB or MDF (needs `asammdf`), recognised by content.
-    Raises ModuleNotFoundError without the extra, FileNotFoundError, and ValueError where the file
-    is no table.
+    Text of any dialect, Parquet, MATLAB or MDF (needs `asammdf`), recognised by content. is_wanted:
+    whether a column's name is one that is looked for. Raises ModuleNotFoundError without the extra,
+    FileNotFoundError, and ValueError where the file is no table.
     """
     with extra("report", "reading a log needs pandas"):
         import pandas as pd
@@ -24,30 +40,20 @@ def read_table(path: Path) -> "pd.DataFrame":
         raise FileNotFoundError(f"{path}: there is no such file")
     if not path.is_file():
         raise ValueError(f"{path}: expected a file, found a folder")
-    with path.open("rb") as stream:
-        head = stream.read(65536)
-    if not head.strip():
+    data = path.read_bytes()
+    if not data[:65536].strip():
         raise ValueError(f"{path}: the file is empty")
+    units: list[str] = []
+    remarks: list[str] = []
     try:
-        if head.startswith(b"PAR1"):
-            table = pd.read_parquet(path)
-        elif head.startswith(b"MATLAB"):
-            table = _matlab(path, head)
-        elif head.startswith(b"MDF "):
-            table = _mdf(path)
-        elif b"\0" in head:
-            raise ValueError("it is a binary file")
+        if data.startswith(b"MDF "):
+            return _mdf(path, is_wanted)
+        if data.startswith(b"PAR1"):
+            frame = pd.read_parquet(path)
+        elif data.startswith(b"MATLAB"):
+            frame = _matlab(path, data)
         else:
-            title = head.splitlines()[0].decode("utf-8-sig")
-            table = pd.read_csv(
-                path,
-                sep=max(",;\t", key=title.count),
-                encoding="utf-8-sig",
-                index_col=False,
-                skipinitialspace=True,
-                low_memory=False,
-                compression=None,
-            )
+            frame, units, remarks = read_text(data, is_wanted)
     except (MemoryError, ImportError):
         raise
     except Exception as error:  # of scipy and asammdf anything, where a file is damaged
@@ -56,7 +62,8 @@ def read_table(path: Path) -> "pd.DataFrame":
         raise ValueError(
             f"{path}: expected CSV, Parquet, MATLAB or MDF, but {reason:.300}"
         ) from None
-    return table.rename(columns=lambda name: str(name).strip())
+    names = [str(name).strip() for name in frame.columns]
+    return Table(frame.set_axis(names, axis=1), units or [""] * len(names), names, remarks)
 
 
 def _matlab(path: Path, head: bytes) -> "pd.DataFrame":
@@ -76,10 +83,32 @@ def _matlab(path: Path, head: bytes) -> "pd.DataFrame":
     return pd.DataFrame({name: each for name, each in columns.items() if len(each) == most})
 
 
-def _mdf(path: Path) -> "pd.DataFrame":
-    """All channels on the clock of the fastest, which becomes `time_s`."""
+def _mdf(path: Path, is_wanted: Callable[[str], bool]) -> Table:
+    """The wanted channels in rows at the stamps of all their groups, NaN where a group has none."""
     with extra("mdf", "reading MDF needs asammdf"):
         from asammdf import MDF
+    import pandas as pd
+
+    chosen: dict[str, tuple[int, int]] = {}
+    columns, units = {}, ["s"]
     with MDF(path) as file:
-        table: pd.DataFrame = file.to_dataframe()
-    return table.rename_axis("time_s").reset_index()
+        for name, entries in file.channels_db.items():
+            places = [place for place in entries if file.masters_db.get(place[0]) != place[1]]
+            labels = [f"{name} (group {g})" if len(places) > 1 else name for g, _ in places]
+            wanted = [item for item in zip(labels, places, strict=True) if is_wanted(item[0])]
+            if not wanted and len(places) > 1 and is_wanted(name):
+                raise ValueError(f"channels share a name; --map one of {', '.join(labels)}")
+            chosen.update(wanted)
+        signals = file.select(
+            [(None, *place) for place in chosen.values()],
+            ignore_value2text_conversions=True,
+            validate=True,
+        )
+        names = list(file.channels_db)
+    for name, signal in zip(chosen, signals, strict=True):
+        if signal.samples.ndim == 1 and signal.samples.dtype.kind in "fiub" and name != "time_s":
+            column = pd.Series(signal.samples, signal.timestamps)
+            columns[name] = column[~column.index.duplicated()]
+            units.append(find_unit(signal.unit))
+    frame = pd.concat(columns, axis=1, sort=True) if columns else pd.DataFrame()
+    return Table(frame.rename_axis("time_s").reset_index(), units, names, [])

@@ -29,7 +29,7 @@ class Drawn:
     engine wrote and changes nothing of it. The strip charts begin at an episode's first picture.
 
     Raises ValueError for an unknown mode; with the first picture ModuleNotFoundError where pygame
-    is missing, RuntimeError where there is no display, ResetNeeded where there was no reset.
+    is missing, ResetNeeded where there was no reset. Without a display a window warns once.
     """
 
     _our_tyres = True  # tyre forces can be drawn

@@ -3,6 +3,8 @@
 import functools
 import os
 
+import gymnasium as gym
+
 from .canvas import pygame
 
 _NO_WINDOW = ("offscreen", "dummy")  # SDL's drivers that show nothing
@@ -22,20 +24,20 @@ def _opened(size: tuple[int, int]) -> pygame.Surface:
         screen = pygame.display.set_mode(size)
     except pygame.error as error:
         close()
-        raise RuntimeError(
-            f"render_mode='human' opens a window, and there is no display ({error}): use "
-            "render_mode='rgb_array', whose frames gymnasium.wrappers.RecordVideo writes to a "
-            "file, or set SDL_VIDEODRIVER=dummy"
-        ) from None
+        if os.environ.get("SDL_VIDEODRIVER") in _NO_WINDOW:
+            raise
+        gym.logger.warn(
+            f"there is no display ({error}): what render_mode='human' draws is not shown; "
+            "render_mode='rgb_array' returns frames"
+        )
+        os.environ["SDL_VIDEODRIVER"] = "dummy"
+        return _opened(size)
     pygame.display.set_caption("sideslip")
     return screen
 
 
 def show(picture: pygame.Surface, rate: float) -> None:
-    """Show a picture, no sooner than 1 / rate seconds after the last one.
-
-    Raises RuntimeError where there is no display.
-    """
+    """Show a picture, no sooner than 1 / rate seconds after the last one."""
     screen = pygame.display.get_surface() or _opened(picture.get_size())
     screen.blit(picture, (0, 0))
     pygame.event.pump()

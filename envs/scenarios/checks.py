@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping, Sequence
 from typing import Any
 
 from ..arguments import brief, check_choice, is_finite, listed, unknown_names
@@ -36,6 +36,7 @@ _CHOICES = {
 _PARAMETERS = [each.name for each in dataclasses.fields(Vehicle)]
 _FLAGS = ("mirror", "small_angle", "lags", "roll")
 _NUMBERS_OR_NONE = ("acceleration", "gps_period")
+_DRAWS_OR_NONE = ("path_speed", "friction_right", "tyre_change_time")
 _MAY_BE_INFINITE = ("half_width", "camera_heading", "camera_offset")
 _TIMES_OR_NONE = {  # how many
     "camera_delays": (1, 2, 3, 4),
@@ -43,42 +44,21 @@ _TIMES_OR_NONE = {  # how many
     "camera_outage": (2,),
     "gps_outage": (2,),
 }
-_POSITIVE = (
-    "disturbance_time",
-    "curve_ramp",
-    "half_width",
-    "camera_heading",
-    "camera_offset",
-    "surge_frequency",
-    "hdop",
-    "hdop_time",
-    "driver_preview",
-    "driver_gain",
-    "driver_rate",
-)
-_POSITIVE_DRAWS = (
-    "frequency",
-    "frequency_3",
-    "front_stiffness",
-    "rear_stiffness",
-    "friction",
-    "front_change",
-    "rear_change",
-)
-_POSITIVE_OR_NONE = ("path_speed", "friction_right", "tyre_change_time")
 
 
-def check(fields: Fields, numbers: Iterable[str]) -> None:
+def check(fields: Fields, entries: Sequence[dataclasses.Field[Any]]) -> None:
     """ValueError for a field out of place, TypeError for a vehicle's parameter that there is not,
-    with the scenario's name and the field's.
+    with the scenario's name and the field's. What is plausible above zero alone is positive.
 
-    numbers: the fields that are one number, neither drawn nor None.
+    entries: the dataclass's. Those of type float are one number, neither drawn nor None.
     """
+    numbers = [each.name for each in entries if each.type is float]
+    positive = {each.name for each in entries if each.metadata.get("plausible", (0,))[0] > 0}
     try:
         _check_names(fields)
         _check_mappings(fields)
-        _check_numbers(fields, numbers)
-        _check_draws(fields)
+        _check_numbers(fields, numbers, positive)
+        _check_draws(fields, positive)
         _check_motion(fields)
         _check_sensors(fields)
         _check_trace(fields)
@@ -138,7 +118,7 @@ def _check_number(name: str, value: Any) -> None:
         raise ValueError(f"{name} {brief(value)} is not finite")
 
 
-def _check_numbers(fields: Fields, numbers: Iterable[str]) -> None:
+def _check_numbers(fields: Fields, numbers: Iterable[str], positive: Container[str]) -> None:
     for name in numbers:
         if name not in _MAY_BE_INFINITE:
             _check_number(name, fields[name])
@@ -150,8 +130,8 @@ def _check_numbers(fields: Fields, numbers: Iterable[str]) -> None:
     for name in ("camera_heading", "camera_offset"):
         if not (isinstance(fields[name], float) and fields[name] == math.inf):
             _check_number(name, fields[name])
-    for name in _POSITIVE:
-        if not fields[name] > 0.0:
+    for name in numbers:
+        if name in positive and not fields[name] > 0.0:
             raise ValueError(f"{name} must be positive, got {fields[name]!r}")
     if fields["duration"] < TICK:
         raise ValueError(f"duration {fields['duration']!r} s is less than {TICK}")
@@ -159,18 +139,17 @@ def _check_numbers(fields: Fields, numbers: Iterable[str]) -> None:
         raise ValueError(f"driver_lag is zero or more, got {fields['driver_lag']!r}")
 
 
-def _check_draws(fields: Fields) -> None:
+def _check_draws(fields: Fields, positive: Container[str]) -> None:
     for name in Draws._fields:
-        if name in SIDES or (name in _POSITIVE_OR_NONE and fields[name] is None):
+        if name in SIDES or (name in _DRAWS_OR_NONE and fields[name] is None):
             continue
         value = fields[name]
         ends = value if isinstance(value, tuple) else (value, value)
         if not (len(ends) == 2 and all(map(is_finite, ends)) and ends[0] <= ends[1]):
             raise ValueError(f"{name} {brief(value)} is not finite, or its ends are swapped")
-        if name in _POSITIVE_OR_NONE and ends[0] <= 0.0:
-            raise ValueError(f"{name} must be positive or None, got {value!r}")
-        if name in _POSITIVE_DRAWS and ends[0] <= 0.0:
-            raise ValueError(f"{name} must be positive, got {value!r}")
+        if name in positive and ends[0] <= 0.0:
+            none = " or None" if name in _DRAWS_OR_NONE else ""
+            raise ValueError(f"{name} must be positive{none}, got {value!r}")
     for name in ("front_change", "rear_change"):
         if fields["tyre_change_time"] is None and range_of(fields[name]) != (1.0, 1.0):
             raise ValueError(

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..documents import write_document
+from ..quantities import quantity
 from ..record import Array
 from .checks import SIDES, check
 from .draws import DRAWS_WIDTH, KMH, Draws, Range, range_of
@@ -17,7 +18,8 @@ from .draws import DRAWS_WIDTH, KMH, Draws, Range, range_of
 
 @dataclass(frozen=True, kw_only=True)
 class Scenario:
-    """What happens in an episode. Ranges are drawn by the seed; SI units.
+    """What happens in an episode. Ranges are drawn by the seed; SI units, in plausible
+    ranges, which environments check unless `strict=False`.
 
     An episode is `duration` s long. Steering is a kind of `STEERING_KINDS`, built from onset,
     amplitude, frequency (random: two pairs of sines, of amplitude and amplitude_2, of frequency,
@@ -80,71 +82,71 @@ class Scenario:
     """
 
     name: str
-    duration: float = 10.0
+    duration: float = quantity("s", 0, 3600, default=10.0)
     steering: str = "straight"
     trace: tuple[float, ...] = ()
-    trace_step: float = 0.01
+    trace_step: float = quantity("s", 0, 10, default=0.01)
     onset: Range = 0.0
-    amplitude: Range = 0.0
-    amplitude_2: Range = 0.0
-    frequency: Range = 0.5
-    frequency_2: Range = 0.5
-    frequency_3: Range = 0.5
-    frequency_4: Range = 0.5
+    amplitude: Range = quantity("rad", -1.6, 1.6, default=0.0)
+    amplitude_2: Range = quantity("rad", -1.6, 1.6, default=0.0)
+    frequency: Range = quantity("Hz", 1e-4, 50, default=0.5)
+    frequency_2: Range = quantity("Hz", 0, 50, default=0.5)
+    frequency_3: Range = quantity("Hz", 1e-4, 50, default=0.5)
+    frequency_4: Range = quantity("Hz", 0, 50, default=0.5)
     hold: Range = 1.5
     mirror: bool = False
     path: str = "road"
-    path_speed: Range | None = None
-    driver_preview: float = 0.8
-    driver_gain: float = 1.0
-    driver_lag: float = 0.1
-    driver_rate: float = 0.8
-    initial_beta: Range = 0.0
-    initial_gamma: Range = 0.0
-    speed: Range = 25.0 * KMH
-    acceleration: float | None = None
-    speed_change: float = 0.0
+    path_speed: Range | None = quantity("m/s", 0.01, 120, default=None)
+    driver_preview: float = quantity("s", 0.01, 20, default=0.8)
+    driver_gain: float = quantity("-", 1e-12, 100, default=1.0)
+    driver_lag: float = quantity("s", 0, 5, default=0.1)
+    driver_rate: float = quantity("rad/s", 0.001, 100, default=0.8)
+    initial_beta: Range = quantity("rad", -1.6, 1.6, default=0.0)
+    initial_gamma: Range = quantity("rad/s", -10, 10, default=0.0)
+    speed: Range = quantity("m/s", 0, 120, default=25.0 * KMH)
+    acceleration: float | None = quantity("m/s2", -50, 50, default=None)
+    speed_change: float = quantity("m/s", -120, 120, default=0.0)
     change_start: float = 0.0
-    change_length: float = 10.0
-    surge: float = 0.0
-    surge_frequency: float = 0.1
-    friction: Range = 0.9
-    friction_right: Range | None = None
-    front_stiffness: Range = 1.0
-    rear_stiffness: Range = 1.0
-    tyre_change_time: Range | None = None
-    front_change: Range = 1.0
-    rear_change: Range = 1.0
-    wind_force: Range = 0.0
-    wind_arm: Range = 0.0
+    change_length: float = quantity("s", 0, 3600, default=10.0)
+    surge: float = quantity("m/s2", -50, 50, default=0.0)
+    surge_frequency: float = quantity("Hz", 1e-4, 50, default=0.1)
+    friction: Range = quantity("-", 0.02, 2.5, default=0.9)
+    friction_right: Range | None = quantity("-", 0.02, 2.5, default=None)
+    front_stiffness: Range = quantity("-", 0.01, 20, default=1.0)
+    rear_stiffness: Range = quantity("-", 0.01, 20, default=1.0)
+    tyre_change_time: Range | None = quantity("s", 1e-12, math.inf, default=None)
+    front_change: Range = quantity("-", 0.01, 20, default=1.0)
+    rear_change: Range = quantity("-", 0.01, 20, default=1.0)
+    wind_force: Range = quantity("N", -1e5, 1e5, default=0.0)
+    wind_arm: Range = quantity("m", -10, 10, default=0.0)
     wind_start: Range = 0.0
     wind_length: Range = 0.0
-    wind_height: float = 0.0
-    disturbance_force: float = 50.0
-    disturbance_moment: float = 20.0
-    disturbance_time: float = 0.3
+    wind_height: float = quantity("m", -10, 10, default=0.0)
+    disturbance_force: float = quantity("N", -1e5, 1e5, default=50.0)
+    disturbance_moment: float = quantity("N m", -1e5, 1e5, default=20.0)
+    disturbance_time: float = quantity("s", 1e-12, math.inf, default=0.3)
     road: str = "straight"
-    curvature: Range = 0.0
+    curvature: Range = quantity("1/m", -2, 2, default=0.0)
     curve_start: float = 20.0
-    curve_ramp: float = 20.0
+    curve_ramp: float = quantity("m", 1e-12, math.inf, default=20.0)
     bank: Range = 0.0
     grade: float = 0.0
-    half_width: float = 50.0
-    camera_delays: tuple[float, ...] | None = None
-    camera_jitter: float = 0.0
+    half_width: float = quantity("m", 0.01, math.inf, default=50.0)
+    camera_delays: tuple[float, ...] | None = quantity("s", 0, 5, default=None)
+    camera_jitter: float = quantity("s", 0, 5, default=0.0)
     camera_loss: float = 0.0
-    camera_heading: float = math.inf
-    camera_offset: float = math.inf
+    camera_heading: float = quantity("rad", 0.001, math.inf, default=math.inf)
+    camera_offset: float = quantity("m", 0.001, math.inf, default=math.inf)
     camera_outage: tuple[float, float] | None = None
-    gps_period: float | None = None
-    gps_delays: tuple[float, ...] | None = None
+    gps_period: float | None = quantity("s", 0.05, 60, default=None)
+    gps_delays: tuple[float, ...] | None = quantity("s", 0, 30, default=None)
     gps_outage: tuple[float, float] | None = None
-    gps_latency: Range = 0.0
-    gyro_bias: Range = 0.0
-    accel_y_bias: Range = 0.0
-    hdop: float = 1.4
+    gps_latency: Range = quantity("s", 0, 30, default=0.0)
+    gyro_bias: Range = quantity("rad/s", -0.5, 0.5, default=0.0)
+    accel_y_bias: Range = quantity("m/s2", -10, 10, default=0.0)
+    hdop: float = quantity("-", 0.1, math.inf, default=1.4)
     hdop_spread: float = 0.5
-    hdop_time: float = 20.0
+    hdop_time: float = quantity("s", 0.001, math.inf, default=20.0)
     hdop_law: str = "half"
     small_angle: bool = False
     tyres: str = "fiala"
@@ -160,7 +162,7 @@ class Scenario:
             value = getattr(self, entry.name)
             if isinstance(value, list):
                 object.__setattr__(self, entry.name, tuple(value))
-        check(vars(self), [each.name for each in dataclasses.fields(self) if each.type is float])
+        check(vars(self), dataclasses.fields(self))
 
     def range(self, name: str) -> tuple[float, float]:
         """(low, high) of a drawn quantity; zeros where it is None."""

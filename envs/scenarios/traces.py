@@ -25,7 +25,7 @@ def trace_from(path: str | os.PathLike[str], mapping: Mapping[str, str] | None =
     that runs backward, stands still, jumps or is uneven.
     """
     source = Path(path)
-    values = read_quantities(source, mapping or {}, ("time", "steer"), {"speed_x"})
+    values, _ = read_quantities(source, mapping or {}, ("time", "steer"), {"speed_x"})
     try:
         _, step = clock_of(values["time"])
     except ValueError as error:

@@ -8,6 +8,10 @@ from ..backend.primitives import select
 RUNNING, SPIN, OFF_ROAD, NOT_FINITE, BAD_ACTION, COLLISION, DEPARTURE = range(7)
 FAILURES = ("none", "spin", "off-road", "not-finite", "bad-action", "collision", "departure")
 REFUSED = -1
+WILD = 1 << 30
+"""Added to what a step returns where an action was beyond `FAR`."""
+FAR = 10.0
+"""An action beyond it, a share of full scale, is a mistake rather than a wish for all there is."""
 
 
 @jit

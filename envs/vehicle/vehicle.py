@@ -2,25 +2,17 @@
 
 import dataclasses
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 from ..arguments import LARGEST, brief, is_finite
+from ..quantities import quantity
 
 GRAVITY = 9.81
 LATERAL = ("mass", "yaw_inertia", "front_arm", "rear_arm", "front_stiffness", "rear_stiffness")
 """What a linear bicycle is made of, in the order of `linear.Bicycle`."""
+_POINTS = ("mass", "front_arm", "rear_arm")  # as inertia, that of two points over the axles
 
-
-def _unit(unit: str, text: str, default: float | None = None) -> Any:
-    metadata = {"unit": unit, "text": text}
-    if default is None:
-        return field(metadata=metadata)
-    return field(default=default, metadata=metadata)
-
-
-_MAY_BE_ZERO = ("motor_lag", "steering_lag", "motor_power", "transfer_height")
-_OF_ANY_SIGN = ("antenna_ahead", "antenna_left")
 _SMALLEST = 1.0 / LARGEST  # what is below is taken for zero: it is divided by
 
 
@@ -29,41 +21,42 @@ class Vehicle:
     """A car with two in-wheel motors at the rear axle.
 
     Cornering stiffness is per tyre, as in the papers (an axle has 2 C). Letters of the papers
-    stand in the descriptions: `Vehicle.__dataclass_fields__[name].metadata` has text and unit.
+    stand in the descriptions: `Vehicle.__dataclass_fields__[name].metadata` has text and unit,
+    and the plausible range that `vehicle_from` and environments go by.
 
     Raises ValueError on a value that is not finite or not positive (lags, motor_power and
     transfer_height may be zero, the antenna's place may be negative).
     """
 
     name: str = "vehicle"
-    mass: float = _unit("kg", "m")
-    yaw_inertia: float = _unit("kg m2", "I, about the vertical axis")
-    front_arm: float = _unit("m", "l_f, centre of gravity to front axle")
-    rear_arm: float = _unit("m", "l_r, centre of gravity to rear axle")
-    front_stiffness: float = _unit("N/rad", "C_f, one front tyre")
-    rear_stiffness: float = _unit("N/rad", "C_r, one rear tyre")
-    front_track: float = _unit("m", "d_f, between the front wheels")
-    rear_track: float = _unit("m", "d_r, between the rear wheels")
-    wheel_radius: float = _unit("m", "r")
-    gravity_height: float = _unit("m", "h, height of the centre of gravity")
-    motor_torque: float = _unit("N m", "T_max, limit of one motor")
-    motor_lag: float = _unit("s", "time constant of the motors", 0.005)
-    steering_lag: float = _unit("s", "time constant of the steering actuator", 0.03)
-    steering_stop: float = _unit("rad", "largest angle that steering adds up to", 0.6)
-    steering_authority: float = _unit("rad", "largest angle added to the driver's", 0.1)
-    steering_rate: float = _unit("rad/s", "how fast the added angle may change", 0.8)
-    preview: float = _unit("m", "l_pre, the camera's preview distance", 5.135)
-    friction: float = _unit("-", "mu, tyre to road (a scenario has its own)", 0.9)
-    width: float = _unit("m", "over all; the lanes of test tracks go by it", 1.8)
-    sprung_mass: float = _unit("kg", "M_s, the part of the mass that rolls")
-    roll_arm: float = _unit("m", "h_s, centre of gravity above the roll axis")
-    roll_inertia: float = _unit("kg m2", "I_x, about the roll axis")
-    roll_stiffness: float = _unit("N m/rad", "K_x, of the suspension")
-    roll_damping: float = _unit("N m s/rad", "C_x, of the suspension")
-    antenna_ahead: float = _unit("m", "GPS antenna ahead of the centre of gravity", 0.0)
-    antenna_left: float = _unit("m", "GPS antenna left of the centre of gravity", 0.0)
-    motor_power: float = _unit("W", "limit of one motor, driving and braking; 0: none", 0.0)
-    transfer_height: float = _unit("m", "at which drive force moves load between the axles", 0.0)
+    mass: float = quantity("kg", 0.01, 1e5, "m")
+    yaw_inertia: float = quantity("kg m2", 0.1, 10, "I, about the vertical axis", per=_POINTS)
+    front_arm: float = quantity("m", 0.01, 10, "l_f, centre of gravity to front axle")
+    rear_arm: float = quantity("m", 0.01, 10, "l_r, centre of gravity to rear axle")
+    front_stiffness: float = quantity("N/rad", 3, 600, "C_f, one front tyre", per=("mass",))
+    rear_stiffness: float = quantity("N/rad", 3, 600, "C_r, one rear tyre", per=("mass",))
+    front_track: float = quantity("m", 0.01, 5, "d_f, between the front wheels")
+    rear_track: float = quantity("m", 0.01, 5, "d_r, between the rear wheels")
+    wheel_radius: float = quantity("m", 0.005, 2, "r")
+    gravity_height: float = quantity("m", 0.005, 5, "h, height of the centre of gravity")
+    motor_torque: float = quantity("N m", 0.001, 5e4, "T_max, limit of one motor")
+    motor_lag: float = quantity("s", 0, 1, "time constant of the motors", 0.005)
+    steering_lag: float = quantity("s", 0, 1, "time constant of the steering actuator", 0.03)
+    steering_stop: float = quantity("rad", 0.01, 1.6, "largest angle that steering adds up to", 0.6)
+    steering_authority: float = quantity("rad", 0.001, 1.6, "largest added to the driver's", 0.1)
+    steering_rate: float = quantity("rad/s", 0.01, 30, "how fast the added angle may change", 0.8)
+    preview: float = quantity("m", 0.05, 200, "l_pre, the camera's preview distance", 5.135)
+    friction: float = quantity("-", 0.02, 2.5, "mu, tyre to road (a scenario has its own)", 0.9)
+    width: float = quantity("m", 0.01, 5, "over all; the lanes of test tracks go by it", 1.8)
+    sprung_mass: float = quantity("kg", 0.005, 1e5, "M_s, the part of the mass that rolls")
+    roll_arm: float = quantity("m", 0.001, 5, "h_s, centre of gravity above the roll axis")
+    roll_inertia: float = quantity("kg m2", 1e-7, 1e6, "I_x, about the roll axis")
+    roll_stiffness: float = quantity("N m/rad", 0.001, 1e8, "K_x, of the suspension")
+    roll_damping: float = quantity("N m s/rad", 1e-5, 1e7, "C_x, of the suspension")
+    antenna_ahead: float = quantity("m", -20, 20, "GPS antenna ahead of the centre of gravity", 0.0)
+    antenna_left: float = quantity("m", -20, 20, "GPS antenna left of the centre of gravity", 0.0)
+    motor_power: float = quantity("W", 0, 1e7, "limit of one motor, also braking; 0: none", 0.0)
+    transfer_height: float = quantity("m", 0, 5, "where drive force moves load between axles", 0.0)
 
     def __post_init__(self) -> None:
         for entry in dataclasses.fields(self):
@@ -75,9 +68,9 @@ class Vehicle:
             if not isinstance(value, int | float) or isinstance(value, bool):
                 raise TypeError(f"Vehicle.{entry.name}: expected a number, got {brief(value)}")
             least, low_ok = "positive and ", value > _SMALLEST
-            if entry.name in _MAY_BE_ZERO:
+            if entry.metadata["plausible"][0] == 0:
                 least, low_ok = "zero or more and ", value > _SMALLEST or value == 0.0
-            elif entry.name in _OF_ANY_SIGN:
+            elif entry.metadata["plausible"][0] < 0:
                 least, low_ok = "", True
             if not (is_finite(value) and low_ok):
                 got = f"{brief(value)} {entry.metadata['unit']}"

@@ -8,6 +8,7 @@ from typing import Any
 
 from ..arguments import brief, check_choice, is_finite, unknown_names
 from ..documents import is_document, read_document
+from ..quantities import check_plausible
 from .vehicle import COMS, LATERAL, PASSENGER_CAR, Vehicle
 
 VehicleSource = str | os.PathLike[str] | Mapping[str, Any] | Vehicle
@@ -21,15 +22,16 @@ _CONVENTIONS = {"_per_tyre": 1.0, "_axle": 0.5}  # tyres' share of the number
 _FIELDS = [entry.name for entry in dataclasses.fields(Vehicle)]
 
 
-def vehicle_from(source: VehicleSource) -> Vehicle:
+def vehicle_from(source: VehicleSource, strict: bool = True) -> Vehicle:
     """A vehicle from its name in `VEHICLES`, a TOML or JSON file, or a mapping of parameters.
 
     Keys are those of `Vehicle`. A cornering stiffness is `front_stiffness_per_tyre` or
-    `front_stiffness_axle` (both tyres together), and so for the rear; a mapping's
-    `front_stiffness` is per tyre, as in `Vehicle`, a file's is refused. What is left out is that
-    of the vehicle under `base` (a name or another file); without one it is the passenger car's,
-    except for mass, inertia, arms and stiffnesses, which must be there. A file without a `name`
-    has that of the file.
+    `front_stiffness_axle` (both tyres together), and so for the rear; `front_stiffness` is per
+    tyre in a mapping that has every parameter, as `Vehicle.to_dict` makes one, and else refused.
+    What is left out is that of the vehicle under `base` (a name or another file); without one it is
+    the passenger car's, except for mass, inertia, arms and stiffnesses, which must be there. A file
+    without a `name` has that of the file. strict: whether implausible numbers of a file or a
+    mapping are refused.
 
     Raises FileNotFoundError; ValueError for an unknown name, a file that cannot be read, a missing
     parameter, a stiffness of no convention or of two, and a value out of place; TypeError for an
@@ -38,9 +40,9 @@ def vehicle_from(source: VehicleSource) -> Vehicle:
     if isinstance(source, Vehicle):
         return source
     if isinstance(source, Mapping):
-        return _vehicle_of(dict(source))
+        return _vehicle_of(dict(source), strict, whole=all(name in source for name in _FIELDS))
     if is_document(source):
-        return _vehicle_in(Path(source))
+        return _vehicle_in(Path(source), strict)
     if not isinstance(source, str):
         raise TypeError(
             "a vehicle is a name, the path of a TOML or JSON file or a mapping of parameters, "
@@ -50,14 +52,11 @@ def vehicle_from(source: VehicleSource) -> Vehicle:
     return VEHICLES[source]
 
 
-def _vehicle_in(path: Path) -> Vehicle:
+def _vehicle_in(path: Path, strict: bool = True) -> Vehicle:
     values = read_document(path, "vehicle")
     values = {name: value for name, value in values.items() if name not in WIRES}
     try:
-        for name in _STIFFNESS:
-            if name in values:
-                raise ValueError(f"{name} must name its convention: {_key(name)}")
-        return _vehicle_of({"name": path.stem} | values)
+        return _vehicle_of({"name": path.stem} | values, strict)
     except (TypeError, ValueError) as error:
         raise type(error)(f"{path}: {error}") from None
 
@@ -67,14 +66,16 @@ def _key(name: str) -> str:
     return " or ".join(map(name.__add__, _CONVENTIONS)) if name in _STIFFNESS else name
 
 
-def _vehicle_of(values: dict[str, Any]) -> Vehicle:
-    """A vehicle of a mapping, whose stiffnesses become those of a tyre."""
+def _vehicle_of(values: dict[str, Any], strict: bool, whole: bool = False) -> Vehicle:
+    """A vehicle of a mapping, whose stiffnesses become those of a tyre, and are if it is whole."""
     based = "base" in values
-    base = vehicle_from(values.pop("base", PASSENGER_CAR.replace(name="vehicle")))
+    base = vehicle_from(values.pop("base", PASSENGER_CAR.replace(name="vehicle")), strict)
     for name in _STIFFNESS:
         there = [key for key in (name, *map(name.__add__, _CONVENTIONS)) if key in values]
         if len(there) > 1:
             raise ValueError(f"{' and '.join(there)} exclude each other: one convention an axle")
+        if name in there and not whole:
+            raise ValueError(f"{name} must name its convention: {_key(name)}")
         for convention, share in _CONVENTIONS.items():
             if name + convention in values:
                 value = values.pop(name + convention)
@@ -87,7 +88,10 @@ def _vehicle_of(values: dict[str, Any]) -> Vehicle:
         raise ValueError(
             f"missing {', '.join(map(_key, missing))} (or name a vehicle under 'base')"
         )
-    return base.replace(**values)
+    vehicle = base.replace(**values)
+    if strict:
+        check_plausible(vehicle)
+    return vehicle
 
 
 VEHICLES: dict[str, Vehicle] = {"coms": COMS, "passenger-car": PASSENGER_CAR}

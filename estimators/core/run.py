@@ -175,6 +175,26 @@ def _write(layers: Filters, gains: Gains, j: int, X: Any, S: Any) -> None:
             column += 1
 
 
+@jit
+def write_estimate(layers: Filters, gains: Gains, x: Row, P: Any) -> bool:
+    """Write the states of all layers into x (n,) and their covariance into zeros P (n, n) or none.
+
+    Returns False where P is to be read from gains that are missing.
+    """
+    at, f = 0, layers[0]
+    if len(P) > 0 and f.periodic == 1 and gains[f.cell, 0, 0] == 0.0:
+        return False
+    for layer in range(len(layers) if own(layers) == 0 else 1):
+        f = layers[layer]
+        for i in range(f.n):
+            x[at + i] = f.x[i]
+            for j in range(f.n if len(P) > 0 else 0):  # a table holds one triangle
+                row, column = (j, i) if f.periodic == 1 and i > j else (i, j)
+                P[at + i, at + j] = covariance_of(f, gains, row, column)
+        at += f.n
+    return True
+
+
 @apart
 def advance(
     layers: Filters,

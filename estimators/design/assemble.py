@@ -5,7 +5,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2
 
 from ...envs.sensors.link import SlowSensor
 from ...envs.sensors.slow import SLOW_NAMES
@@ -152,6 +151,8 @@ def _write_trust(f: Memory, config: FilterConfig) -> None:
         f.r_share = 1.0 - math.exp(-f.step / config.accel_time)
     f.wary = config.wary
     if config.gate is not None:
+        from scipy.stats import chi2  # slow to load
+
         f.gate[1:] = chi2.ppf(config.gate, np.arange(1, ROWS + 1))
     knots = config.hdop_table if f.kind != VELOCITY_ROLL else ()  # applied by the first layer
     f.knots = len(knots)

@@ -201,7 +201,10 @@ def _slow_sensors(row: Filter, there: Mapping[str, SlowSensor], read: Options) -
             raise ValueError(f"{read.name} uses no slow sensor, got slow={slow!r}")
         return ()
     if slow is None:
-        wanted = [sensor for sensor in row.slow if sensor in there][:1] or [" or ".join(row.slow)]
+        wanted = [sensor for sensor in row.slow if sensor in there][:1]
+        inertial = "accel_y" in dict(row.options).get("fast", row.fast)
+        if not wanted and (there or not inertial):
+            wanted = [" or ".join(row.slow)]
     else:
         wanted = list(slow) if isinstance(slow, list | tuple) else [slow]
     for sensor in wanted:

@@ -2,7 +2,6 @@
 
 import numpy as np
 from scipy.linalg import solve_discrete_lyapunov
-from scipy.signal import place_poles
 
 from ..core.memory import Memory
 from .kalman import Array
@@ -23,6 +22,8 @@ def observer_gain(F: Array, C: Array, poles: Array) -> Array:
     Raises ValueError where that is impossible: not observable, or more equal poles than outputs.
     """
     try:
+        from scipy.signal import place_poles  # slow to load
+
         K: Array = place_poles(F.T, (C @ F).T, poles).gain_matrix.T
     except ValueError as error:
         raise ValueError(f"the poles {np.round(poles, 6)} cannot be placed: {error}") from None

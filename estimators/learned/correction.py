@@ -16,8 +16,9 @@ from ..core.memory import FILTER
 from ..entry import entry
 from ..estimator import Estimator
 from ..make import make_estimator
+from . import kernel
 from .files import Correction, load_correction
-from .kernel import EXAMPLE, MASS, begin, filter_and_correct, lend, memory_size, net_of, take_back
+from .kernel import EXAMPLE, begin, filter_and_correct, memory_size, net_of
 
 Array = npt.NDArray[np.float64]
 
@@ -46,8 +47,8 @@ class Learned:
             )
         self.base, self.names, self.correction = base, base.names, correction
         self.net = net_of(correction, base.names)
-        self.memory = np.zeros(memory_size(self.net))
-        self.memory[MASS] = vehicle.mass
+        self.memory = np.zeros(memory_size(self.net, len(base.names)))
+        self.memory[kernel.MASS] = vehicle.mass
         self.reset(base.sensors, 0)
 
     def reset(self, sensors: Mapping[str, SlowSensor] | None, first: int) -> None:
@@ -63,19 +64,17 @@ class Learned:
     @property
     def x(self) -> Array:
         """The states now, (n,)."""
-        return self._corrected()[0]
+        x = self.base.x
+        x[self.net.beta] += self.memory[kernel.SHIFT]
+        return x
 
     @property
     def P(self) -> Array:
         """Their covariance now, (n, n)."""
-        return self._corrected()[1]
-
-    def _corrected(self) -> tuple[Array, Array]:
-        f, row = self.base.filters[0], np.empty(len(self.names) + 1)
-        lend(f, self.memory, self.net, row)
-        found = self.base.x, self.base.P
-        take_back(f, self.net, row)
-        return found
+        P, beta, deviation = self.base.P, self.net.beta, self.memory[kernel.DEVIATION]
+        if deviation > 0.0:  # else there is no correction
+            P[beta], P[:, beta], P[beta, beta] = 0.0, 0.0, deviation * deviation
+        return P
 
 
 @functools.cache

@@ -72,9 +72,9 @@ def stack_at(net: Any) -> Any:
     return HISTORY + net.sizes[0] // len(LAGS) * RING
 
 
-def memory_size(net: Net) -> int:
-    """Numbers of a car's memory."""
-    return int(stack_at(net) + net.sizes.sum())
+def memory_size(net: Net, states: int) -> int:
+    """Numbers of a car's memory, in whole cache lines; at its end a filter's, states + 1."""
+    return (int(stack_at(net) + net.sizes.sum()) + states + 8) // 8 * 8
 
 
 @jit
@@ -156,7 +156,7 @@ def filter_and_correct(
 ) -> None:
     """`advance` of a filter whose gains follow P, pace by pace, and its correction.
 
-    m: the memory, (memory_size(net),).
+    m: the memory, (memory_size(net, states),).
     """
     start, begun, nothing, last = 0, 0, fast[:0], m[TICK] + rows
     for j in range(rows):
@@ -175,12 +175,12 @@ def filter_and_correct(
 
 
 @jit
-def lend(f: Any, m: Any, net: Any, row: Any) -> None:
-    """Put the correction into a filter's record, whose own numbers go to `row` (n + 1,).
+def lend(f: Any, m: Any, net: Any) -> None:
+    """Put the correction into a filter's record, whose own numbers go to the memory's end.
 
     How the sum's error depends on those of the other states is not known: covariances are zero.
     """
-    b, n = net.beta, f.n
+    b, n, row = net.beta, f.n, m[len(m) - f.n - 1 :]
     copied(f.P[b, :n], row)
     row[n] = f.x[b]
     if m[DEVIATION] > 0.0:
@@ -191,9 +191,9 @@ def lend(f: Any, m: Any, net: Any, row: Any) -> None:
 
 
 @jit
-def take_back(f: Any, net: Any, row: Any) -> None:
+def take_back(f: Any, m: Any, net: Any) -> None:
     """Give a filter's record its own numbers back."""
-    b, n = net.beta, f.n
+    b, n, row = net.beta, f.n, m[len(m) - f.n - 1 :]
     copied(row[:n], f.P[b])
     copied(row[:n], f.P[:, b])
     f.x[b] = row[n]

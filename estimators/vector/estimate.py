@@ -59,11 +59,12 @@ class EstimateObservation(
         vehicle: VehicleSource | None = None,
         options: Mapping[str, Any] | None = None,
         name: str | None = None,
+        **misplaced: Any,
     ) -> None:
         self._records = _records_below(env)
         clocks = self._records.setups([0])[0].sensors
         self._arguments = arguments = Arguments(
-            estimator, outputs, std, replace, vehicle, options, name, clocks
+            estimator, outputs, std, replace, vehicle, options, name, clocks, misplaced
         )
         if arguments.object is not None:
             raise TypeError(

@@ -11,10 +11,10 @@ from ...envs.backend.decorators import counted
 from ..core.memory import FILTER
 from ..entry import entry
 from ..learned.correction import Learned
-from ..learned.kernel import EXAMPLE, MASS, filter_and_correct, lend, take_back
+from ..learned.kernel import EXAMPLE, MASS
 from ..protocol import ForeignEstimator
 from ..wrappers.arguments import Setup
-from ..wrappers.kernel import observe
+from ..wrappers.kernel import observe_corrected
 from .batch import BatchEstimator
 from .designs import Build, gains_of
 from .kernel import nothing_observed
@@ -24,22 +24,19 @@ from .kernel import nothing_observed
 def correct_batch(
     filters: Any, pool: Any, places: Any, chosen: Any, record: Any, observed: Any, own: Any
 ) -> None:
-    """`filter_and_correct` for the chosen filters, and what `observe` writes of the sums.
+    """`observe_corrected` for the chosen filters.
 
     record, observed: the arguments of `kernel.observe_batch` from `fast` to `counts` and behind.
-    own: memory (N, memory_size), net, and (n + 1,) to work on.
+    own: memory (N, memory_size), net.
     """
     fast, rows, packets, counts = record
     obs, inner, plan, limits, beta, gamma, out, summary = observed
-    memory, net, row = own
+    memory, net = own
     for k in range(len(chosen)):
         i = chosen[k]
-        f, m, gains = filters[i], memory[i], gains_of(pool, places[i])
-        filter_and_correct(f, gains, fast[i], rows[i], packets[i], counts[i], m, net)
-        lend(f[0], m, net, row)
+        one, gains = (fast[i], rows[i], packets[i], counts[i]), gains_of(pool, places[i])
         told = obs[i], inner, plan, limits, beta[i], gamma[i], out[i], summary[i]
-        observe(f, gains, fast[i], 0, packets[i], 0, 0, *told)
-        take_back(f[0], net, row)
+        observe_corrected(filters[i], gains, one, memory[i], net, told)
 
 
 def _base(build: Build, setup: Setup) -> Any:
@@ -75,8 +72,7 @@ class LearnedBatch(BatchEstimator):
         """As `BatchEstimator.take`."""
         chosen = np.arange(len(self)) if mask is None else np.flatnonzero(mask)
         layers = self.filters, self._designs.pool, self._places, chosen
-        own = self.memory, self.first.net, np.empty(len(self.names) + 1)
-        _entry()(*layers, arguments[:4], arguments[4:], own)
+        _entry()(*layers, arguments[:4], arguments[4:], (self.memory, self.first.net))
 
     def get_state(self) -> Any:
         """The filters and their corrections."""
@@ -92,5 +88,5 @@ def _entry() -> Any:
     """`correct_batch` as a plain call."""
     whole, cube = np.zeros(1, np.int64), np.zeros((1, 1, 1))
     layers = np.zeros((1, 1), FILTER), np.zeros(1), np.zeros((1, 4), np.int64), whole
-    own = np.zeros((1, 1)), EXAMPLE, np.zeros(1)
+    own = np.zeros((1, 1)), EXAMPLE
     return entry(correct_batch, *layers, (cube, whole, cube, whole), nothing_observed(1), own)

@@ -32,7 +32,10 @@ def batch_of(
         first = each(setups[0])
         if isinstance(first, ForeignEstimator) and isinstance(first.inner, Learned):
             return LearnedBatch(first, setups, dt, each)
-        if isinstance(first, ForeignEstimator) or not first.compiled:
+        if isinstance(first, ForeignEstimator):
+            kind = getattr(first.inner, "batch", ForeignBatch)  # one that takes all rows at once
+            return kind(first, setups, dt, each)
+        if not first.compiled:
             return ForeignBatch(first, setups, dt, each)
     return BatchEstimator(label_of(source), setups, dt, each)
 

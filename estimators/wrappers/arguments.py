@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, NoReturn
 
+from ...envs.arguments import brief, unknown_names
 from ...envs.sensors.link import SlowSensor
 from ...envs.vehicle.vehicle import Vehicle
 from ...envs.vehicle.vehicles import VehicleSource, vehicle_from
@@ -16,6 +17,7 @@ from .truth import TRUTH
 Source = str | EstimatorFactory | EstimatorLike
 """What `EstimateObservation` takes for its estimator: a name, a factory or an object."""
 AnyEstimator = Estimator | ForeignEstimator
+_OWN = ("estimator", "outputs", "std", "replace", "vehicle", "options", "name")
 
 
 class Setup(NamedTuple):
@@ -51,7 +53,8 @@ class Arguments:
 
     source: a name or a factory; None where `object` is the one estimator to use. vehicle: None for
     the env's nominal one, or, if `truth`, the true one. recorded: what stands in the env's spec.
-    Raises ValueError for an object with a vehicle or options, which would not reach it.
+    Raises ValueError for an object with a vehicle or options, which would not reach it, TypeError
+    for misplaced arguments, with the nearest name of the wrapper's or of the estimator's options.
     """
 
     def __init__(
@@ -63,10 +66,19 @@ class Arguments:
         vehicle: VehicleSource | None,
         options: Mapping[str, Any] | None,
         name: str | None,
-        slow_sensors: Iterable[str],
+        slow_sensors: Mapping[str, SlowSensor],
+        misplaced: Mapping[str, Any],
     ) -> None:
         source: Any = usual_estimator(slow_sensors) if estimator is None else estimator
         recorded = source
+        if misplaced:
+            wrong = unknown_names("argument of EstimateObservation", misplaced, _OWN)
+            if isinstance(source, str) and "did you mean" not in wrong:
+                make_estimator(
+                    source, sensors=slow_sensors, **misplaced
+                )  # names the nearest option
+                wrong = f"options of an estimator are passed as options={brief(dict(misplaced))}"
+            raise TypeError(wrong)
         self.options = dict(options or {})
         self.truth = isinstance(vehicle, str) and vehicle == TRUTH
         self.vehicle = None if vehicle is None or self.truth else vehicle_from(vehicle)

@@ -12,6 +12,7 @@ from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
 from ...envs.task.observation import Entry, space_of
 from ...envs.vehicle.vehicles import VehicleSource
 from ..estimator import Estimator
+from ..learned.correction import Learned
 from .arguments import AnyEstimator, Arguments, Setup, Source, setup_of
 from .kernel import observe_entry
 from .outputs import BETA, STD, Outputs, outputs_of, titled, write
@@ -74,11 +75,12 @@ class EstimateObservation(
         vehicle: VehicleSource | None = None,
         options: Mapping[str, Any] | None = None,
         name: str | None = None,
+        **misplaced: Any,
     ) -> None:
         self._base = base_of(env)
         clocks = self._base.slow_sensors
         self._arguments = Arguments(
-            estimator, outputs, std, replace, vehicle, options, name, clocks
+            estimator, outputs, std, replace, vehicle, options, name, clocks, misplaced
         )
         RecordConstructorArgs.__init__(self, **self._arguments.recorded)
         gym.Wrapper.__init__(self, env)
@@ -138,15 +140,20 @@ class EstimateObservation(
         """The estimator takes the newest step; the observation with its outputs, (width,)."""
         base, outputs, summary = self._base, self.outputs, self._summary
         estimator: Any = self.estimator
+        inner = None if self._ours else getattr(estimator, "inner", None)
         out, rows, done = np.empty(self._width, np.float32), base.ticks_done, 0
-        last = outputs.inner, outputs.plan, outputs.limits, info["beta"], info["gamma"]
-        if not self._ours:
+        record = base.rows, rows, base.packets, base.delivered
+        shown = outputs.inner, outputs.plan, outputs.limits
+        what = obs, *shown, info["beta"], info["gamma"], out, summary
+        if isinstance(inner, Learned):
+            memory = inner.base.filters, inner.base.gains
+            observe_entry(corrected=True)(*memory, record, inner.memory, inner.net, what)
+        elif not self._ours:
             estimator.step(base.rows[:rows], base.packets[: base.delivered])
-            write(estimator, obs, *last, out, summary)
+            write(estimator, *what)
         while self._ours:
-            record = base.rows, rows, base.packets, base.delivered, done
             memory = estimator.filters, estimator.gains
-            done = observe_entry()(*memory, *record, obs, *last, out, summary)
+            done = observe_entry()(*memory, *record, done, *what)
             if done == rows:  # which a refused action leaves at none
                 break
             estimator.design_missing()

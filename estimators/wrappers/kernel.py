@@ -11,6 +11,7 @@ from ...envs.backend.primitives import maximum, minimum
 from ..core.memory import FILTER
 from ..core.run import advance, covariance_of, deviation
 from ..entry import entry
+from ..learned.kernel import EXAMPLE, filter_and_correct, lend, take_back
 
 
 @jit
@@ -93,10 +94,25 @@ def observe(
     return done
 
 
+@jit
+def observe_corrected(filters: Any, gains: Any, record: Any, m: Any, net: Any, rest: Any) -> None:
+    """`filter_and_correct`, and what `observe` writes of the sums.
+
+    record, rest: the arguments of `observe` before and behind `start`.
+    """
+    fast, rows, packets, count = record
+    filter_and_correct(filters, gains, fast, rows, packets, count, m, net)
+    lend(filters[0], m, net)
+    observe(filters, gains, fast, 0, packets, 0, 0, *rest)
+    take_back(filters[0], m, net)
+
+
 @cache
-def observe_entry() -> Any:
-    """`observe` as a plain call."""
+def observe_entry(corrected: bool = False) -> Any:
+    """`observe`, or `observe_corrected`, as a plain call."""
     small, wide, matrix = np.zeros(1, np.float32), np.zeros(1), np.zeros((1, 1))
-    memory, record = (np.zeros(1, FILTER), np.zeros((1, 1, 1))), (matrix, 0, matrix, 0, 0)
+    memory, record = (np.zeros(1, FILTER), np.zeros((1, 1, 1))), (matrix, 0, matrix, 0)
     outputs = small, 0, np.zeros((1, 3), np.int64), wide, 0.0, 0.0, small, wide
-    return entry(observe, *memory, *record, *outputs)
+    if corrected:
+        return entry(observe_corrected, *memory, record, wide, EXAMPLE, outputs)
+    return entry(observe, *memory, *record, 0, *outputs)

@@ -166,7 +166,7 @@ def test_the_command_shows_writes_and_tells_the_card(run: Run, tmp_path: Path) -
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("nobody",), "policy nobody does not exist; shipped policies: distill-car-"),
+        (("nobody",), "unknown policy 'nobody'; known: distill-car-"),
         (("ppo-yaw-vision", "--env", "sideslip/YawGps-v0", "--episodes", 2), "camera_psi"),
         (("ppo-yaw-vision", "--scenario", "moon"), "unknown scenario 'moon'"),
         (("ppo-yaw-vision", "--html", "nowhere/report.html"), "no such folder"),

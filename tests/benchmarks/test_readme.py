@@ -1,4 +1,4 @@
-"""The README's table of the matrix is that of its file, line by line."""
+"""The tables and numbers of README and docs/benchmark.md are those of their files."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -15,18 +15,33 @@ from sideslip.benchmarks.control.episodes import NUMBERS, Chunk, Driven, drive
 from sideslip.benchmarks.control.run import Results
 from sideslip.benchmarks.control.scores import gains
 from sideslip.benchmarks.control.seeds import seeds_of_contests
-from sideslip.benchmarks.harness.results import Row, write_json
+from sideslip.benchmarks.harness.results import Row, read_json, write_json
 
 ROOT = Path(readme.__file__ or "").resolve().parents[1]
 
 
-def test_the_table_in_the_readme_is_made_from_the_file() -> None:
-    text, rows = (ROOT / readme.README).read_text(), readme.tier_rows(ROOT / readme.ROWS)
+def test_the_page_of_the_benchmark_is_made_from_its_file() -> None:
+    text, rows = (ROOT / readme.PAGE).read_text(), readme.tier_rows(ROOT / readme.ROWS)
     assert readme.put(text, readme.table(rows)) == text
     other = [replace(row, value=1.5 * row.value) for row in rows]
     assert readme.put(text, readme.table(other)) != text
     kept = {row.scenario: row.n for row in rows if row.controller == STATE}
     assert all(f" {n}" in text for n in kept.values()), kept  # what its prose says of the episodes
+
+
+def test_the_readme_is_a_door() -> None:
+    """At most 900 words; its table is its file's, of nine rows at most."""
+    text, rows = (ROOT / readme.README).read_text(), read_json(ROOT / readme.FIRST_ROWS)
+    assert len(text.split()) <= 900
+    made = readme.first_table(rows)
+    assert readme.put(text, made) == text and len(made.splitlines()) <= 2 + 9
+    episodes = {row.n for row in rows if row.controller == NOMINAL}
+    assert f"{readme.EPISODES} drives of each of 21 manoeuvres" in text and len(episodes) > 1
+
+
+def test_the_headline_numbers_of_the_readme_are_their_files() -> None:
+    text = " ".join((ROOT / readme.README).read_text().split())
+    assert readme.headlines(ROOT) and all(line in text for line in readme.headlines(ROOT))
 
 
 def test_a_line_has_every_tier_with_cost_interval_and_failures() -> None:
@@ -86,7 +101,7 @@ def test_it_is_in_every_tier_of_its_class_on_what_it_reads(
     monkeypatch.setattr(readme, "measure", measured)
     monkeypatch.chdir(tmp_path)
     Path("docs").mkdir()
-    readme.README.write_text((ROOT / readme.README).read_text())
+    readme.PAGE.write_text((ROOT / readme.PAGE).read_text())
     write_json(tmp_path / "rows.json", [STATE_ROW])
     readme.main(tmp_path / "rows.json", [name])
     new = [row for row in readme.tier_rows(readme.ROWS) if row.controller == name]

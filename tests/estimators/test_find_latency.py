@@ -8,7 +8,7 @@ import pytest
 
 from sideslip.envs.record import FAST, PACKET, PACKET_WIDTH, Log, Record
 from sideslip.estimators import make_estimator
-from sideslip.estimators.find_latency import Search
+from sideslip.estimators.find_latency import Search, aligned
 from tests.estimators.simulation import CAMERA, FIG7, simulate
 from tests.estimators.test_late import later
 
@@ -52,6 +52,27 @@ def test_it_finds_the_latency_whatever_the_tyres(tyres: tuple[float, float], lat
 def test_rows_too_far_apart_are_refused(dt: float) -> None:
     with pytest.raises(ValueError, match=f"rows every {dt:g} s tell nothing: say the latency"):
         Search((FAST.gyro,), dt)
+
+
+@pytest.mark.parametrize("least", [0.0, 3.2, 37.3, 62.6, 118.4, 120.0])
+def test_between_the_lags_that_are_tried_a_parabola_has_the_least(least: float) -> None:
+    search = Search((FAST.gyro,), 0.001)
+    lag, bend, _ = search._least(lambda lag: 7.0 + 0.25 * (lag - least) ** 2)
+    assert lag == round(least) and bend == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("lag", [0, 1, 7, 20, 30])
+def test_aligned_rows_are_those_that_were_never_late(lag: int) -> None:
+    """As far as they have come; other columns stay as they are."""
+    true = np.random.default_rng(0).normal(size=(20 + lag, len(FAST)))
+    late = true[lag:].copy()
+    late[:, FAST.gyro] = true[:20, FAST.gyro]
+    come = max(20 - lag, 0)
+    wanted = true[lag:].copy()
+    wanted[come:, FAST.gyro] = np.nan
+    before = late.copy()
+    np.testing.assert_array_equal(aligned(late, {FAST.gyro: lag}), wanted)
+    np.testing.assert_array_equal(late, before)
 
 
 def straight(rows: int) -> Log:

@@ -40,7 +40,7 @@ def static_slip(_: tuple[int, ...]) -> Measured:
             "hold": 60.0,
             "duration": 10.0,
             "speed": kmh * KMH,
-            "noise": {"wheel": 0.0, "gyro": 0.0},
+            "noise": {"wheel": 0.0},
         }
         env = gym.make("sideslip/YawVision-v0", scenario=scenario)
         left.append(abs(rollout(env, make_agent("feedforward", env))["beta"][-1]))

@@ -13,7 +13,7 @@ import numpy as np
 from ...backend.decorators import plain
 from .analytic import View, at_preview
 from .consensus import Array, Fit, Place, across, fit, levelled, reach_of, search
-from .pinhole import Pinhole
+from .pinhole import WORKING_WIDTH, Pinhole, resample
 from .road_image import Image
 
 _at_preview = plain(at_preview)
@@ -24,6 +24,7 @@ CONTRAST = 6.0  # grey levels that a ridge has at least
 MOST = 800  # points
 ENOUGH = 0.25  # share of a marking's rows at which the quality is 1
 LEAST = 0.06  # share below which it is lost
+CLIPPED = 250  # grey levels from which light is clipped and shows no marking
 _WORST = (0.02, 0.08)  # rad, m, standard errors beyond which it is lost
 
 
@@ -62,8 +63,9 @@ class LaneFinder:
                 f"{near}, {far}, {lane_width} and {side} m"
             )
         self.camera, self.view = camera, view
+        self._scale = scale = camera.size[0] / WORKING_WIDTH
         self._place = Place(camera.height, camera.ahead, camera.preview, lane_width)
-        steps = camera.K[1][1] * camera.height * (1.0 / near - 1.0 / far)  # a row of the picture
+        steps = camera.K[1][1] / scale * camera.height * (1.0 / near - 1.0 / far)  # picture's rows
         self._x = 1.0 / np.linspace(1.0 / near, 1.0 / far, max(int(steps), 20))
         self._y = np.arange(side, -side, -CELL)
         pixels = camera.pixels_of(self._x[:, None], self._y)
@@ -72,6 +74,7 @@ class LaneFinder:
             raise ValueError(f"the camera does not see the road {near} to {far} m ahead")
         rows = pixels[..., 1][self._seen]
         self.rows = max(int(rows.min()) - 2, 0), min(int(rows.max()) + 3, camera.size[1])
+        pixels = (pixels + 0.5) / scale - 0.5
         right, down = np.nan_to_num(np.moveaxis(pixels, -1, 0), nan=-1.0).astype(np.float32)
         self._map, self._fine = cv2.convertMaps(right, down, cv2.CV_16SC2)
         inner = cv2.erode(self._seen.astype(np.uint8), np.ones((1, 7)), borderValue=0)
@@ -94,9 +97,10 @@ class LaneFinder:
                 f"expected a picture of {self.camera.size} pixels in bytes, got "
                 f"{picture.shape[1::-1]} in {picture.dtype}"
             )
-        x, y, strength = self._bright(picture)
+        x, y, strength = self._bright(resample(picture))
         self.points, self.fit = np.stack([x, y], 1), None
-        weight, deviation = np.minimum(strength, 40.0), 0.03 + 2.0 * x / self.camera.K[0][0]
+        focal = self.camera.K[0][0] / self._scale
+        weight, deviation = np.minimum(strength, 40.0), 0.03 + 2.0 * x / focal
         best, quality = None, 0.0
         for start in search(x, y, weight, self._place):
             found = fit(x, y, deviation, start.values, self._place)
@@ -113,6 +117,7 @@ class LaneFinder:
         road = cv2.remap(picture, self._map, self._fine, cv2.INTER_LINEAR)
         if road.ndim == 3:
             road = cv2.max(road[..., 1], road[..., 2])  # yellow is bright in red
+        self._clipped = float(np.mean(road[self._seen] >= CLIPPED))
         light = cv2.sepFilter2D(road, cv2.CV_32F, self._ridge, np.ones(1, np.float32))
         middle = light[:, 1:-1]
         level = max(CONTRAST, 4.0 * 1.4826 * float(np.median(np.abs(middle[::4, ::4]))))
@@ -127,8 +132,10 @@ class LaneFinder:
         return self._x[row], self._y[column + 1] - CELL * shift, strength
 
     def _quality(self, found: Fit, x: Array) -> float:
-        """The share of the rows in which each marking was found, of those in which it must be."""
-        if (found.error > _WORST).any():
+        """The share of the rows in which each marking was found, of those in which it must be;
+        less for clipped light, few pixels and a fit that is not sure of itself."""
+        doubt = float(np.max(found.error / _WORST))
+        if doubt > 1.0:
             return 0.0
         if self.view is not None and (
             abs(found.psi) > self.view.heading or abs(found.y) > self.view.offset
@@ -143,7 +150,8 @@ class LaneFinder:
             if rows < max(8.0, LEAST * expected.sum(), by_chance + 6.0 * np.sqrt(by_chance)):
                 return 0.0
             shares.append(rows / max(expected.sum(), 1))
-        return float(min(1.0, min(shares) / ENOUGH))
+        shown = min(1.0, 2.0 * self._scale) * float(np.clip(1.05 - 2.0 * self._clipped, 0.0, 1.0))
+        return float(min(1.0, min(shares) / ENOUGH) * min(1.0, 2.5 * (1.0 - doubt)) * shown)
 
     def _expected(self, found: Fit, side: int) -> Array:
         """The rows, of bool, in which a marking would be seen."""

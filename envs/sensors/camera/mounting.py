@@ -10,15 +10,19 @@ from math import atan, cos
 import cv2
 import numpy as np
 
+from .analytic import View
 from .consensus import Array
-from .pinhole import Pinhole
+from .finder import LaneFinder
+from .pinhole import WORKING_WIDTH, Pinhole, resample
 from .road_image import Image
 
-TRIED, LEAST = 1500, 20  # pairs of points, and points
+TRIED, LEAST = 4000, 20  # pairs of points, and points
 _TOP, _BOTTOM = 0.55, 0.92  # of the picture's height: the road, without the bonnet
 _NEAR = 0.004  # of the focal length, from a line
 _SLOPES = 0.35, 4.0  # across over down, of a lane's own markings
-_TILTS, _HEIGHTS = (-0.25, 0.45), (0.4, 4.0)  # rad, m
+_TILTS, _HEIGHTS = (-0.14, 0.45), (0.8, 3.0)  # rad, m
+NEAR, FAR, HEADING = 6.0, 30.0, 0.12  # m, m, rad: beyond a bonnet, where markings are wide enough
+_STRAIGHT = 0.003, 0.01, 0.05  # 1/m, rad, rad: curvature, pitch and roll of the lane that shows it
 
 
 def default_camera(size: tuple[int, int]) -> Pinhole:
@@ -31,39 +35,40 @@ def default_camera(size: tuple[int, int]) -> Pinhole:
 def mounted(camera: Pinhole, picture: Image, lane_width: float) -> Pinhole:
     """The camera with the tilt and the height that a picture of a straight lane shows.
 
-    Raises ValueError where two markings are not found in it.
+    Raises ValueError where two markings are not found in it, or no car sees them so.
     """
     points, weight = _ridges(camera, picture)
     pair = _pair(points, weight)
     if pair is None:
-        raise ValueError("no pair of markings was found: pass the camera's tilt and height")
+        raise ValueError("no lane: no pair of markings was found: pass tilt and height")
     (a, b), (c, d) = pair  # across = a + b down, left and right
     down = (a - c) / (d - b)
     tilt = atan(-down)
     height = lane_width * cos(tilt) / (d - b)
-    if not (_TILTS[0] < tilt < _TILTS[1] and _HEIGHTS[0] < height < _HEIGHTS[1]):
-        raise ValueError(
-            f"the markings found would have the camera {height:.2f} m high and tilted by "
-            f"{tilt:.3f} rad: pass its tilt and height"
-        )
-    return dataclasses.replace(camera, tilt=tilt, height=height)
+    found = dataclasses.replace(camera, tilt=tilt, height=height)
+    finder = LaneFinder(found, lane_width, NEAR, FAR, view=View(HEADING, 0.5 * lane_width))
+    finder.find(picture)
+    straight = finder.fit is not None and (np.abs(finder.fit[2:5]) < _STRAIGHT).all()
+    if not (straight and _HEIGHTS[0] < height < _HEIGHTS[1]):
+        what = f"for a camera {height:.2f} m high and tilted by {tilt:.3f} rad"
+        raise ValueError(f"no lane: the best markings are no straight one's {what}: pass both")
+    return found
 
 
 def _ridges(camera: Pinhole, picture: Image) -> tuple[Array, Array]:
     """(points (n, 2) on the plane one unit ahead, weight): bright ridges across the rows."""
-    grey = picture if picture.ndim == 2 else picture.max(2)
+    grey = resample(picture if picture.ndim == 2 else picture.max(2))
     rows = slice(int(_TOP * len(grey)), int(_BOTTOM * len(grey)))
-    scale = camera.size[0] / 1280.0
-    smooth = cv2.GaussianBlur(grey[rows].astype(np.float32), (0, 0), 4.0 * scale)
-    light = -16.0 * scale**2 * cv2.Laplacian(smooth, cv2.CV_32F)
+    smooth = cv2.GaussianBlur(grey[rows].astype(np.float32), (0, 0), 4.0)
+    light = -16.0 * cv2.Laplacian(smooth, cv2.CV_32F)
     middle = light[:, 1:-1]
     level = max(8.0, 4.0 * 1.4826 * float(np.median(np.abs(middle))))
     top = (middle > level) & (middle >= light[:, :-2]) & (middle > light[:, 2:])
     row, column = np.nonzero(top[::2])
-    pixels = np.stack([column + 1.0, 2.0 * row + rows.start], 1)
-    return camera.undistorted(pixels) if len(pixels) else pixels, np.minimum(
-        middle[::2][row, column], 40.0
-    ).astype(float)
+    pixels = np.stack([column + 1.5, 2.0 * row + rows.start + 0.5], 1)
+    pixels = pixels * camera.size[0] / WORKING_WIDTH - 0.5
+    weight = np.minimum(middle[::2][row, column], 40.0).astype(float)
+    return camera.undistorted(pixels) if len(pixels) else pixels, weight
 
 
 def _pair(points: Array, weight: Array) -> tuple[Array, Array] | None:
@@ -91,7 +96,9 @@ def _pair(points: Array, weight: Array) -> tuple[Array, Array] | None:
     best_left, best_right = np.unravel_index(np.argmax(score), score.shape)
     lines = []
     for k in (left[best_left], right[best_right]):
-        near = np.abs(across - a[k] - b[k] * down) < _NEAR * (1.0 + abs(b[k]))
-        slope, start = np.polyfit(down[near], across[near], 1, w=weight[near])
+        start, slope = a[k], b[k]
+        for _ in range(3):
+            near = np.abs(across - start - slope * down) < _NEAR * (1.0 + abs(slope))
+            slope, start = np.polyfit(down[near], across[near], 1, w=weight[near])
         lines.append(np.array([start, slope]))
     return lines[0], lines[1]

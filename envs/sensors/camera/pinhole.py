@@ -19,6 +19,7 @@ from ...documents import read_document, write_document
 
 Array = npt.NDArray[np.floating[Any]]
 _MATRIX = ((640.0, 0.0, 639.5), (0.0, 640.0, 359.5), (0.0, 0.0, 1.0))
+WORKING_WIDTH = 1280  # px, of a picture in which a lane is looked for
 _MEASURED = ("rms_px", "boards")  # a calibration file may hold them
 
 
@@ -121,3 +122,10 @@ class Pinhole:
         across, down = np.moveaxis(self.undistorted(grid.astype(float)), -1, 0)
         s, c = sin(self.tilt), cos(self.tilt)
         return np.stack([c - s * down, -across, -s - c * down], -1)
+
+
+def resample(picture: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+    """Resample a picture to `WORKING_WIDTH`, in its proportions."""
+    size = WORKING_WIDTH, round(picture.shape[0] * WORKING_WIDTH / picture.shape[1])
+    way = cv2.INTER_AREA if picture.shape[1] > WORKING_WIDTH else cv2.INTER_CUBIC
+    return np.asarray(cv2.resize(picture, size, interpolation=way), np.uint8)

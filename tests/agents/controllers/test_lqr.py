@@ -58,9 +58,8 @@ def test_the_model_is_the_plant_and_its_cost_the_envs(period: int, lag: float) -
     """Two steps of the env and of x+ = G x + H u, and what they cost, steering and all."""
     car = {"base": "coms", "motor_lag": lag, "steering_lag": 6.0 * lag, "steering_rate": 1e6}
     scenario = SMALL | {"steering": "step", "onset": -10.0, "hold": 1e6, "amplitude": 0.01}
-    env: Any = gym.make(
-        "sideslip/AfsYawFusion-v0", scenario=scenario, vehicle=car, control_period=period
-    )
+    built: dict[str, Any] = {"vehicle": car, "control_period": period, "strict": False}
+    env: Any = gym.make("sideslip/AfsYawFusion-v0", scenario=scenario, **built)
     env.reset(seed=0)
     vehicle = env.unwrapped.vehicle
     model = design_model(vehicle, 7.0, Purpose(period, vehicle.yaw_moment_limit, True, MODEL))

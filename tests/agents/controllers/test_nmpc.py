@@ -9,8 +9,16 @@ import pytest
 from gymnasium.vector import SyncVectorEnv
 
 from sideslip.agents import Nmpc, make_agent
-from sideslip.agents.controllers.nmpc import problem_of
-from sideslip.agents.design.gauss_newton import LIMIT, damped_step, improved, lanes_of, roll_all
+from sideslip.agents.controllers.nmpc import _shifted, problem_of
+from sideslip.agents.design.gauss_newton import (
+    DIFFERENCE,
+    LIMIT,
+    _normal_equations,
+    damped_step,
+    improved,
+    lanes_of,
+    roll_all,
+)
 from sideslip.agents.design.prediction import roll_out
 from sideslip.agents.design.prediction_model import blocks_of
 from sideslip.agents.rungs import make_rung
@@ -203,6 +211,62 @@ def test_a_damped_step_is_the_solution() -> None:
     damped_step(A, g, 0.1, np.empty((6, 6)), d)
     wanted = np.linalg.solve(A + 0.1 * np.diag(np.diag(A)) + 1e-9 * np.eye(6), -g)
     assert d == pytest.approx(wanted, rel=1e-6) and d[2] == 0.0
+
+
+def test_a_variable_that_a_limit_holds_is_left_out_of_the_step() -> None:
+    """At a limit beyond which it would be cheaper; where it is cheaper within, it moves."""
+    rng = np.random.default_rng(3)
+    blocks = np.array([3, 2])
+    all = lanes_of(4, blocks, 5)
+    J, r = rng.normal(size=(len(all.residuals), 4)), rng.normal(size=len(all.residuals))
+    all.residuals[:] = r[:, None] + DIFFERENCE * np.insert(J, 0, 0.0, axis=1)
+    falls = -np.sign(J.T @ r)  # where the cost falls
+    all.limits[1, 0], all.limits[2, 0] = falls[1], -falls[2]
+    A, g, d = np.empty((4, 4)), np.empty(4), np.empty(4)
+    _normal_equations(all, A, g)
+    damped_step(A, g, 0.0, np.empty((4, 4)), d)
+    free = [0, 2, 3]
+    assert d[1] == 0.0
+    assert d[free] == pytest.approx(np.linalg.lstsq(J[:, free], -r)[0], rel=1e-6)
+
+
+def test_no_plan_is_dearer_than_the_regulators_own() -> None:
+    """However bad the plan is that the last decision left: zeros are tried too."""
+    env, agent = made(YAW, scenario=SMALL, reference="model")
+    found = problem(agent, seen(env, 7.0, true_friction=0.9, beta_hat=0.01))
+    blocks = agent.design.blocks
+    plan = LIMIT * (-1.0) ** np.arange(len(blocks))
+    zeros = cost_of(agent, found, np.zeros(len(blocks)))
+    assert cost_of(agent, found, plan) > 2.0 * zeros
+    start, K, T = found
+    J, _, _ = improved(agent.design.model, start, K, T, blocks, plan, 1)
+    assert zeros >= J
+
+
+def test_a_plan_is_shifted_by_the_time_that_passed() -> None:
+    """A block gets the mean of what its steps were to be; the last one is held on."""
+    blocks = np.array([1, 2, 4, 4])
+    plan = np.random.default_rng(0).normal(size=(4, 2))
+    ahead = np.repeat(plan, blocks, axis=0)
+    later = np.vstack([ahead[1:], ahead[-1:]])
+    wanted = [part.mean(axis=0) for part in np.split(later, np.cumsum(blocks)[:-1])]
+    shifted = plan.ravel().copy()
+    _shifted(shifted, blocks, 2, 1.0)
+    assert shifted == pytest.approx(np.ravel(wanted))
+
+
+def test_where_roll_is_not_measured_it_is_that_of_a_steady_turn() -> None:
+    """As the plant has it after some seconds of turning."""
+    quiet = {"disturbance_force": 0.0, "disturbance_moment": 0.0, "mirror": False}
+    turn = {"base": "step-steer", "amplitude": 0.03, "onset": 0.1, "hold": 9.0, **quiet}
+    env, agent = made(YAW, scenario=turn)
+    obs, _ = env.reset(seed=0)
+    for _ in range(250):
+        obs, *_ = env.step(np.zeros(1, np.float32))
+    x, motion = obs[agent._columns].astype(np.float64), env.unwrapped.motion
+    start, _, _ = problem_of(agent.design, x, 0.9, np.full(2, np.nan), 0.0, agent._most(x[None])[0])
+    assert abs(motion.phi) > 1e-3
+    assert (start.motion.phi, start.motion.phi_dot) == pytest.approx((motion.phi, 0.0), rel=0.02)
 
 
 def test_bad_input() -> None:

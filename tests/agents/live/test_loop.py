@@ -13,7 +13,7 @@ from sideslip.agents.live.datagrams import FIELDS, STAMP, Kind, Message, decode
 from sideslip.agents.live.loop import PERIOD, Histogram, Loop
 from sideslip.agents.live.onboard import Onboard
 from sideslip.agents.live.port import MOST_AT_ONCE, Port, address_of, clock
-from tests.agents.live.both_ends import SEED, VISION, contestant
+from tests.agents.live.both_ends import SEED, VISION, camera, contestant, inertial
 
 ROW = [0.0, 0.0, 0.0, 0.0, 7.0, 7.0] + [0.0] * (len(FIELDS[Kind.INERTIAL]) - 6)
 
@@ -67,6 +67,17 @@ def test_estimates_go_to_everybody_and_controls_back_to_the_car() -> None:
     assert len(sent) == 201 and isinstance(sent[-1], Message)
     assert sent[-1].names == loop.onboard.names
     assert sent[-1].values == (*loop.onboard.x, *loop.onboard.std)
+
+
+def test_controls_follow_a_sender_that_begins_anew() -> None:
+    """From another address, as after a restart; a camera at a third one gets none."""
+    with Port() as port, Port() as car, Port() as restarted, Port() as eye:
+        loop = Loop(onboard(), Assembler(None), port, step=True)
+        for sender, first in ((car, 5_000), (restarted, 0)):
+            loop._take([inertial(k, first + k)._replace(sender=sender.address) for k in range(11)])
+            loop._take([camera(first)._replace(sender=eye.address)])
+        loop._take([inertial(k)._replace(sender=restarted.address) for k in range(11, 31)])
+        assert [len(end.wait(0.1)) for end in (car, restarted, eye)] == [2, 4, 0]
 
 
 def test_a_busy_loop_counts_the_deadlines_it_missed_and_catches_none_up() -> None:

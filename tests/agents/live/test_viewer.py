@@ -1,10 +1,12 @@
 """What the loop sends is on the page and in the table, and nowhere but on this machine."""
 
+import io
 import json
 import math
 import re
 import shutil
 import subprocess
+import urllib.error
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
@@ -61,8 +63,30 @@ def test_the_page_has_all_and_the_events_what_is_new(viewer: Viewer) -> None:
     with urllib.request.urlopen(viewer.url, timeout=10.0) as page:
         text, policy = page.read().decode(), page.headers["Content-Security-Policy"]
     assert "default-src 'none'" in policy and "connect-src 'self'" in policy
+    (nonce,) = set(re.findall(r"nonce-([\w-]+)", policy))
+    assert text.count(f'nonce="{nonce}"') == 2 and "unsafe-inline" not in policy
     assert "&lt;b&gt;mine" in text and "<b>mine" not in text
     assert not re.search(r"https?://|src=|href=", text)
+
+
+@pytest.mark.parametrize(
+    ("header", "value"), [("Host", "evil.example:80"), ("Origin", "http://evil.example")]
+)
+@pytest.mark.parametrize("path", ["", "events"])
+def test_another_page_gets_nothing(viewer: Viewer, path: str, header: str, value: str) -> None:
+    """Neither one whose name resolves to this address nor one from elsewhere."""
+    request = urllib.request.Request(f"{viewer.url}{path}", headers={header: value})
+    with pytest.raises(urllib.error.HTTPError, match="403"):
+        urllib.request.urlopen(request, timeout=10.0)
+
+
+def test_markup_in_a_name_is_shown_as_it_is() -> None:
+    seen = Seen()
+    seen.datagram_received(encode(Kind.ESTIMATE, 0, 0, (1.0, 0.1), ("[/red]",)), None)
+    console = Console(width=80, record=True, file=io.StringIO())
+    console.print(table_of(seen, "[/bold]"))
+    text = console.export_text()
+    assert "[/red]" in text and "[/bold]" in text
 
 
 def test_the_browser_draws_every_strip(viewer: Viewer, tmp_path: Path) -> None:

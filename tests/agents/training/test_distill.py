@@ -152,6 +152,42 @@ def test_a_teacher_of_other_cars_is_refused() -> None:
         drive(lesson(scenario=SHORT | {"friction": 0.5}), None, range(CARS), 0.0)
 
 
+class Watched:
+    """A teacher that knows no action for one car, and notes of what it is told."""
+
+    def __init__(self, teacher: Any, blind: int) -> None:
+        self.teacher, self.blind, self.acts = teacher, blind, list[Any]()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.teacher, name)
+
+    def predict(self, *seen: Any) -> Any:
+        label, memory = self.teacher.predict(*seen)
+        label[self.blind] = np.nan
+        return label, memory
+
+    def acted(self, memory: Any, action: Any) -> None:
+        self.acts.append(action.copy())
+        self.teacher.acted(memory, action)
+
+
+def test_a_teacher_is_told_what_was_done_and_teaches_what_it_knows() -> None:
+    """What it would have done, shaken by noise of which 0.95 are left after a step."""
+    plain = lesson()
+    watched, done, step = Watched(plain.teacher, 3), list[Any](), plain.cars.step
+
+    def noted(action: Any) -> Any:
+        done.append(action.copy())
+        return step(action)
+
+    plain.cars.step = noted
+    seen = drive(plain._replace(teacher=watched), None, range(CARS), 0.01)
+    assert np.array_equal(watched.acts, done) and len(done) == seen.labels.shape[1]
+    assert not seen.weights[3].any() and (np.delete(seen.weights, 3, axis=0) > 0.0).all()
+    shaken = np.stack(done, axis=1)[..., 0] - seen.labels[..., 0]
+    assert 0.9 < np.corrcoef(shaken[:, 1:].ravel(), shaken[:, :-1].ravel())[0, 1] < 0.99
+
+
 def test_what_the_teachers_sensors_do_changes_no_car() -> None:
     """`oracle-parameters` has sensors without biases: another record of the same motion."""
     knowing = make_rung("oracle-parameters-lqr", ID, CARS, **OPTIONS)
@@ -185,10 +221,10 @@ def test_an_age_is_scaled_as_it_varies_while_packets_come() -> None:
     drives = Drives(
         obs, obs, obs, np.ones((1, 300), np.float32), np.eye(2, dtype=np.float32), np.ones(1)
     )
-    z, plain = (
-        normalised(obs, scaling.mean, scaling.scale)[0, :, 0]
-        for scaling in (scaling_of([drives], layout, ("beta",), each) for each in (True, False))
-    )
+    usual, deviation = (scaling_of([drives], layout, ("beta",), each) for each in (True, False))
+    ends = np.percentile(ages, (16, 50))  # the usual age is 0, a soon one a deviation before it
+    assert (ends - usual.mean[0]) * usual.scale[0] == pytest.approx([-1.0, 0.0])
+    z, plain = (normalised(obs, x.mean, x.scale)[0, :, 0] for x in (usual, deviation))
     assert z[:20].min() == 8.0 == z[-1] and np.abs(z[20:200]).max() < 4.0
     assert np.diff(z[24:36]).min() > 0.1 > 20.0 * np.diff(plain[24:36]).max()
 

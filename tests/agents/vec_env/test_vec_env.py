@@ -21,7 +21,6 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import (
     DummyVecEnv,
     VecCheckNan,
-    VecFrameStack,
     VecNormalize,
 )
 
@@ -233,15 +232,6 @@ def test_a_controller_is_evaluated_like_a_network(agent: str) -> None:
         assert told[1] == [25] * 6
         rewards.append(sorted(told[0]))
     assert rewards[0] == pytest.approx(rewards[1], rel=1e-5)
-
-
-def test_a_controller_is_not_designed_on_changed_observations() -> None:
-    env = make_vec_env(VISION, 2, 0)
-    assert make_agent("none", VecCheckNan(env)).nominal == env.get_attr("nominal")[0]
-    for changed in (VecNormalize(env), VecFrameStack(env, 2)):
-        with pytest.raises(ValueError, match=f"{type(changed).__name__} changes the observations"):
-            make_agent("none", changed)
-    assert make_agent("none", VecNormalize(env, norm_obs=False)).control_period == 10
 
 
 def test_ppo_learns_on_it_and_is_evaluated() -> None:

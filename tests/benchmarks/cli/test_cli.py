@@ -135,7 +135,12 @@ def test_an_unwritable_result_leaves_nothing(run: Run, tmp_path: Path) -> None:
 
 def test_bench_without_a_name_runs_all_suites(run: Run, monkeypatch: Any) -> None:
     names: list[str] = []
-    monkeypatch.setattr(cli, "run_suites", lambda some, request: names.extend(some) or [])
+
+    def run_suites(some: list[str], request: Any) -> list[Any]:
+        names.extend(some)
+        return []
+
+    monkeypatch.setattr(cli, "run_suites", run_suites)
     status, _, _ = run("bench", "--quick")
     assert status == 0 and names == list(SUITES)
 

@@ -58,6 +58,16 @@ def test_a_picture_is_read_drawn_and_written(run: Run, camera: Path, tmp_path: P
     assert drawn is not None and (drawn != picture[..., None]).any(2).mean() > 0.02
 
 
+def test_geometry_that_no_car_has_is_no_lane(run: Run, camera: Path, tmp_path: Path) -> None:
+    for scene, said in (
+        (Scene(psi=0.08), "quality"), (Scene(psi=0.2), "no lane"),
+        (Scene(y=1.5), "quality"), (Scene(y=2.0), "no lane"),
+    ):  # fmt: skip
+        cv2.imwrite(str(tmp_path / "road.png"), PAINTER.picture(scene))
+        status, text, _ = run("lane", tmp_path / "road.png", "--intrinsics", camera, *WIDE)
+        assert status == 0 and said in text
+
+
 def test_a_film_is_read_and_its_losses_are_counted(run: Run, camera: Path, tmp_path: Path) -> None:
     film, out, numbers = filmed(tmp_path / "a.avi", 6), tmp_path / "b.avi", tmp_path / "b.json"
     arguments = (*WIDE, "--intrinsics", camera)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sideslip.agents.learned.files import ENDING
 from sideslip.benchmarks.control import episodes, run
 from sideslip.benchmarks.control.cells import Cell
 from sideslip.benchmarks.control.contests import Contest
@@ -119,4 +120,14 @@ def test_other_tuned_options_are_another_case(
         run.sources.cache_clear()
         names.append(drive._path(chunk).name)
     run.sources.cache_clear()
+    assert names[0] == names[2] != names[1]
+
+
+def test_another_policy_in_the_same_file_is_another_case(tmp_path: Path) -> None:
+    """A policy that is trained further keeps its path, not its episodes."""
+    file, drive = tmp_path / f"mine{ENDING}", CachedDrive(tmp_path / "cases")
+    names = []
+    for weights in (b"one", b"another", b"one"):
+        file.write_bytes(weights)
+        names.append(drive._path(Chunk(Cell(Contest(scenario="gust"), "", str(file)), SEEDS)).name)
     assert names[0] == names[2] != names[1]

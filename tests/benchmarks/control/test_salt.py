@@ -10,7 +10,8 @@ import pytest
 import sideslip
 from sideslip.agents.learned.files import ENDING
 from sideslip.agents.rollout import rollout
-from sideslip.benchmarks.control import ladder, run, seeds
+from sideslip.benchmarks import recovery
+from sideslip.benchmarks.control import calibration, ladder, run, seeds
 from sideslip.benchmarks.control.cells import Cell
 from sideslip.benchmarks.control.contests import Contest, contests
 from sideslip.benchmarks.control.episodes import NUMBERS, Driven
@@ -138,3 +139,11 @@ def test_seeds_follow_the_salt_and_only_grow() -> None:
     assert salted_seeds(salt_of("more"), 10) != salted_seeds(salt, 10)
     assert len(set(salted_seeds(salt, 1000))) == 1000
     assert not set(salted_seeds(salt, 1000)) & set(tuning_seeds(64))
+
+
+def test_tuning_seeds_are_nobody_elses() -> None:
+    """Suites and users count theirs from 0: what they look at, nobody tuned on."""
+    tuned = tuning_seeds(4096)
+    assert tuned[:64] == tuning_seeds(64) and len(set(tuned)) == 4096
+    for first in (0, recovery.FIRST_SEED, calibration._FIRST):
+        assert set(tuned).isdisjoint(range(first, first + 2**20))

@@ -194,7 +194,8 @@ def test_the_ladders_steps_are_ratios_of_costs() -> None:
 
 def test_the_answer_names_the_best_and_by_how_much() -> None:
     _, estimator, controller, why, rest = answer({"1": table(results())}).splitlines()
-    assert f"estimator: {REFERENCE_FILTER}, with 6" in estimator and "cost of dakf" in estimator
+    best = REFERENCE_FILTER.replace(", ", " with ")
+    assert f"estimator: {best}, with 6" in estimator and "cost of dakf" in estimator
     assert "controller: lqr, with 33 % [" in controller and "of the cost of esc" in controller
     assert ", 16 % of no control's" in controller  # 2 / 12
     assert "true car and road saves 50 %, then its exact motion saves 7" in why
@@ -214,7 +215,7 @@ def test_the_answer_calls_a_tie_a_tie_and_names_who_leads_elsewhere() -> None:
     for each, there in zip(two, [{e.label: e for e in table(other)}] * len(two), strict=True):
         each.__dict__["pairs"] = {k: there[each.label].pairs[c] for k, c in elsewhere.items()}
     *_, rest = answer({"1": table(found), "2": two}).splitlines()
-    assert rest.startswith("But esc in tier 2. ")
+    assert rest.startswith("Cheaper there: esc in tier 2. ")
 
 
 def test_who_drives_a_part_of_the_contests_is_not_the_best_but_is_named() -> None:
@@ -223,7 +224,7 @@ def test_who_drives_a_part_of_the_contests_is_not_the_best_but_is_named() -> Non
     found.found[Cell(TWO, "joint", "distill-car-yaw")] = episodes(1.2)
     *_, controller, _, rest = answer({"1": table(found)}).splitlines()
     assert "controller: lqr, with 33 % [" in controller
-    assert rest.startswith("But distill-car-yaw where it drives. ")
+    assert rest.startswith("Cheaper there: distill-car-yaw on its own manoeuvres. ")
     found.found[Cell(ONE, "joint", "distill-car-yaw")] = episodes(1.2)
     *_, controller, _, rest = answer({"1": table(found)}).splitlines()
     assert "controller: distill-car-yaw, with" in controller and not rest.startswith("But")

@@ -4,7 +4,6 @@ import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
-from zipfile import ZipFile
 
 import numpy as np
 import pandas as pd
@@ -91,6 +90,7 @@ def episodes(cell: Cell, n: int) -> Driven:
     levels = {NOMINAL: 4.0, "oracle-state": 1.0, "none": 20.0}
     numbers = np.zeros((n, len(NUMBERS)))
     numbers[:, COST] = levels.get(cell.controller, 2.0) * (1.0 + 0.1 * np.arange(n) % 3)
+    numbers[: n // 3, FAILURE] = cell.controller.endswith("e.py")
     if "broken" in cell.controller:
         return Driven(np.full_like(numbers, np.nan), np.nan, error="ValueError: no (pd.py, line 3)")
     return Driven(numbers, 0.0)
@@ -168,16 +168,26 @@ def test_otherwise_they_drive_anew_on_everybodys_seeds(
     assert ("Publishable" in verdict(found)[-1]) == (why == "fresh")
 
 
-def test_fresh_seeds_follow_the_users_file(
-    tmp_path: Path, driven: list[tuple[Cell, tuple[int, ...]]]
+def test_fresh_seeds_are_nobodys_to_foresee_and_can_be_driven_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, driven: list[tuple[Cell, tuple[int, ...]]]
 ) -> None:
-    salts = [compare.compare(challenge(tmp_path, fresh=True)).salt]
-    (tmp_path / "pd.py").write_text(PD + "# better\n")
-    path = (Pair(f"{tmp_path}/pd.py"),)
-    salts += [compare.compare(Challenge(path, fresh=fresh)).salt for fresh in (True, False)]
-    assert len(set(salts)) == 3
-    (tmp_path / "pd.py").write_text(PD)
-    assert compare.compare(Challenge(path, fresh=True)).salt == salts[0]
+    """Other ones each time; with the bytes that the driver drew, others for another file."""
+    rehearsed = frozenset({str((tmp_path / "pd.py").resolve())})
+    monkeypatch.setattr(compare, "_rehearsed", lambda *_: rehearsed)
+    found = [compare.compare(challenge(tmp_path, fresh=True)) for _ in range(2)]
+    assert found[0].salt != found[1].salt
+    again = compare.compare(challenge(tmp_path, salt=found[0].salt))
+    assert again.salt == found[0].salt and "Not publishable" in verdict(again)[-1]
+    assert f"--salt {found[0].salt} repeats them" in verdict(found[0])[-1]
+    mine = [seeds for cell, seeds in driven if cell.is_users]
+    third = len(mine) // 3
+    assert mine[:third] == mine[2 * third :] != mine[third : 2 * third]
+    monkeypatch.setattr("secrets.token_hex", lambda n: "0" * 2 * n)
+    salts = set()
+    for text in (PD, PD + "# better\n"):
+        (tmp_path / "pd.py").write_text(text)
+        salts.add(compare.compare(Challenge((Pair(f"{tmp_path}/pd.py"),), fresh=True)).salt)
+    assert len(salts) == 2
 
 
 def test_the_verdict_has_a_sentence_for_each_and_five_lines_at_most(
@@ -193,6 +203,7 @@ def test_the_verdict_has_a_sentence_for_each_and_five_lines_at_most(
     assert lines[0] == f"Place 3 of 9: {sentence(mine)}."
     assert "50 % [50, 50] of nominal's cost (tier 1: 50, tier 2a: 50, tier 2b: 50" in lines[0]
     assert "closes 50 % [50, 50] of the gap" in lines[0] and "fails in 0.0 %" in lines[0]
+    assert "fails in 33.3 % (nominal 0.0 %)" in sentence(found.of(pairs[4]))
     broken = sentence(found.of(pairs[1]))
     assert "not driven: " in broken and broken.endswith("ValueError: no (pd.py, line 3)")
     cells = table(found).cells
@@ -208,20 +219,6 @@ def test_an_agent_drives_on_the_estimators_and_these_under_lqr() -> None:
         ("lqr", "dakf"),
     ]
     assert pairs_of(["ppo-yaw-vision"], [])[0].estimator == ""
-
-
-def test_a_zip_is_read_where_it_is_trusted(tmp_path: Path) -> None:
-    """Alone, without a filter that it did not see in training."""
-    mine = str(tmp_path / "mine.zip")
-    with ZipFile(mine, "w") as archive:
-        archive.writestr("data", "{}")
-        archive.writestr("policy.pth", "")
-    (pair, other) = pairs_of([mine, "esc"], [], trust=True)
-    assert pair.estimator == "" and pair.cell(Contest()).best["controller"] == {"trust": True}
-    assert not other.trust
-    Challenge((pair,))
-    with pytest.raises(PermissionError, match=r"`sideslip export .*mine.zip --trust`"):
-        Challenge(tuple(pairs_of([mine], [])))
 
 
 def test_contests_are_those_of_the_id() -> None:
@@ -265,6 +262,8 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
     "vehicle": ({"vehicle": "comss"}, "comss"),
     "scenario": ({"scenarios": ({"bas": "gust"},)}, "bas"),
     "limit": ({"limit": 0.0}, "above 0"),
+    "salt": ({"salt": "xyz"}, "hexadecimal"),
+    "salt beside seeds": ({"salt": "ab", "seeds": (1, 2)}, "no others beside it"),
 }
 
 

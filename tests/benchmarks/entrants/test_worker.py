@@ -9,7 +9,7 @@ import pytest
 from sideslip.benchmarks.control.cells import Cell
 from sideslip.benchmarks.control.contests import Contest
 from sideslip.benchmarks.control.episodes import Chunk
-from sideslip.benchmarks.entrants import worker
+from sideslip.benchmarks.entrants.process import place_of
 from sideslip.benchmarks.entrants.worker import drive_apart, drive_users
 
 SHORT = {"scenario": {"base": "gust", "duration": 0.05}}
@@ -79,9 +79,37 @@ def test_what_it_does_to_its_process_is_its_result(
     assert apart.series is not None and np.array_equal(apart.series, here.series)  # type: ignore[arg-type]
 
 
-def test_a_hang_is_found_in_the_users_file(tmp_path: Path) -> None:
-    stack = (
-        f'0:00:01)!\n  File "/lib/time.py", line 9 in sleep\n  File "{tmp_path}/mine.py", line 12'
-    )
-    assert worker._place(chunk(tmp_path, "pass").cell, stack) == ", still in mine.py, line 12"
-    assert worker._place(Cell(Contest(), "", "pd"), stack) == ""
+def test_a_hang_is_found_in_the_users_file() -> None:
+    stack = 'File "/lib/time.py", line 9 in sleep\n  File "/home/mine.py", line 12'
+    assert place_of(("/home/mine.py:Mine", ""), stack) == ", still in mine.py, line 12"
+    assert place_of(("pd", ""), stack) == ""
+
+
+FILTER = """
+import numpy as np
+from sideslip.envs.record import FAST
+
+
+class Integrator:
+    names = ("beta", "gamma")
+
+    def __init__(self, *, vehicle, sensors, dt, speed):
+        self.dt, self.speed = dt, speed or 7.0
+
+    def reset(self, sensors, first):
+        self.x, self.P = np.zeros(2), np.diag([0.02, 0.005]) ** 2
+
+    def step(self, rows, packets):
+        for row in rows:
+            rate = row[FAST.accel_y] / self.speed - row[FAST.gyro] - 2.0 * self.x[0]
+            self.x = np.array([self.x[0] + self.dt * rate, row[FAST.gyro]])
+        self.P = self.P + 1e-6 * len(packets) * np.eye(2)
+"""
+
+
+def test_a_filter_in_a_child_gives_the_bits_of_one_in_this_process(tmp_path: Path) -> None:
+    (tmp_path / "filter.py").write_text(FILTER)
+    cell = Cell(Contest(scenario="gust"), str(tmp_path / "filter.py"), "lqr", dict(SHORT))
+    apart, here = (drive(Chunk(cell, (0, 1, 2))) for drive in (drive_apart, drive_users))
+    assert not apart.error
+    assert np.array_equal(apart.numbers, here.numbers)

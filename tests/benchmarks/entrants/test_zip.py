@@ -2,11 +2,13 @@
 
 from pathlib import Path
 from typing import Any
+from zipfile import ZipFile
 
 import pytest
 
 import sideslip
-from sideslip.benchmarks.control.contests import YAW
+from sideslip.benchmarks.control.contests import YAW, Contest
+from sideslip.benchmarks.entrants.challenge import Challenge, pairs_of
 
 
 def test_a_zip_drives_as_its_export_does(tmp_path: Path) -> None:
@@ -25,3 +27,17 @@ def test_a_zip_drives_as_its_export_does(tmp_path: Path) -> None:
         for path in (zipped, exported)
     ]
     assert not found[0].error and found[0].cost == found[1].cost
+
+
+def test_a_zip_is_read_where_it_is_trusted(tmp_path: Path) -> None:
+    """Alone, without a filter that it did not see in training."""
+    mine = str(tmp_path / "mine.zip")
+    with ZipFile(mine, "w") as archive:
+        archive.writestr("data", "{}")
+        archive.writestr("policy.pth", "")
+    (pair, other) = pairs_of([mine, "esc"], [], trust=True)
+    assert pair.estimator == "" and pair.cell(Contest()).best["controller"] == {"trust": True}
+    assert not other.trust
+    Challenge((pair,))
+    with pytest.raises(PermissionError, match=r"`sideslip export .*mine.zip --trust`"):
+        Challenge(tuple(pairs_of([mine], [])))

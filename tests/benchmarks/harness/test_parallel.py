@@ -10,13 +10,14 @@ from collections import Counter
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from rich.console import Console
 
 from sideslip.benchmarks.estimation import run
-from sideslip.benchmarks.harness import engines
+from sideslip.benchmarks.harness import engines, parallel
 from sideslip.benchmarks.harness.engines import completed, engine
 from sideslip.benchmarks.harness.parallel import one_bar, run_cases
 
@@ -50,6 +51,41 @@ def test_an_engine_that_is_none_is_refused() -> None:
         pass
     with pytest.raises(ValueError, match="an address is of a Ray cluster"), engine(address="x:1"):
         pass
+
+
+class Deadly:
+    """Ray's calls that `completed` makes; the worker of each case dies so many times."""
+
+    def __init__(self, deaths: int) -> None:
+        self.deaths = deaths
+
+    def put(self, value: Any) -> Any:
+        return value
+
+    def remote(self, num_cpus: int, max_retries: int) -> Any:
+        def ask(function: Any, *args: Any) -> Any:
+            if self.deaths > max_retries:
+                raise ChildProcessError(f"the worker died {self.deaths} times")
+            return function(*args)
+
+        return lambda function: SimpleNamespace(remote=lambda *args: partial(ask, function, *args))
+
+    def wait(self, asked: list[Any], num_returns: int) -> tuple[list[Any], list[Any]]:
+        return asked[:num_returns], asked[num_returns:]
+
+    def get(self, asked: Any) -> Any:
+        return asked()
+
+
+def test_a_case_outlives_so_many_deaths_of_its_worker_and_no_more() -> None:
+    token = engines._CLUSTER.set(Deadly(engines.RETRIES))
+    try:
+        assert dict(completed(abs, [-1, -2, -3])) == {0: 1, 1: 2, 2: 3}
+        engines._CLUSTER.set(Deadly(engines.RETRIES + 1))
+        with pytest.raises(ChildProcessError):
+            list(completed(abs, [-1]))
+    finally:
+        engines._CLUSTER.reset(token)
 
 
 @pytest.fixture
@@ -151,3 +187,16 @@ def test_a_run_has_one_progress_bar() -> None:
     last = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", written.getvalue()).splitlines()[-1]
     assert "third" in last and "2/2" in last
     assert "\n" not in re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", written.getvalue()).strip()
+
+
+def test_off_a_terminal_a_line_says_how_far_it_is(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At once, and again and again while cases run; none without a console."""
+    monkeypatch.setattr(parallel, "_EVERY", 0.01)
+    wait = partial(time.sleep, 0.05)
+    run_cases(lambda _: wait(), [1, 2], "mine", jobs=1, console=Console(file=io.StringIO()))
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0] == "mine: 0 of 2 cases, 0 s" and "mine: 1 of 2 cases, 0 s" in lines
+    run_cases(lambda _: wait(), [1, 2], "mine", jobs=1)
+    assert capsys.readouterr().err == ""

@@ -6,6 +6,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import pandas as pd
 
 import sideslip
 from sideslip.agents.rollout import rollout
@@ -43,18 +44,42 @@ def drive(
     offset: rad at the wheels; late: s, of the GPS, whose packets bear the time of their arrival."""
     scenario: dict[str, Any] = TURNS | (PLAIN if plain else {}) | {"gps_latency": late} | changes
     env: Any = gym.make("sideslip/YawFusion-v0", scenario=scenario, vehicle="passenger-car")
-    log = rollout(env, seed=seed).log
+    log = decimated(rollout(env, seed=seed).log)
+    log.record.fast[:, FAST.steer] = (log.record.fast[:, FAST.steer] - offset) * ratio
+    log.record.packets[:, PACKET.captured] = log.record.packets[:, PACKET.arrived]
+    return dataclasses.replace(log, truth={}), env.unwrapped.vehicle
+
+
+def decimated(log: Log, every: int = EVERY) -> Log:
+    """Every so many rows of a log, with its GPS alone; its steering is the mean of the rows."""
     whole = log.record.fast[1:]
-    fast = whole[EVERY - 1 :: EVERY].copy()
-    steer = whole[:, FAST.steer][: len(fast) * EVERY].reshape(-1, EVERY).mean(axis=1)
-    fast[:, FAST.steer] = (steer - offset) * ratio
+    fast = whole[every - 1 :: every].copy()
+    steer = whole[:, FAST.steer][: len(fast) * every].reshape(-1, every).mean(axis=1)
+    fast[:, FAST.steer] = steer
     packets = log.record.packets_of("gps").copy()
-    arrived = np.ceil(packets[:, PACKET.arrived] / EVERY)
-    packets[:, PACKET.captured] = packets[:, PACKET.arrived] = arrived
-    packets = packets[(arrived >= 1) & (arrived <= len(fast))]
+    ticks = [PACKET.captured, PACKET.arrived]
+    packets[:, ticks] = np.ceil(packets[:, ticks] / every)
+    within = (packets[:, PACKET.captured] >= 1) & (packets[:, PACKET.arrived] <= len(fast))
     record = dataclasses.replace(
-        log.record, fast=fast, packets=packets, first=1, dt=EVERY * log.record.dt
+        log.record, fast=fast, packets=packets[within], first=1, dt=every * log.record.dt
     )
-    return dataclasses.replace(
-        log, record=record, slow={"gps": log.slow["gps"]}, truth={}
-    ), env.unwrapped.vehicle
+    truth = {name: values[1:][every - 1 :: every] for name, values in log.truth.items()}
+    slow = {name: sensor for name, sensor in log.slow.items() if name == "gps"}
+    return dataclasses.replace(log, record=record, slow=slow, truth=truth)
+
+
+def as_table(log: Log) -> pd.DataFrame:
+    fast = log.record.fast
+    course = np.full(len(fast), np.nan)
+    packets = log.record.packets
+    course[(packets[:, PACKET.captured] - log.record.first).astype(int)] = packets[:, PACKET.value]
+    return pd.DataFrame(
+        {
+            "time_s": log.time,
+            "speed_x_mps": fast[:, FAST.wheel_left],
+            "yaw_rate_radps": fast[:, FAST.gyro],
+            "accel_y_mps2": fast[:, FAST.accel_y],
+            "steer_rad": np.append(fast[1:, FAST.steer], fast[-1, FAST.steer]),
+            "course_rad": course,
+        }
+    )

@@ -171,7 +171,7 @@ def test_a_log_too_short_to_compare_is_refused_by_name(tmp_path: Path, sparse: b
 
 def test_a_log_without_hdop_is_refused(tmp_path: Path) -> None:
     path = log_of([each._replace(hdop=math.nan) for each in drive(0.0, 200)], tmp_path / "a.nmea")
-    with pytest.raises(ValueError, match=r"a\.nmea: 0 fixes to score"):
+    with pytest.raises(ValueError, match=r"a\.nmea: no fix has an HDOP: expected GGA"):
         replay_nmea(path)
 
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pandas import read_csv
 
 from sideslip.benchmarks.harness.results import Suite, read_json, write_json
 from sideslip.benchmarks.recorded.emulate import Emulation, heading
@@ -205,3 +206,23 @@ def test_the_stanford_drive_reaches_its_numbers() -> None:
     assert rmse[GYRO_ONLY] == pytest.approx(1.11 * DEG, abs=0.02 * DEG)
     assert rmse["multirate-kf"] < 0.55 * DEG
     assert values(suite, "ratio")["multirate-kf"] <= 0.60
+
+
+def test_no_course_is_emulated_in_a_part_that_lacks_the_logs_own(tmp_path: Path) -> None:
+    rows = read_csv(saved(tmp_path)).assign(course_rad=math.nan)
+    rows.loc[: len(rows) // 2 - 40 : 20, "course_rad"] = 0.1
+    path = tmp_path / "parts.csv"
+    rows.drop(index=range(len(rows) // 2 - 35, len(rows) // 2 + 35)).to_csv(path, index=False)
+    suite = replay_file(path, PASSENGER_CAR, estimators=["exact-kf"], figures=False)
+    kinds = {(row.scenario.rpartition("part ")[2][0], row.estimator) for row in suite.rows}
+    assert kinds == {("1", GYRO_ONLY), ("1", "exact-kf"), ("2", GYRO_ONLY)}
+    assert "Part 2 has no sample of gps." in suite.text and "emulated" not in suite.text
+
+
+def test_that_most_rows_were_dropped_is_the_first_line(tmp_path: Path) -> None:
+    rows = read_csv(saved(tmp_path))
+    rows.loc[: 0.6 * len(rows), "yaw_rate_radps"] = math.nan
+    rows.to_csv(tmp_path / "late.csv", index=False)
+    settings: dict[str, Any] = {"estimators": [], "figures": False}
+    first, *_ = replay_file(tmp_path / "late.csv", PASSENGER_CAR, **settings).warnings
+    assert "rows lack a value of yaw_rate" in first

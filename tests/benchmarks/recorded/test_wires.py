@@ -4,7 +4,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import pytest
 from typer.testing import CliRunner
 
@@ -12,29 +11,12 @@ from sideslip.benchmarks.cli.main import app
 from sideslip.benchmarks.cli.recorded import estimator_options
 from sideslip.benchmarks.recorded.replay_file import replay_file
 from sideslip.benchmarks.recorded.wires import Wires, corrected, wires_of, write_vehicle
-from sideslip.envs.record import FAST, PACKET, Log
+from sideslip.envs.record import FAST, PACKET
 from sideslip.envs.vehicle.vehicle import PASSENGER_CAR
 from sideslip.envs.vehicle.vehicles import vehicle_from
 
-from .simulated import drive
+from .simulated import as_table, drive
 from .slalom import columns, saved
-
-
-def as_table(log: Log) -> pd.DataFrame:
-    fast = log.record.fast
-    course = np.full(len(fast), np.nan)
-    packets = log.record.packets
-    course[(packets[:, PACKET.captured] - log.record.first).astype(int)] = packets[:, PACKET.value]
-    return pd.DataFrame(
-        {
-            "time_s": log.time,
-            "speed_x_mps": fast[:, FAST.wheel_left],
-            "yaw_rate_radps": fast[:, FAST.gyro],
-            "accel_y_mps2": fast[:, FAST.accel_y],
-            "steer_rad": np.append(fast[1:, FAST.steer], fast[-1, FAST.steer]),
-            "course_rad": course,
-        }
-    )
 
 
 def test_a_file_keeps_the_car_and_the_wires(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 
 from sideslip.benchmarks.harness.results import Suite, Table
-from sideslip.benchmarks.report.terminal import print_suite
+from sideslip.benchmarks.report.terminal import print_run, print_suite
 from sideslip.estimators.make import ESTIMATORS
 
 HEADER = ("controller and estimator", *(f"column {i} / %" for i in range(12)))
@@ -84,3 +84,24 @@ def line_end(text: str, width: int) -> int:
     """Where the first column ends: at the gap before the second one's header."""
     head = next(line for line in text.splitlines() if "score" in line)
     return head.index("score") - 1
+
+
+@pytest.mark.parametrize("count", [1, 2, 12])
+def test_a_run_fits_on_a_screen_and_says_where_the_rest_is(count: int) -> None:
+    """At 80 columns, whatever the tables hold; the verdicts stand there."""
+    cells = [[f"filter-{i}", *["0.123456"] * 12] for i in range(50)]
+    table = Table("errors", ("estimator", *"abcdefghijkl"), cells, "a note " * 40)
+    verdict = "\n".join(["It is so. " * 9, "And so. " * 9, *["More of it. " * 9] * 3])
+    suites = [Suite(f"s{i}", f"Suite {i}", "a text", tables=[table] * 3) for i in range(count)]
+    for suite in suites:
+        suite.verdict = verdict
+    written = io.StringIO()
+    print_run(Console(file=written, width=80), suites, reported=False)
+    lines = written.getvalue().splitlines()
+    assert len(lines) <= 60 and max(map(len, lines)) <= 80
+    assert written.getvalue().count("And so.") == 9 * count
+    assert (
+        lines[-1]
+        == f"All {3 * count} tables, with notes and figures, are in a report: --html FILE."
+    )
+    assert ("filter-0" in written.getvalue()) == (count <= 2)

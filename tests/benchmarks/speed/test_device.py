@@ -8,6 +8,7 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from sideslip.benchmarks.speed import device as device_speed  # noqa: E402
+from sideslip.envs.device.env import DeviceVectorEnv  # noqa: E402
 
 ENV_ID = "sideslip/YawVision-v0"
 
@@ -27,6 +28,15 @@ def test_the_table_has_a_line_for_each_size_and_says_how_it_was_made(
         assert dtype == "float64"
         low, high = map(float, spread.split(" .. "))
         assert 0.0 < low <= float(rate) <= high, count
+
+
+def test_every_round_takes_its_steps() -> None:
+    """One round more than is counted, the first of them."""
+    env: Any = DeviceVectorEnv.make(ENV_ID, 2)
+    steps: list[Any] = []
+    env.step = steps.append
+    found = device_speed.measure(env, 1e9, rounds=2, steps=3)
+    assert len(steps) == (2 + 1) * 3 and found.size == 2
 
 
 @pytest.mark.parametrize(

@@ -1,10 +1,13 @@
 """What is counted of the fused kernel's PTX."""
 
+import subprocess
+from pathlib import Path
+
 import pytest
 
 pytest.importorskip("numba_cuda")
 
-from sideslip.benchmarks.speed.ptx import counts
+from sideslip.benchmarks.speed.ptx import assembled, counts
 
 TEXT = """
 .visible .entry step(
@@ -32,3 +35,24 @@ def test_arithmetic_is_told_from_the_rest() -> None:
         "fused": 1,
         "divisions, roots": 1,
     }
+
+
+SAID = "ptxas info : 16 bytes stack frame, 4 bytes spill stores\nptxas info : Used 42 registers"
+
+
+@pytest.mark.parametrize("status", [0, 1])
+def test_the_assembler_says_what_a_thread_holds_or_ends_the_count(
+    status: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without one on the path nothing is counted."""
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert assembled(TEXT, (9, 0)) == {}
+    ptxas = tmp_path / "ptxas"
+    ptxas.write_text(f"#!/bin/sh\necho '{SAID}' >&2\nexit {status}\n")
+    ptxas.chmod(0o755)
+    if status:
+        with pytest.raises(subprocess.CalledProcessError):
+            assembled(TEXT, (9, 0))
+    else:
+        held = {"registers": "42", "stack, bytes": "16", "spilled, bytes": "4"}
+        assert assembled(TEXT, (9, 0)) == held

@@ -2,11 +2,20 @@
 
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
 from sideslip.benchmarks.unknown import conditions, curves, measure, suite
-from sideslip.benchmarks.unknown.conditions import CAMERA, CONDITIONS, CURVES, PARTS, WITHOUT
+from sideslip.benchmarks.unknown.conditions import (
+    CAMERA,
+    CONDITIONS,
+    CURVES,
+    LINEAR,
+    MIX,
+    PARTS,
+    WITHOUT,
+)
 
 NAMED = {each.name: each for each in CONDITIONS}
 FIALA = "Fiala tyres, friction 0.9"
@@ -17,6 +26,25 @@ FEW = tuple(
     if each.name in ("camera and GPS", "twice the disturbances it was told", FIALA, LATE, CAR)
     or "change" in each.name
 )
+
+
+EVERY = [*CONDITIONS, *(each for curve in CURVES for each in curve.conditions())]
+
+
+@pytest.mark.parametrize("condition", EVERY, ids=lambda each: each.name)
+def test_a_condition_is_a_drive_and_bounded_where_its_car_is_linear(condition: Any) -> None:
+    """The bound is of linear tyres on a body that does not roll."""
+    scenario = LINEAR | dict(condition.scenario)
+    env: Any = gym.make(condition.env_id, scenario=scenario, vehicle=condition.vehicle)
+    drawn = env.unwrapped.config.scenario
+    assert condition.bounded == (drawn.tyres == "linear" and not drawn.roll)
+
+
+def test_a_curve_changes_what_it_says() -> None:
+    late, *_ = (each for each in CURVES if "late" in each.at(1.0).name)
+    for ms, condition in zip(late.values, late.conditions(), strict=True):
+        assert condition.scenario == MIX | {"camera_delays": (pytest.approx(1e-3 * ms),)}
+        assert condition.name == f"camera {ms:g} ms late"
 
 
 @pytest.fixture(scope="module")
@@ -65,6 +93,7 @@ def test_a_curve_has_a_point_for_every_value_and_its_bound_below(few: Any) -> No
     assert bound == sorted(bound)  # a slower GPS sees less
     assert all(rmse[name, "joint"] > 0.9 * rmse[name, curves.BOUND] for name in names)
     titles = [question for question, _, _ in few.answers]
+    assert few.answers[0][2] == few.verdict.splitlines()[1]  # beneath the first picture
     assert titles[1:] == ["Do the intervals hold what they promise?", curve.question]
 
 

@@ -142,6 +142,17 @@ def test_a_second_process_loads_what_the_first_compiled(folder: Path) -> None:
     assert {path: path.read_bytes() for path in folder.iterdir()} == files
 
 
+def test_what_was_compiled_for_another_processor_is_not_loaded(folder: Path) -> None:
+    """A folder that two machines share: each finds its own kernel and leaves the other's."""
+    assert run(folder, NUMBA_CPU_NAME="generic")[0] == EXPECTED
+    (generic,) = folder.iterdir()
+    before = generic.read_bytes()
+    found, notices = run(folder)
+    assert found == EXPECTED and "compiling" in notices
+    assert len(list(folder.iterdir())) == 2 and generic.read_bytes() == before
+    assert run(folder) == run(folder, NUMBA_CPU_NAME="generic") == (EXPECTED, "")
+
+
 def test_machine_code_is_found_by_a_name_without_a_process_counts(folder: Path) -> None:
     """Numba numbers record types as it meets them; a kernel may be made anew after its callers."""
     code = "print(weight(np.ones(1, [('m', float)])[0]))"
@@ -164,6 +175,9 @@ def test_a_damaged_file_is_compiled_again(
     assert kernel()(2.0) == 6.0
     (path,) = tmp_path.iterdir()
     whole = path.read_bytes()
+    path.write_bytes(bytes([whole[0] ^ 1]) + whole[1:])  # the digest alone: the code is sound
+    again = kernel()
+    assert again(3.0) == 9.0 and again.parts != {}
     path.write_bytes(whole[:left])
     again = kernel()
     assert again(3.0) == 9.0 and again.parts != {}

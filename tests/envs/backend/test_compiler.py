@@ -10,8 +10,7 @@ from typing import Any
 import pytest
 from numba.core.dispatcher import Dispatcher
 
-from sideslip.envs import backend
-from sideslip.envs.backend import cache
+from sideslip.envs.backend import cache, decorators
 
 PACKAGE = cache._PACKAGE
 kernel_folder = cache.kernel_folder.__wrapped__  # asked anew each time
@@ -119,15 +118,15 @@ def test_old_versions_are_pruned_but_not_in_a_folder_of_the_users_own(
 
 
 def test_compiling_leaves_numbas_own_settings_alone() -> None:
-    before = backend.config.CACHE_DIR
-    backend.jit(lambda x: x)
-    assert before == backend.config.CACHE_DIR
+    before = decorators.config.CACHE_DIR
+    decorators.jit(lambda x: x)
+    assert before == decorators.config.CACHE_DIR
 
 
 def test_plain_replaces_every_callee_and_leaves_the_original_alone() -> None:
     from sideslip.envs.vehicle.integration import kutta3
 
-    function = backend.plain(kutta3)
+    function = decorators.plain(kutta3)
     seen: set[str] = set()
     todo: list[Any] = [function]
     while todo:
@@ -139,7 +138,7 @@ def test_plain_replaces_every_callee_and_leaves_the_original_alone() -> None:
             if hasattr(callee, "__code__") and callee.__name__ not in seen:
                 todo.append(callee)
     assert {"kutta3", "rates", "slips", "sincos", "minimum", "floor"} <= seen
-    assert backend.plain(kutta3) is not function
+    assert decorators.plain(kutta3) is not function
 
 
 def test_a_folder_that_can_only_be_read_is_read(

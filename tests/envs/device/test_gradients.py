@@ -8,6 +8,7 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from sideslip.envs.device.env import DeviceVectorEnv  # noqa: E402
+from sideslip.envs.device.gradient import Gate  # noqa: E402
 from sideslip.envs.record import PACKET  # noqa: E402
 
 from .moments import DRIVEN, FUSION  # noqa: E402
@@ -41,6 +42,17 @@ def drive(env: DeviceVectorEnv, inputs: dict[str, Any]) -> Any:
         obs, rewards, _, _, infos = env.step(action[:, None].expand(-1, width))
         total = total + obs @ shares[k] + 30.0 * rewards + infos["gamma"]
     return total
+
+
+@pytest.mark.parametrize("shape", [(4,), (2, 4)])
+def test_a_gate_lets_slopes_through_to_the_open_rows_alone(shape: tuple[int, ...]) -> None:
+    """A row that is over gets zero, finite slopes or not; an open row all that is a number."""
+    gate = Gate()
+    value = torch.ones(shape, requires_grad=True)
+    passed = gate(value)
+    gate.open = torch.tensor([True, False, True, False])  # as late as the gradients
+    (passed * torch.tensor([2.0, 3.0, torch.nan, torch.inf])).sum().backward()
+    assert torch.equal(value.grad, torch.tensor([2.0, 0.0, 0.0, 0.0]).expand(shape))
 
 
 @pytest.mark.parametrize("device", DEVICES)

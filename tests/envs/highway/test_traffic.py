@@ -71,6 +71,19 @@ def test_a_car_that_drives_on_into_the_braking_one_crashes() -> None:
     assert around.crashed
 
 
+def test_an_impact_that_highway_env_foresees_is_a_crash_to_both() -> None:
+    """Closer than the next step goes, whatever our car does then: they never overlap."""
+    around = traffic(Hazard(headway=1.0, onset=0.0, braking=1.0))
+    lead = around.road.vehicles[1]
+    lead.speed = 0.0
+    reach = 0.5 * (lead.LENGTH + around.ours.LENGTH) + around.ours._centre
+    near = AHEAD._replace(X=lead.position[0] - reach - 0.5 * V * 1e-3 * PERIOD)
+    around.follow(near)
+    assert not around.crashed and not lead.crashed
+    around.follow(near._replace(Y=9.0))
+    assert around.crashed and lead.crashed
+
+
 @pytest.mark.parametrize("away", [2.8, 3.0])
 def test_a_car_has_departed_whose_width_is_beyond_the_edge(away: float) -> None:
     """The edge line is 2 m to the side where no lane is free, the car 1.8 m wide."""

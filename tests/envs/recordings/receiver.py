@@ -37,6 +37,10 @@ def gga(time: str = "120000.00", hdop: str = "1.2", quality: str = "1", used: st
     )
 
 
+def zda(time: str, day: str = "01", month: str = "01", year: str = "2024") -> bytes:
+    return sentence(f"GPZDA,{time},{day},{month},{year},00,00")
+
+
 def decoded(data: bytes, step: int | None = None) -> tuple[list[Epoch], Counts]:
     """The epochs of bytes fed in chunks of so many, or at once."""
     decoder = Decoder()

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sideslip.envs.recordings.nmea import LONGEST, Decoder
+from sideslip.envs.recordings.nmea import DAY, LONGEST, Decoder, mend_dates
 from sideslip.envs.recordings.sentences import DECODED
 
-from .receiver import ABSENT, REASON, RECORDINGS, decoded, gga, rmc, sentence
+from .receiver import ABSENT, REASON, RECORDINGS, decoded, gga, rmc, sentence, zda
 
 GSA = "GPGSA,A,3,05,08,15,,,,,,,,,,2.0,1.7,1.5"
 
@@ -138,6 +138,69 @@ def test_time_that_steps_back_is_counted_and_handed_on() -> None:
     assert len(epochs) == 4 and counts.backward == 1
 
 
+def clocks(*times: str) -> list[tuple[float, float]]:
+    """(t, t mended) of epochs "hhmmss" or "hhmmss ddmmyy", without a date or with one."""
+    parts = [each.split() for each in times]
+    data = b"".join((rmc(*each) if len(each) > 1 else b"") + gga(each[0]) for each in parts)
+    epochs = decoded(data)[0]
+    assert len(epochs) == len(times)
+    return [(old.t, new.t) for old, new in zip(epochs, mend_dates(epochs), strict=True)]
+
+
+def test_midnight_without_a_date_is_passed_forward_and_backward() -> None:
+    t = [t for t, _ in clocks("235959", "000000", "235959", "000001")]
+    assert t == [DAY - 1.0, DAY, DAY - 1.0, DAY + 1.0]
+    (_, first), (_, back) = clocks("000000 010117", "235959")
+    assert back - first == -1.0
+
+
+NOON = 1704110400.0  # 2024-01-01, a Monday; 1024 weeks before it was 2004-05-17
+
+
+@pytest.mark.parametrize(
+    "times",
+    [
+        ("115958", "115959", "120000 010124"),  # the first date comes late
+        ("115958 060180", "115959 060180", "120000 010124"),  # a cold start
+        ("115958 170504", "115959 010124", "120000 010124"),  # a rollover that is mended
+        ("115958 010124", "115959 010124", "120000 170504"),  # and one that begins
+        ("115958 010124", "115959 311299", "120000 010124"),  # one wrong date
+        ("115958", "115959 060180", "120000 010124"),
+    ],
+)
+def test_a_log_has_one_date_where_the_time_of_day_goes_on(times: tuple[str, ...]) -> None:
+    assert [t for _, t in clocks(*times)] == [NOON - 2.0, NOON - 1.0, NOON]
+
+
+def test_a_date_that_is_late_or_early_at_midnight_is_mended() -> None:
+    for days in (("311223", "311223", "010124"), ("010124", "010124", "010124")):
+        times = zip(("235959", "000000", "000001"), days, strict=True)
+        t = [t for _, t in clocks(*(f"{time} {day}" for time, day in times))]
+        assert t == [NOON - DAY / 2 + k for k in (-1.0, 0.0, 1.0)]
+    (_, early), (_, late) = clocks("080000", "100000 010124")  # the date comes after a tunnel
+    assert (early, late) == (NOON - 4 * 3600.0, NOON - 2 * 3600.0)
+    (_, first), (_, last) = clocks("235959", "000000 010124")
+    assert (first, last) == (NOON - DAY / 2 - 1.0, NOON - DAY / 2)
+
+
+def test_a_pause_of_days_and_a_log_of_another_era_remain() -> None:
+    for times in (("120000 010124", "090000 030124"), ("120000 170504", "120001 170504")):
+        assert all(old == new for old, new in clocks(*times))
+    assert mend_dates([]) == []
+
+
+def test_a_jump_forward_is_counted_like_one_backward_and_the_first_date_is_none() -> None:
+    def steps(*times: str) -> tuple[int, int]:
+        counts = decoded(b"".join(rmc(*each.split()) + gga(each[:6]) for each in times))[1]
+        return counts.forward, counts.backward
+
+    assert steps("120000 060180", "120001 010124", "120002 010124") == (1, 0)
+    assert steps("120000 010124", "120001 060180", "120002 060180") == (0, 1)
+    assert steps("000000 010124", "100000 010124", "100001 010124") == (1, 0)
+    counts = decoded(gga("115959") + rmc("120000") + gga("120000"))[1]
+    assert (counts.forward, counts.backward) == (0, 0)
+
+
 def test_what_is_no_sentence_of_ours_is_counted_and_skipped() -> None:
     data = b"# a title\r\n" + rmc()[:30] + b"\r\n" + rmc()[:20] + rmc() + b"$" + b"A" * LONGEST * 2
     data += b"\r\n" + rmc().replace(b"48", b"49") + sentence("PGRME,5.5,M,7.0,M,8.9,M") + gga()
@@ -159,12 +222,14 @@ def test_a_sentence_sent_twice_is_counted() -> None:
 def pieces() -> st.SearchStrategy[bytes]:
     fields = st.text(st.characters(codec="ascii", exclude_characters="$*\r\n"), max_size=30)
     times = st.sampled_from(["120000", "120001.50", "235960", "000000", "", "0NaN"])
-    kinds = st.sampled_from(["GPRMC", "GNGGA", "GPGSA", "GLGSV", "GPVTG", "PGRME", "G", ""])
+    talkers = ["GPRMC", "GNGGA", "GPGSA", "GLGSV", "GPVTG", "GNGNS", "GAGLL", "GPZDA", "PGRME"]
+    kinds = st.sampled_from([*talkers, "G", ""])
     return st.one_of(
         st.binary(max_size=40),
         st.sampled_from([b"$", b"\r\n", b"\r", b"*", b"$" * 5, b"x" * (LONGEST + 3)]),
         st.builds(lambda kind, text: sentence(f"{kind},{text}"), kinds, fields),
-        st.builds(rmc, times),
+        st.builds(rmc, times, st.sampled_from(["010124", "060180", "", "320124"])),
+        st.builds(zda, times, st.sampled_from(["01", "31"]), st.sampled_from(["02", "12", "13"])),
         st.builds(gga, times, st.sampled_from(["1.0", "", "0NaN", "-1"])),
     )
 

@@ -80,3 +80,42 @@ def test_nothing_that_lasts(tmp_path: Path) -> None:
         read_parts(saved(table, tmp_path))
     with pytest.raises(ValueError, match="fewer than two rows"):
         read_parts(saved(drive(600), tmp_path), start=100.0)
+
+
+def test_a_part_without_a_slow_sensors_sample_lacks_the_sensor(tmp_path: Path) -> None:
+    table = drive(1200).assign(course_rad=np.nan, camera_psi_rad=np.nan)
+    table.loc[:500:20, "course_rad"] = 0.1
+    table.loc[::10, "camera_psi_rad"] = 0.1
+    logs, done = read_parts(saved(without(table, 550, 620), tmp_path))
+    assert [sorted(log.slow) for log in logs] == [["camera", "gps"], ["camera"]]
+    assert "Part 2 has no sample of gps." in done
+    assert len(logs[1].record.packets_of("gps")) == 0 < len(logs[1].record.packets_of("camera"))
+
+
+@pytest.mark.parametrize("late", [1e-7, 2e-3])
+def test_all_parts_have_one_step(tmp_path: Path, late: float) -> None:
+    """Clocks that differ by rounding, or truly, would be drives of several dt."""
+    table = without(drive(1300), 700, 800)
+    slower = table["time_s"] > 10.5
+    table.loc[slower, "time_s"] += np.arange(slower.sum()) * late + 1e-8
+    logs, _ = read_parts(saved(table, tmp_path))
+    assert len(logs) == 2 and logs[0].record.dt == logs[1].record.dt == pytest.approx(0.01)
+    assert logs[1].time[-1] == pytest.approx(table["time_s"].iloc[-1], abs=0.02)
+
+
+def test_stamps_that_lost_digits_are_refused(tmp_path: Path) -> None:
+    table = drive(600)
+    table["time_s"] = [float(f"{time:.9g}") for time in 1.7e9 + table["time_s"]]
+    with pytest.raises(ValueError, match=r"back in 598 of 600 rows: have its stamps lost digits"):
+        read_parts(saved(table, tmp_path))
+
+
+def test_a_large_share_of_rows_dropped_is_said_first_or_refused(tmp_path: Path) -> None:
+    table = drive(600)
+    late = table.assign(yaw_rate_radps=table["yaw_rate_radps"].where(table.index >= 350))
+    (log,), done = read_parts(saved(late, tmp_path))
+    assert done[0] == "WARNING: 350 of 600 rows lack a value of yaw_rate and were dropped."
+    assert len(log.record.fast) == 250
+    rare = table.assign(steer_rad=table["steer_rad"].where(table.index % 150 == 0))
+    with pytest.raises(ValueError, match=r"596 of 600 rows lack a value of steer; regular gaps up"):
+        read_parts(saved(rare, tmp_path))

@@ -14,7 +14,7 @@ import pytest
 from sideslip.envs.recordings.nmea import Decoder, Epoch
 from sideslip.envs.recordings.sources import Line, Source, is_nmea, open_source, read_nmea
 
-from .receiver import gga, rmc
+from .receiver import gga, rmc, sentence
 
 SECONDS = [f"1200{i:02d}" for i in range(20)]
 LOG = b"".join(rmc(time) + gga(time) for time in SECONDS)
@@ -55,6 +55,16 @@ def test_a_file_ends(tmp_path: Path) -> None:
     assert b"".join(open_source(str(path))) == LOG
     epochs, counts = read_nmea(path)
     assert len(epochs) == counts.epochs == len(SECONDS)
+
+
+def test_a_log_is_dated_by_its_last_date_and_how_many_epochs_were_is_counted(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "drive.nmea"
+    path.write_bytes(gga("115958") + rmc("115959", "060180") + gga("115959") + LOG)
+    epochs, counts = read_nmea(path)
+    assert [epoch.t for epoch in epochs] == [1704110398.0 + k for k in range(22)]
+    assert (counts.redated, counts.forward) == (2, 1)
 
 
 def test_a_serial_port_that_vanishes_ends_clearly() -> None:
@@ -150,7 +160,10 @@ def test_a_text_of_another_form_is_refused(text: str) -> None:
         (b"", "the file is empty"),
         (bytes(range(256)) * 100, "no valid NMEA sentence in 25600 bytes"),
         (rmc().replace(b"48", b"49") * 3, "3 with a bad checksum"),
-        (rmc(status="V") + gga(quality="0"), "none of 1 epochs has a fix"),
+        (gga().split(b"*")[0] + b"\r\n" + gga()[:30], "1 without a checksum, 1 cut short"),
+        (rmc(status="V") + gga(quality="0"), "none of 1 epochs has a fix; sentences: 1 GGA, 1 RMC"),
+        (rmc("") + gga(""), "none of 1 epochs has both a fix and a time"),
+        (sentence("GPGSV,1,1,00") * 3, "none of 0 epochs has a fix; sentences: 3 GSV"),
     ],
 )
 def test_what_is_no_log_is_refused_by_name(tmp_path: Path, data: bytes, message: str) -> None:
@@ -164,6 +177,8 @@ def test_a_log_is_known_by_its_content(tmp_path: Path) -> None:
     for name, data in (("a.txt", LOG), ("b.log", b"# title\n" + LOG), ("c.csv", LOG)):
         (tmp_path / name).write_bytes(data)
         assert is_nmea(tmp_path / name)
+    (tmp_path / "e.txt").write_bytes(gga().split(b"*")[0])
+    assert is_nmea(tmp_path / "e.txt")
     (tmp_path / "d.txt").write_bytes(b"time_s,price_$\n1,2\n")
     assert not is_nmea(tmp_path / "d.txt")
     assert not is_nmea(tmp_path / "gone.csv")

@@ -139,13 +139,13 @@ def test_a_window_shows_the_first_car() -> None:
         assert pygame.display.get_surface() is None
 
 
-def test_a_window_without_a_display_is_refused(screenless: None) -> None:
+def test_without_a_display_nothing_is_shown_and_a_warning_says_so(screenless: None) -> None:
+    """So Gymnasium's checker, which tries each mode, passes on a server."""
     env = StabilityEnv(render_mode="human")
-    with pytest.raises(RuntimeError, match=r"no display .*use render_mode='rgb_array'"):
+    with pytest.warns(UserWarning, match=r"no display .*render_mode='rgb_array' returns frames"):
         env.reset(seed=0)
-    rows = StabilityVectorEnv(2, render_mode="human")
-    with pytest.raises(RuntimeError, match="no display"):
-        rows.reset(seed=0)
+    assert env.render() is None
+    env.close()
 
 
 def test_render_fps_is_real_time() -> None:

@@ -110,6 +110,12 @@ def test_the_chart_has_the_truth_and_an_estimate_where_a_wrapper_makes_one() -> 
         assert truth[1] > truth[0] + 100
 
 
+def test_the_legend_names_the_truth_beside_a_level_line_of_its_colour() -> None:
+    left, top = int(_STRIPS[0]) + 48, 262
+    x, y = painted(seen(started()), INK, (left, top, 20, 20)).T
+    assert set(range(2, 18)) <= set(x) and np.ptp(y) < 4 and abs(y.mean() - 10.0) < 2.0
+
+
 def test_the_chart_begins_anew_with_an_episode_and_slides() -> None:
     env = started(FULL | {"duration": 12.0})
     assert env.render() is not None

@@ -145,7 +145,10 @@ def test_the_env_tells_its_redraws_and_has_the_drawn_vehicle() -> None:
 def test_each_axle_has_its_own_draw(front: float, rear: float) -> None:
     """The drawn car drives as one built with these tyres, of which nothing is drawn."""
     turning: dict[str, Any] = {"base": "sine", "speed": 7.0, "friction": 0.9, "onset": 0.0}
-    own = {"front_stiffness": 6000.0 * front, "rear_stiffness": 6000.0 * rear}
+    own = {
+        "front_stiffness_per_tyre": 6000.0 * front,
+        "rear_stiffness_per_tyre": 6000.0 * rear,
+    }
     rows = []
     for factors, vehicle in (((front, rear), {}), ((1.0, 1.0), own)):
         f, r = factors
@@ -155,8 +158,8 @@ def test_each_axle_has_its_own_draw(front: float, rear: float) -> None:
         )
         env.reset(seed=2)
         rows.append([tuple(play(env, [0.2]) and env.motion) for _ in range(100)])
-        assert env.vehicle.front_stiffness == own["front_stiffness"]
-        assert env.vehicle.rear_stiffness == own["rear_stiffness"]
+        assert env.vehicle.front_stiffness == own["front_stiffness_per_tyre"]
+        assert env.vehicle.rear_stiffness == own["rear_stiffness_per_tyre"]
     assert rows[0] == rows[1]
 
 

@@ -6,8 +6,14 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from sideslip.envs.backend.decorators import plain
 from sideslip.envs.record import PACKET, Record, concatenate
+from sideslip.envs.sensors.camera import View, camera_sample, lane_in_view, lane_offset
+from sideslip.envs.sensors.noise import Noise
+from sideslip.envs.vehicle.dynamics import Motion, Road
 from sideslip.estimators import make_estimator
+
+from ..helpers import SILENT
 
 FUSION = "sideslip/YawFusion-v0"
 TURN = {"base": "sine", "steering": "held-step", "onset": 0.2, "amplitude": 0.06, "duration": 3.0}
@@ -27,6 +33,19 @@ def drive(view: Any, steps: int = 250, **arguments: Any) -> Any:
         infos.append(info)
     table = dict(zip(names, np.array(seen).T, strict=True))
     return concatenate(records), table, infos, env.unwrapped.slow_sensors
+
+
+@pytest.mark.plain
+def test_where_the_road_leads_changes_nothing_that_is_seen_of_it() -> None:
+    """A road and a car that are both turned: heading and offset are relative to the road."""
+    road, still = Road(0.0, 0.0, 1.0), (0.0,) * 3
+    seen = []
+    for turned in (0.0, 0.7, -2.0):
+        motion = Motion(*still, turned + 0.1, 0.0, 0.0, 0.0, 0.4, turned)
+        assert plain(lane_offset)(motion, road, 5.0) == pytest.approx(0.4 + 5.0 * 0.1)
+        assert plain(lane_in_view)(motion, View(0.15, 1.0)) == 1.0
+        seen.append(plain(camera_sample)(motion, road, 5.0, Noise()._replace(**SILENT), (0.0,) * 4))
+    np.testing.assert_allclose(seen, [(0.1, 0.9)] * 3)
 
 
 @pytest.mark.parametrize("view", [{"camera_heading": HEADING}, {"camera_offset": OFFSET}])

@@ -50,7 +50,7 @@ def test_round_trip(tmp_path: Path, vehicle: Vehicle) -> None:
 def test_a_mapping_may_start_from_another_vehicle() -> None:
     assert vehicle_from({"base": "coms", "mass": 400.0}) == COMS.replace(mass=400.0)
     assert vehicle_from({"base": COMS}) == COMS
-    axle = {"front_stiffness_axle": 9000.0, "rear_stiffness": 5000.0}
+    axle = {"front_stiffness_axle": 9000.0, "rear_stiffness_per_tyre": 5000.0}
     assert vehicle_from({"base": "coms"} | axle).front_stiffness == 4500.0
     assert vehicle_from({"base": "coms"} | axle).rear_stiffness == 5000.0
 
@@ -62,6 +62,11 @@ def test_a_mapping_may_start_from_another_vehicle() -> None:
         ({"base": "coms", "masss": 1.0}, TypeError, "parameter 'masss'; did you mean 'mass'"),
         ({"mass": 380.0}, ValueError, "missing yaw_inertia, front_arm, .* or front_stiffness_axle"),
         ({"front_stiffness": 1e4, "front_stiffness_axle": 2e4}, ValueError, "exclude each other"),
+        (
+            {"base": "coms", "rear_stiffness": 1e4},
+            ValueError,
+            "rear_stiffness must name its convention: rear_stiffness_per_tyre or rear_stiffness_ax",
+        ),
         (5, TypeError, "a vehicle is a name, the path of"),
     ],
 )
@@ -132,6 +137,17 @@ def test_the_vehicles_of_the_stanford_log_come_with_the_package() -> None:
     assert (nominal.front_stiffness, nominal.rear_stiffness) == (0.35e5, 0.6e5)
     assert (fitted.front_stiffness, fitted.rear_stiffness) == (2.165e4, 4.29e4)
     assert fitted.yaw_inertia == 1340.0
+
+
+def test_a_whole_mapping_is_per_tyre_and_builds_the_env_again() -> None:
+    soft = COMS.scaled(0.8)
+    env = gym.make("sideslip/YawVision-v0", vehicle=soft.to_dict())
+    assert env.spec is not None
+    again = gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json()))
+    assert again.get_wrapper_attr("config").vehicle == soft
+    scenario = {"base": "straight", "vehicle": {"front_stiffness": 7000.0}}  # as of `Vehicle`
+    env = gym.make("sideslip/YawVision-v0", scenario=scenario)
+    assert env.get_wrapper_attr("_now").vehicle.front_stiffness == 7000.0
 
 
 def test_an_env_takes_what_the_reader_takes(tmp_path: Path) -> None:

@@ -14,7 +14,9 @@ from sideslip.envs.record import PACKET
 from sideslip.envs.vehicle.tyres import FIALA, Tyre, lateral_forces
 from sideslip.estimators import Estimator, make_estimator
 from sideslip.estimators.analysis.bound import bound
+from sideslip.estimators.core.layers import respawn
 from sideslip.estimators.core.tyres import axle_force
+from sideslip.estimators.design.assemble import HAZARD, RESPAWN
 
 assert sideslip.__version__
 LINEAR: dict[str, Any] = {
@@ -139,6 +141,17 @@ def test_what_a_member_remembers_of_its_tyres_is_forgotten_too() -> None:
     filter_.step(record.fast[:4501], record.packets[due])
     (new,) = (f for f in filter_.filters[1:] if f.fresh > 0.0)
     assert (new.snapshot_P[:-1, new.tyres, new.tyres] > new.spread).all()
+
+
+def test_a_member_begins_anew_at_the_odds_of_a_change_since_the_last_one() -> None:
+    base, ((log, _), *_) = drives(1)
+    filter_ = built(base, log, members=3)
+    filter_.run(log)
+    weight = filter_.filters.weight
+    weight[1:] = [-1.0, 2.0, -9.0]
+    respawn(filter_.filters)
+    assert weight[1:3].tolist() == [-3.0, 0.0]
+    assert np.exp(weight[3]) == pytest.approx(HAZARD * RESPAWN)
 
 
 def test_no_member_of_a_bank_is_another_s_twin() -> None:

@@ -7,11 +7,16 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
+from sideslip.envs.backend.decorators import plain
+from sideslip.envs.engine.packing import car_of
+from sideslip.envs.record import FAST
 from sideslip.envs.sensors.link import SlowSensor
+from sideslip.envs.vehicle.actuators import yaw_moment
 from sideslip.envs.vehicle.linear import course, velocity_and_roll, vision
 from sideslip.envs.vehicle.vehicle import COMS, PASSENGER_CAR
 from sideslip.estimators import make_estimator
 from sideslip.estimators.core.transition import build, discretise
+from sideslip.estimators.design.models import signals
 from tests.estimators.simulation import CAMERA, GPS
 
 STEPS = (0.001, 0.01, 0.033, 0.1, 0.2)
@@ -121,6 +126,14 @@ def test_process_noise_means_the_same_at_every_tick() -> None:
     assert fine.filters[0].Q[0, 0] == pytest.approx(1e-6)
     assert coarse.filters[0].Q[0, 0] == pytest.approx(1e-5)
     assert single.filters[0].Q[0, 0] == pytest.approx(33e-6)
+
+
+@pytest.mark.parametrize("vehicle", [COMS, PASSENGER_CAR], ids=["coms", "passenger-car"])
+def test_the_yaw_moment_of_a_fast_row_is_the_plants(vehicle: Any) -> None:
+    row = np.random.default_rng(0).normal(size=len(FAST))
+    found = sum(factor * row[column] for column, factor in signals(vehicle)["N_z"])
+    torques = row[FAST.torque_left], row[FAST.torque_right]
+    assert found == pytest.approx(plain(yaw_moment)(*torques, car_of(vehicle)), rel=1e-12)
 
 
 @pytest.mark.parametrize("turning", [0.0, 0.3, -1.2])

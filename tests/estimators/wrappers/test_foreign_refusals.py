@@ -12,6 +12,7 @@ from sideslip.estimators import (
     EstimateObservation,
     make_estimator,
     smooth,
+    vector,
 )
 from sideslip.estimators.make import ESTIMATORS, register_estimator
 from tests.estimators.wrappers.constant import Constant
@@ -106,3 +107,20 @@ def test_a_record_without_rows_or_of_other_ticks() -> None:
     log.record.fast, log.record.dt = log.record.fast[:0], 1e-3
     with pytest.raises(ValueError, match="the record has 0 of"):
         found.run(log)
+
+
+@pytest.mark.parametrize(
+    ("argument", "message"),
+    [
+        ({"outputz": ["beta"]}, "unknown argument of EstimateObservation 'outputz'; .*'outputs'"),
+        ({"gyro_noize": 0.1}, "exact-kf: unknown option 'gyro_noize'; did you mean 'gyro_noise'"),
+        ({"gyro_noise": 0.1}, r"passed as options=\{'gyro_noise': 0.1\}"),
+    ],
+)
+def test_a_misplaced_argument_is_refused_with_the_nearest_name(
+    argument: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(TypeError, match=message):
+        EstimateObservation(gym.make(VISION), "exact-kf", **argument)
+    with pytest.raises(TypeError, match=message):
+        vector.EstimateObservation(gym.make_vec(VISION, 2), "exact-kf", **argument)

@@ -1,6 +1,7 @@
 """The lane finder on rendered pictures whose truth is known."""
 
 from collections.abc import Iterable
+from dataclasses import replace
 from itertools import product
 from math import radians
 
@@ -8,8 +9,11 @@ import numpy as np
 import pytest
 
 pytest.importorskip("cv2")
+import cv2
+
 from sideslip.envs.backend.decorators import plain
 from sideslip.envs.sensors.camera import View, lane_offset
+from sideslip.envs.sensors.camera.consensus import Place, search
 from sideslip.envs.sensors.camera.finder import Lane, LaneFinder
 from sideslip.envs.sensors.camera.pinhole import Pinhole
 from sideslip.envs.sensors.camera.road_image import Appearance, Painter, Scene
@@ -97,6 +101,17 @@ def test_pitch_and_roll_are_told_from_the_lane() -> None:
     assert lane.y_l == pytest.approx(1.5, abs=0.04)
 
 
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_of_two_lanes_the_cars_own_is_taken(side: float) -> None:
+    """Even where the marking beyond the next lane is the fresher one."""
+    width = 3.7
+    x = np.tile(np.linspace(6.0, 30.0, 60), 3)
+    y = np.repeat(side * width * np.array([-0.5, 0.5, 1.5]), 60)
+    weight = np.repeat([1.0, 1.2, 1.1], 60)
+    best = search(x, y, weight, Place(1.2, 1.5, 5.0, width))[0]
+    assert best.values[1] == pytest.approx(0.0, abs=0.05)
+
+
 @pytest.mark.parametrize("noise", [0.0, 2.0, 30.0])
 def test_without_markings_the_lane_is_lost_and_no_number_is_wild(noise: float) -> None:
     bare = Painter(CAMERA, Appearance(wear=1.0, noise=noise, shadow=0.5), FINDER.rows)
@@ -119,6 +134,45 @@ def test_one_picture_one_answer_in_grey_and_in_colour() -> None:
     FINDER.find(CLEAR.picture(Scene(psi=-0.3, y=2.0), 2))
     assert FINDER.find(picture) == first
     assert FINDER.find(np.repeat(picture[..., None], 3, 2)) == first
+
+
+def scaled(width: int) -> Pinhole:
+    """The camera with pictures of so many pixels across."""
+    scale = width / CAMERA.size[0]
+    K = np.diag([scale, scale, 1.0]) @ np.array(CAMERA.K)
+    K[:2, 2] += 0.5 * (scale - 1.0)
+    return replace(CAMERA, K=tuple(map(tuple, K)), size=(width, round(scale * CAMERA.size[1])))
+
+
+@pytest.mark.parametrize("width", [320, 480, 640, 1920, 3840])
+def test_one_working_scale_finds_the_same_lane_in_a_picture_of_any_size(width: int) -> None:
+    finder = LaneFinder(scaled(width))
+    way = cv2.INTER_AREA if width < 1280 else cv2.INTER_LINEAR
+    for scene in (Scene(psi=0.05, y=-0.4, s=3.0), Scene.bend(0.006, psi=-0.04, y=0.5)):
+        picture = CLEAR.picture(scene, 1)
+        whole = FINDER.find(picture)
+        other = cv2.resize(picture, finder.camera.size, interpolation=way)
+        lane = finder.find(np.asarray(other, np.uint8))
+        np.testing.assert_allclose(lane[:2], whole[:2], atol=0.01)
+        assert lane.curvature == pytest.approx(whole.curvature, abs=1e-3)
+        assert lane.quality == pytest.approx(min(1.0, width / 640), abs=0.1)
+
+
+def test_a_working_scale_asks_for_as_many_rows_and_points_whatever_the_picture() -> None:
+    assert len({len(LaneFinder(scaled(width)).rows_ahead) for width in (320, 1280, 3840)}) == 1
+
+
+def test_quality_falls_with_what_was_seen() -> None:
+    picture = CLEAR.picture(Scene(psi=0.05, y=0.2), 1)
+    full = FINDER.find(picture)
+    glare, near = picture.copy(), picture.copy()
+    glare[:, 900:] = 255  # beside the lane
+    lane = FINDER.find(glare)
+    assert full.quality == 1.0 and 0.0 < lane.quality < 0.8
+    assert lane[:2] == pytest.approx(full[:2], abs=0.01)
+    row = float(CAMERA.pixels_of(np.array(10.0), np.array(0.0))[1])
+    near[: round(row)] = 85  # nothing is painted beyond
+    assert 0.0 < FINDER.find(near).quality < 0.35
 
 
 def test_a_picture_of_another_size_and_a_blind_camera_are_refused() -> None:

@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 
 pytest.importorskip("cv2")
+import cv2
 
 from sideslip.envs.sensors.camera.chessboard import calibrated
 from sideslip.envs.sensors.camera.films import read_picture
-from sideslip.envs.sensors.camera.finder import LaneFinder
+from sideslip.envs.sensors.camera.finder import Lane, LaneFinder
 from sideslip.envs.sensors.camera.mounting import default_camera, mounted
 from sideslip.envs.sensors.camera.pinhole import Pinhole
-from sideslip.envs.sensors.camera.road_image import Painter, Scene
+from sideslip.envs.sensors.camera.road_image import Image, Painter, Scene
 
 ROOT = Path(__file__).resolve().parents[4]
 PLACES = [folder / "shared" / "data" / "lane_images" for folder in (ROOT, ROOT.parent)]
@@ -32,6 +33,63 @@ def test_the_vanishing_point_has_tilt_and_height(tilt: float) -> None:
     assert found.height == pytest.approx(1.2, rel=0.05)
     with pytest.raises(ValueError, match="no pair of markings"):
         mounted(camera, np.zeros((720, 1280), np.uint8), 3.5)
+
+
+CAR = Pinhole(tilt=0.05, height=1.2)
+
+
+@pytest.mark.parametrize(
+    ("scene", "camera"),
+    [
+        (Scene(psi=0.16, y=0.2), CAR),  # no heading in a lane
+        (Scene.bend(0.008), CAR),  # not straight
+        (Scene(y=0.2), replace(CAR, height=4.0)),
+        (Scene(y=0.2), replace(CAR, height=0.6)),
+        (Scene(y=0.2), replace(CAR, tilt=-0.18)),
+    ],
+)
+def test_geometry_that_no_car_has_is_no_lane(scene: Scene, camera: Pinhole) -> None:
+    with pytest.raises(ValueError, match="no lane"):
+        mounted(camera, Painter(camera).picture(scene), 3.5)
+
+
+@pytest.mark.parametrize("turns", [1, 2, 3])
+def test_a_picture_on_its_side_or_its_head_is_no_lane(turns: int) -> None:
+    picture = np.rot90(Painter(Pinhole(tilt=0.0)).picture(Scene(y=0.2)), turns).copy()
+    with pytest.raises(ValueError, match="no lane"):
+        mounted(default_camera((picture.shape[1], picture.shape[0])), picture, 3.5)
+
+
+@pytest.mark.parametrize("width", [320, 640, 3840])
+def test_one_working_scale_has_the_mounting_at_any_size(width: int) -> None:
+    camera = replace(default_camera((1280, 720)), height=1.3)
+    picture = Painter(camera).picture(Scene(psi=0.02, y=0.2, s=1.0))
+    size = width, width * 9 // 16
+    found = mounted(default_camera(size), np.asarray(cv2.resize(picture, size), np.uint8), 3.5)
+    assert found.size == size and found.tilt == pytest.approx(0.0, abs=radians(0.6))
+    assert found.height == pytest.approx(1.3, rel=0.05)
+
+
+@recorded
+@pytest.mark.parametrize("name", ["straight_lines1.jpg", "solidWhiteRight.jpg"])
+def test_a_recording_has_one_lane_at_any_size_mirrored_and_none_on_its_side(name: str) -> None:
+    picture = read_picture(IMAGES / name)
+    height, width = picture.shape[:2]
+
+    def lane(picture: Image) -> Lane:
+        camera = mounted(default_camera((picture.shape[1], picture.shape[0])), picture, WIDTH)
+        return LaneFinder(camera, WIDTH, near=6.0, far=30.0).find(picture)
+
+    whole = lane(picture)
+    for wide in (320, 640, 1920, 3840):
+        size = wide, wide * height // width
+        found = lane(np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8))
+        assert abs(np.degrees(found.psi - whole.psi)) < 0.5 and abs(found.y - whole.y) < 0.1
+    mirrored = lane(np.ascontiguousarray(picture[:, ::-1]))
+    assert abs(np.degrees(mirrored.psi + whole.psi)) < 0.5 and abs(mirrored.y + whole.y) < 0.1
+    for turns in (1, 2, 3):
+        with pytest.raises(ValueError, match="no lane"):
+            lane(np.rot90(picture, turns).copy())
 
 
 @recorded

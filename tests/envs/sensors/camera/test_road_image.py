@@ -5,10 +5,11 @@ from math import cos, sin
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 pytest.importorskip("cv2")
 from sideslip.envs.sensors.camera.pinhole import Pinhole
-from sideslip.envs.sensors.camera.road_image import Appearance, Painter, Scene
+from sideslip.envs.sensors.camera.road_image import Appearance, Painter, Scene, _attitude
 from sideslip.envs.vehicle.dynamics import Road
 
 CAMERA = Pinhole()
@@ -46,6 +47,14 @@ def test_the_solid_marking_lies_where_a_walk_along_the_road_ends(scene: Scene) -
             x, y = walked(scene, ahead, aside)
             column, row = np.round(CAMERA.pixels_of(np.array(x), np.array(y))).astype(int)
             assert (picture[row, column] > 150) == bright, (ahead, aside)
+
+
+def test_a_body_rolls_and_then_nods() -> None:
+    """Left side up and nose down are positive; a rotation keeps lengths and angles."""
+    for roll, pitch in ((0.3, 0.0), (0.0, 0.2), (-0.1, 0.05)):
+        turned = Rotation.from_euler("YX", [pitch, roll]).as_matrix()
+        np.testing.assert_allclose(_attitude(roll, pitch), turned, atol=1e-15)
+    assert _attitude(0.1, 0.0)[2, 1] > 0.0 > _attitude(0.0, 0.1)[2, 0]
 
 
 def test_dashes_move_with_the_car() -> None:

@@ -1,0 +1,195 @@
+"""The process of a contestant: it gets observations, or records, and returns actions or estimates.
+
+The environment, its seeds and the results stay with the driver. What is asked comes pickled; the
+answers are bytes of which nothing is unpickled.
+"""
+
+import ctypes
+import faulthandler
+import importlib.util
+import json
+import os
+import resource
+import signal
+import site
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ...agents import make_agent
+from ...agents.env_facts import EnvView
+from ...envs.arguments import actions_of
+from ...envs.sensors.link import SlowSensor
+from ...estimators.make import make_estimator
+from ...estimators.user_files import reason_of
+from ..control.build import Checked
+
+MEMORY = 4 * 2**30
+"""Bytes of address space of a contestant."""
+WRITTEN = 2**26
+"""Bytes of the longest file that it may write, in its scratch folder."""
+DONE, FAILED = b"d", b"f"
+
+_PACKAGE = Path(__file__).resolve().parents[2]
+_INSTALLED = {*site.getsitepackages(), sys.prefix, sys.base_prefix, str(_PACKAGE)}
+_SYSTEM = ("/proc", "/sys", "/dev", "/etc", "/usr", "/lib", "/lib64")
+_OPENS = {"open": 0, "ctypes.dlopen": 0, "import": 1}  # audit events, the argument with the path
+
+
+class Start(NamedTuple):
+    """What the process is told before any code of the contestant runs.
+
+    Args:
+        scratch: The one folder in which it may write.
+        allowed: Files that it may open beside the installation; None notes what it opens.
+    """
+
+    scratch: str
+    allowed: frozenset[str] | None
+
+
+class Contestant:
+    """The agent, or the estimators of all rows, of one process."""
+
+    def __init__(self) -> None:
+        self._agent: Any = None
+        self._state: Any = None
+        self._estimators: dict[int, Any] = {}
+
+    def agent(self, source: str, view: EnvView, options: Mapping[str, Any]) -> bytes:
+        """Build the agent of a text that `make_agent` takes."""
+        env: Any = view
+        agent = make_agent(source, env, **options)
+        self._agent = Checked(agent, view.num_envs, view.facts.width)
+        return b""
+
+    def predict(self, observation: Any, start: Any) -> bytes:
+        """Return the actions of all rows, float32 (rows, width); the memory stays here."""
+        action, self._state = self._agent.predict(observation, self._state, start)
+        rows, width = self._agent.shape
+        return actions_of(action, rows, width, fail=True).tobytes()
+
+    def estimator(self, row: int, source: str, arguments: Mapping[str, Any]) -> bytes:
+        """Build the estimator of a row; return the names of its states as JSON."""
+        self._estimators[row] = make_estimator(source, **arguments)
+        return json.dumps(self._estimators[row].names).encode()
+
+    def reset(self, row: int, sensors: Mapping[str, SlowSensor], first: int) -> bytes:
+        """Reset the estimator of a row."""
+        self._estimators[row].reset(sensors, first)
+        return b""
+
+    def step(self, records: Sequence[tuple[int, Any, Any]]) -> bytes:
+        """Let some rows take fast rows and packets; return each x and P, float64."""
+        parts = []
+        for row, fast, packets in records:
+            estimator = self._estimators[row]
+            estimator.step(fast, packets)
+            parts += [np.asarray(estimator.x).tobytes(), np.asarray(estimator.P).tobytes()]
+        return b"".join(parts)
+
+
+def main() -> None:
+    """Serve the driver on the connection whose descriptor is the first argument."""
+    driver = Connection(int(sys.argv[1]))
+    (start,) = driver.recv()
+    faulthandler.register(signal.SIGUSR1, all_threads=False)
+    opened: set[str] = set()
+
+    def refuse(text: str) -> None:
+        driver.send_bytes(FAILED + text.encode())
+        os._exit(1)
+
+    confine(Path(start.scratch))
+    sys.addaudithook(_audit(opened, start, refuse))
+    driver.send_bytes(DONE + json.dumps(time.process_time()).encode())
+    contestant = Contestant()
+    with suppress(EOFError):
+        while True:
+            name, *arguments = driver.recv()
+            try:
+                answer = (
+                    json.dumps(sorted(opened)).encode()
+                    if name == "opened"
+                    else getattr(contestant, name)(*arguments)
+                )
+            except MemoryError as error:
+                refuse(f"{reason_of(error)}; a contestant has {MEMORY / 2**30:g} GiB of memory")
+            except Exception as error:
+                refuse(reason_of(error))
+            driver.send_bytes(DONE + answer)
+
+
+def _audit(
+    opened: set[str], start: Start, refuse: Callable[[str], None]
+) -> Callable[[str, tuple[Any, ...]], None]:
+    """Make the audit hook that notes what is opened outside the installation, or ends there."""
+    skipped = tuple(f"{os.path.realpath(each)}/" for each in {*_INSTALLED, *_SYSTEM, start.scratch})
+
+    def hook(event: str, arguments: tuple[Any, ...]) -> None:
+        place = _OPENS.get(event)
+        path = None if place is None else arguments[place]
+        if not isinstance(path, str | bytes | os.PathLike) or not path:
+            return
+        real = os.path.realpath(os.fsdecode(path))
+        with suppress(ValueError, NotImplementedError):  # bytecode stands for its source
+            real = importlib.util.source_from_cache(real)
+        if real.startswith(skipped) or real in opened or not os.path.isfile(real):
+            return
+        opened.add(real)
+        if start.allowed is not None and real not in start.allowed:
+            refuse(f"it opened {real}, which it had not opened in the rehearsal")
+
+    return hook
+
+
+def confine(scratch: Path) -> None:
+    """Limit this process for good: its memory, and where it may write."""
+    for kind, most in (
+        (resource.RLIMIT_AS, MEMORY),
+        (resource.RLIMIT_FSIZE, WRITTEN),
+        (resource.RLIMIT_CORE, 0),
+    ):
+        resource.setrlimit(kind, (most, most))
+    if sys.platform == "linux":
+        libc = ctypes.CDLL(None, use_errno=True)
+        libc.prctl(1, 9, 0, 0, 0)  # PR_SET_PDEATHSIG: killed with the driver
+        libc.prctl(38, 1, 0, 0, 0)  # PR_SET_NO_NEW_PRIVS
+        _landlock(libc, {scratch: _WRITES, Path(os.devnull): _WRITES & _OF_FILES})
+
+
+# Linux's Landlock (landlock(7)): its system calls, and the rights to change files.
+_CREATE, _ADD, _RESTRICT = 444, 445, 446
+_WRITES = sum(1 << bit for bit in (1, *range(4, 15)))
+_OF_FILES = 1 << 1 | 1 << 14  # write, truncate
+_NEWER = {1: 1 << 13 | 1 << 14, 2: 1 << 14}  # rights that this version does not know
+_SIGNALS = 0b11  # sockets and signals to processes outside
+
+
+def _landlock(libc: Any, rights: Mapping[Path, int]) -> None:
+    """Deny this process to change files, but for some below these paths, and to reach others.
+
+    Nothing happens where the kernel has no Landlock.
+    """
+    version = libc.syscall(_CREATE, None, 0, 1)
+    if version < 1:
+        return
+    known = _WRITES & ~_NEWER.get(version, 0)
+    scoped = _SIGNALS if version >= 6 else 0
+    size = 24 if scoped else 8
+    attributes = (ctypes.c_uint64 * 3)(known, 0, scoped)
+    ruleset = libc.syscall(_CREATE, ctypes.byref(attributes), ctypes.c_size_t(size), 0)
+    for path, right in rights.items():
+        descriptor = os.open(path, os.O_PATH)
+        rule = (right & known).to_bytes(8, sys.byteorder) + descriptor.to_bytes(4, sys.byteorder)
+        libc.syscall(_ADD, ruleset, 1, ctypes.c_char_p(rule), 0)
+        os.close(descriptor)
+    if libc.syscall(_RESTRICT, ruleset, 0):
+        raise OSError(ctypes.get_errno(), "Landlock refused the contestant's rules")
+    os.close(ruleset)

@@ -1,0 +1,144 @@
+"""Cars that the stated one is not, each driven twice: for the identification and held out."""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+
+import sideslip
+from sideslip.agents.rollout import rollout
+from sideslip.envs.record import FAST, PACKET, Array, Log
+from sideslip.envs.vehicle.vehicle import LATERAL, PASSENGER_CAR, Vehicle, critical_speed
+
+assert sideslip.__version__
+EVERY, STEP = 10, 0.01  # ticks to a row; s of a steering trace
+NOISE = {"gyro": 0.005, "accel": 0.1, "wheel": 0.05, "course": 0.0407}
+
+
+class DrawnCar(NamedTuple):
+    """A car and its logs: one to identify from, one held out.
+
+    ratio: I/(m l_f l_r) of the car. kind: which sensors the first log has. late: s, of the GPS.
+    """
+
+    car: Vehicle
+    log: Log
+    held_out: Log
+    ratio: float
+    kind: str
+    late: float
+
+
+def steering_trace(rng: np.random.Generator, duration: float, amplitude: float) -> Array:
+    """Sines, and steps that are held, with ramps of 0.25 s between them, in rad at the wheels."""
+    t = np.arange(round(duration / STEP)) * STEP
+    angle = np.zeros(len(t))
+    for _ in range(3):
+        size, frequency, phase = rng.uniform((0.1, 0.08, 0.0), (0.5, 0.9, 6.28))
+        angle += amplitude * size * np.sin(2.0 * np.pi * frequency * t + phase)
+    held, k = np.zeros(len(t)), 0
+    while k < len(t):
+        rows = round(rng.uniform(0.8, 3.0) / STEP)
+        held[k : k + rows] = amplitude * rng.choice([0.0, 0.0, rng.uniform(-0.8, 0.8)])
+        k += rows
+    smooth = np.convolve(held, np.ones(25) / 25.0, "same")
+    return np.asarray((angle + smooth) * np.minimum(1.0, t / 0.5))
+
+
+def scenario_of(car: Vehicle) -> dict[str, Any]:
+    """Disturbed drives of this car after a steering trace, which is to be added."""
+    return {
+        "base": "random-steering",
+        "steering": "trace",
+        "trace_step": STEP,
+        "surge_frequency": 0.05,
+        "half_width": 1e4,
+        "disturbance_force": 150.0,
+        "disturbance_moment": 150.0,
+        "front_stiffness": 1.0,
+        "rear_stiffness": 1.0,
+        "vehicle": {name: getattr(car, name) for name in (*LATERAL, "sprung_mass")},
+    }
+
+
+def simulate(scenario: dict[str, Any], seed: int) -> Log:
+    """A drive at 100 Hz whose GPS packets bear the time of their arrival."""
+    env: Any = gym.make("sideslip/YawGps-v0", scenario=scenario, vehicle="passenger-car")
+    log = rollout(env, seed=seed).log
+    whole = log.record.fast[1:]
+    fast = whole[EVERY - 1 :: EVERY].copy()
+    rows = len(fast)
+    fast[:, FAST.steer] = whole[: rows * EVERY, FAST.steer].reshape(-1, EVERY).mean(axis=1)
+    packets = log.record.packets_of("gps").copy()
+    arrived = np.ceil(packets[:, PACKET.arrived] / EVERY)
+    packets[:, PACKET.captured] = packets[:, PACKET.arrived] = arrived
+    packets = packets[(arrived >= 1) & (arrived <= rows)]
+    record = dataclasses.replace(
+        log.record, fast=fast, packets=packets, first=1, dt=EVERY * log.record.dt
+    )
+    truth = {"beta": log.truth["beta"][1:][EVERY - 1 :: EVERY][:rows]}
+    return dataclasses.replace(log, record=record, slow={"gps": log.slow["gps"]}, truth=truth)
+
+
+def without(log: Log, accel: bool, course: bool) -> Log:
+    """The log without its lateral acceleration, without its GPS."""
+    record = log.record
+    if accel:
+        fast = record.fast.copy()
+        fast[:, FAST.accel_y] = 0.0
+        present = tuple(name for name in record.present if name != "accel_y")
+        record = dataclasses.replace(record, fast=fast, present=present)
+    if course:
+        record = dataclasses.replace(record, packets=record.packets[:0])
+    return dataclasses.replace(log, record=record, slow={} if course else log.slow)
+
+
+def drawn_car(seed: int, duration: float = 60.0, held_out: float = 30.0) -> DrawnCar:
+    """A passenger car with other tyres, inertia and load, and its two drives; one that the steering
+    loses is drawn again."""
+    rng = np.random.default_rng((seed, 7))
+    while True:
+        drawn = _drawn(rng, seed, duration, held_out)
+        if all(
+            len(log.time) > 0.95 * each / (EVERY * 1e-3)
+            for log, each in zip((drawn.log, drawn.held_out), (duration, held_out), strict=True)
+        ):
+            return drawn
+
+
+def _drawn(rng: np.random.Generator, seed: int, duration: float, held_out: float) -> DrawnCar:
+    stated = PASSENGER_CAR
+    speed, surge = rng.uniform(14.0, 24.0), rng.choice([0.0, rng.uniform(0.2, 0.8)])
+    while True:
+        front, rear = rng.uniform(0.6, 1.4, 2)
+        ratio, load = rng.uniform(0.7, 1.1), rng.uniform(0.0, 0.25)
+        mass = stated.mass * (1.0 + load)
+        car = stated.scaled(front, rear).replace(
+            mass=mass,
+            sprung_mass=stated.sprung_mass + load * stated.mass,
+            yaw_inertia=ratio * mass * stated.front_arm * stated.rear_arm,
+        )
+        if critical_speed(car) > speed + 6.0:
+            break
+    noisy = np.exp(rng.uniform(np.log(0.5), np.log(4.0)))
+    scenario = scenario_of(car) | {
+        "speed": speed,
+        "surge": surge,
+        "friction": rng.uniform(0.8, 1.0),
+        "gyro_bias": rng.uniform(-0.005, 0.005),
+        "gps_latency": round(rng.uniform(0.1, 0.3), 2),
+        "noise": {name: noisy * size for name, size in NOISE.items()},
+    }
+    kind = ("all", "no accel_y", "no course", "gyro alone")[seed % 4]
+    logs = []
+    for drive, lasts in enumerate((duration, held_out)):
+        changes: dict[str, Any] = {"speed": speed * rng.uniform(0.85, 1.1)} if drive else {}
+        size = rng.uniform(0.5, 1.2) * 0.05 * min(1.0, (16.0 / speed) ** 1.2)
+        trace = steering_trace(rng, lasts, size)
+        changes |= {"trace": tuple(trace), "duration": lasts}
+        logs.append(simulate(scenario | changes, 2 * seed + drive))
+    log = without(
+        logs[0], kind in ("no accel_y", "gyro alone"), kind in ("no course", "gyro alone")
+    )
+    return DrawnCar(car, log, logs[1], ratio, kind, scenario["gps_latency"])

@@ -1,0 +1,195 @@
+"""Stiffnesses and yaw inertia scaled together leave the yaw rate as it is; identification does not
+slide down that valley, its intervals know it, and no estimator gets worse by the found car."""
+
+import dataclasses
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+from scipy.stats import t as student
+from typer.testing import CliRunner
+
+from sideslip.benchmarks.cli.main import app
+from sideslip.benchmarks.recorded.bicycle_fit import Fit, Theta, fit, windows_of
+from sideslip.benchmarks.recorded.checks import saturated
+from sideslip.benchmarks.recorded.identify import POSSIBLE, TYRES, identify
+from sideslip.benchmarks.recorded.noises import noise_levels
+from sideslip.benchmarks.recorded.run import Settings, run_estimators
+from sideslip.benchmarks.recorded.wires import Wires, corrected
+from sideslip.envs.record import FAST, Array, Log
+from sideslip.envs.vehicle.vehicle import PASSENGER_CAR, Vehicle
+
+from .drawn_cars import NOISE, drawn_car, scenario_of, simulate, steering_trace, without
+from .simulated import as_table
+from .slalom import columns, saved
+
+ESTIMATORS = ("bicycle-kf", "multirate-kf", "exact-kf", "joint")
+NEUTRAL = PASSENGER_CAR.replace(  # steers nearly neutrally: the valley is exact
+    mass=1776.0,
+    sprung_mass=1500.0,
+    front_arm=1.3,
+    rear_arm=1.45,
+    front_stiffness=72500.0,
+    rear_stiffness=65000.0,
+    yaw_inertia=3180.0,
+)
+
+
+def share(car: Vehicle) -> float:
+    return car.yaw_inertia / (car.mass * car.front_arm * car.rear_arm)
+
+
+def driven(car: Vehicle, quieter: float = 0.2) -> Log:
+    """Mild random steering with sensors and disturbances that are quieter than usual."""
+    trace = steering_trace(np.random.default_rng(3), 60.0, 0.02)
+    changes = {
+        "speed": 20.0,
+        "surge": 0.7,
+        "duration": 60.0,
+        "trace": tuple(trace),
+        "gps_latency": 0.2,
+        "noise": {name: quieter * sd for name, sd in NOISE.items()},
+        "disturbance_force": 150.0 * quieter,
+        "disturbance_moment": 150.0 * quieter,
+    }
+    return simulate(scenario_of(car) | changes, 5)
+
+
+def with_lagging_gyro(log: Log, lag: float) -> Log:
+    fast, keeps = log.record.fast.copy(), math.exp(-log.record.dt / lag)
+    fast[:, FAST.gyro] = lfilter([1.0 - keeps], [1.0, -keeps], fast[:, FAST.gyro])
+    return dataclasses.replace(log, record=dataclasses.replace(log.record, fast=fast))
+
+
+def test_a_yaw_rate_alone_does_not_lead_down_the_valley() -> None:
+    """A gyro behind a low-pass is what no model here has; the stated tyres are 1.3 times too stiff.
+    Without priors tyres and inertia stay 1.3 and 1.5 times the true ones, within 5 %."""
+    log = with_lagging_gyro(without(driven(NEUTRAL), accel=True, course=True), 0.08)
+    found = identify([log], NEUTRAL.scaled(1.3))
+    true = (2.0 * NEUTRAL.front_stiffness, 2.0 * NEUTRAL.rear_stiffness, NEUTRAL.yaw_inertia)
+    for row, value in zip(found.findings[:3], true, strict=True):
+        assert abs(row.value - value) < row.half, row
+    assert POSSIBLE[0] < share(found.car) < POSSIBLE[1] and found.reason == ""
+
+
+def test_the_priors_bound_what_a_disturbed_yaw_rate_leaves_open() -> None:
+    log = with_lagging_gyro(without(driven(NEUTRAL, 1.0), accel=True, course=True), 0.08)
+    w = dataclasses.replace(windows_of([log], [saturated(log)]), tyres="fiala")
+    found = fit(NEUTRAL, w, Theta(), ("front", "rear", "inertia", "gyro_bias"))
+    for name, sd in (("front", 0.4), ("rear", 0.4), ("inertia", 0.2)):
+        assert abs(getattr(found.theta, name)) < sd and found.half(name) < 2.3 * sd, name
+
+
+def test_the_course_tells_what_the_yaw_rate_leaves_open() -> None:
+    log = driven(NEUTRAL)
+    stated = NEUTRAL.scaled(1.3)
+    alone, course = (
+        identify([without(log, accel=True, course=not kept)], stated) for kept in (False, True)
+    )
+    for row, row_alone in zip(course.findings[:2], alone.findings[:2], strict=True):
+        assert row.told and row.half < 0.7 * row_alone.half
+    assert course.wires.latency["gps"] == pytest.approx(0.2, abs=0.03)
+    assert course.car.rear_stiffness == pytest.approx(NEUTRAL.rear_stiffness, rel=0.15)
+
+
+def test_an_interval_without_data_is_that_of_the_prior() -> None:
+    """And a prior belongs to no stretch: it stays when one is left out."""
+    nothing = Fit(
+        Theta(front=0.1),
+        ("front",),
+        np.ones(1),
+        np.zeros((20, 1, 1)),
+        np.zeros((20, 1)),
+        np.array([0.4**-2]),
+        np.array([0.0]),
+    )
+    assert nothing.half("front") == pytest.approx(student.ppf(0.975, 19) * 0.4)
+    pulled = dataclasses.replace(nothing, H=nothing.H + 1.0, pull=np.array([0.3 * 0.4**-2]))
+    gone = np.arange(20) < 15
+    assert pulled.without(gone)[0] == pytest.approx(-0.3 * 0.4**-2 / (5.0 + 0.4**-2))
+
+
+def test_rows_that_are_alike_count_once() -> None:
+    white = np.random.default_rng(0).normal(0.0, 0.2, (60, 1, 400))
+    held = np.repeat(white[:, :, ::25], 25, axis=2)
+    seldom = np.where(np.arange(400) % 10 == 0, white, 0.0)
+    for rows, level in ((white, 0.2), (held, 0.2 * 5.0), (seldom, 0.2)):
+        assert noise_levels(rows, 0.01)[0] == pytest.approx(level, rel=0.15)
+
+
+def test_a_car_that_cannot_be_is_not_identified(tmp_path: Path) -> None:
+    """Nothing is written, the exit status is 1, and a replay keeps the stated car."""
+    log = driven(PASSENGER_CAR.replace(yaw_inertia=0.35 * 2700.0))
+    found = identify([log], PASSENGER_CAR)
+    assert "I/(m l_f l_r) = 0." in found.reason
+    assert found.car == PASSENGER_CAR and found.wires.gain == 1.0
+    assert not any(row.told for row in found.findings[:8])
+    path, out = tmp_path / "drive.csv", tmp_path / "car.toml"
+    as_table(log).to_csv(path, index=False)
+    run = CliRunner().invoke(app, ["identify", str(path), "--out", str(out)])
+    assert run.exit_code == 1 and not out.exists()
+    assert run.output.splitlines()[1].startswith("Not identified.")
+    again = ["replay", str(path), "--vehicle", "identify", "--estimator", "exact-kf"]
+    run = CliRunner().invoke(app, again)
+    assert run.exit_code == 0, run.output
+    text = " ".join(run.output.split())
+    assert "the car is not identified" in text and "passenger-car-identified" not in text
+
+
+def test_five_rows_identify_nothing(tmp_path: Path) -> None:
+    path = saved(tmp_path, **{name: values[:5] for name, values in columns().items()})
+    out = tmp_path / "car.toml"
+    run = CliRunner().invoke(app, ["identify", str(path), "--out", str(out)])
+    assert run.exit_code == 1 and not out.exists()
+    assert "Not identified." in run.output
+
+
+def slip_errors(log: Log, car: Vehicle, wires: Wires) -> Array:
+    how = Settings(estimators=ESTIMATORS, seeds=1, noise=wires.noise)
+    squares = run_estimators([corrected(log, wires)], car, how).squares
+    return np.array([squares[name][0] for name in ESTIMATORS])
+
+
+@pytest.mark.parametrize(
+    ("seeds", "laws"),
+    [
+        (range(3), TYRES[:1]),
+        pytest.param(range(100, 130), (None, TYRES[0]), marks=pytest.mark.long),
+    ],
+)
+def test_estimators_do_not_get_worse_on_another_drive(
+    seeds: range, laws: tuple[str | None, ...]
+) -> None:
+    """By the drawn cars together, for the chosen law and the linear one of a replay: with the
+    steering, latency and noise that were found, and with the car alone. The chosen law's intervals
+    hold the small-slip stiffness and the inertia per mass."""
+    errors: list[tuple[str | None, Array, Array]] = []
+    outside = []
+    for seed in seeds:
+        drawn = drawn_car(seed)
+        own = Wires(latency={"gps": drawn.late})
+        stated = [slip_errors(drawn.held_out, PASSENGER_CAR, each) for each in (Wires(), own)]
+        for tyres in laws:
+            found = identify([drawn.log], PASSENGER_CAR, tyres=tyres)
+            now = [slip_errors(drawn.held_out, found.car, each) for each in (found.wires, own)]
+            errors.append((tyres, np.array(stated), np.array(now)))
+            if found.wires.latency.get("gps"):
+                assert found.wires.latency["gps"] == pytest.approx(drawn.late, abs=0.06)
+            if tyres is None:
+                load = drawn.car.mass / PASSENGER_CAR.mass
+                true = (2.0 * drawn.car.front_stiffness, 2.0 * drawn.car.rear_stiffness)
+                outside += [
+                    abs(row.value - value / load) > row.half
+                    for row, value in zip(
+                        found.findings[:3], (*true, drawn.car.yaw_inertia), strict=True
+                    )
+                ]
+    for law in laws:
+        before = np.sum([stated for tyres, stated, _ in errors if tyres == law], axis=0)
+        after = np.sum([now for tyres, _, now in errors if tyres == law], axis=0)
+        assert np.all(np.sqrt(after / before) < 1.05), np.sqrt(after / before)
+    assert (
+        not outside or np.mean(outside) < 0.15
+    )  # 95 % intervals, and friction is not the stated one
