@@ -54,7 +54,8 @@ class Child:
             folder = kernel_folder(layer)
             if folder is not None:
                 copy = Path(scratch, "sideslip", "kernels", folder.name)
-                shutil.copytree(folder, copy, dirs_exist_ok=True)
+                with suppress(OSError):  # one that is pruned meanwhile is compiled again
+                    shutil.copytree(folder, copy, dirs_exist_ok=True)
         self._pipe, there = Pipe()
         with there:
             self._process = subprocess.Popen(
