@@ -11,7 +11,7 @@ from rich.table import Table
 from ...envs.arguments import check_choice
 from ..harness.engines import PROCESSES, engine
 from .options import Address, EngineName, command_line
-from .output import check_files, goes_on, wrote
+from .output import check_files, explain_interrupt, wrote
 
 
 def calibrate_command(
@@ -46,7 +46,7 @@ def calibrate_command(
         f"({left * USUAL / 3600:.1f} h in all). Ctrl-C stops; the same command goes on.",
         highlight=False,
     )
-    with engine(engine_name, address), goes_on("run the same command in the same folder"):
+    with engine(engine_name, address), explain_interrupt("run the same command in the same folder"):
         made = calibrate(asked, folder, seeds, command_line(), jobs, console)
     update(path, made)
     forget(cases_of(asked, folder, seeds))

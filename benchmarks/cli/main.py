@@ -22,7 +22,7 @@ from .lane import lane_command
 from .live import live_command
 from .names import KINDS, complete
 from .options import Address, EngineName, options_of
-from .output import check_files, goes_on, show_episode, write_output, wrote
+from .output import check_files, explain_interrupt, show_episode, write_output, wrote
 from .recorded import Mapping, identify_command, replay_command
 from .train import distill_command, train_command, train_estimator_command
 from .tune import tune_app
@@ -233,7 +233,7 @@ def bench(
         done.append(replay_file(log, vehicle, mapping=mapping))
     request = Request(quick, jobs, console, episodes, keep, clairvoyant, challenge)
     how = "the same command" if keep else "add --keep FOLDER, which keeps finished cases"
-    with engine(engine_name, address), goes_on(how):
+    with engine(engine_name, address), explain_interrupt(how):
         done += run_suites(names, request)
     order = [*names, "replay"]
     done.sort(key=lambda suite: order.index(suite.name))

@@ -61,7 +61,7 @@ def check_files(**paths: Path | None) -> None:
 
 
 @contextmanager
-def goes_on(how: str) -> Iterator[None]:
+def explain_interrupt(how: str) -> Iterator[None]:
     """End with exit status 130 where the user interrupts, and say how to continue."""
     try:
         yield

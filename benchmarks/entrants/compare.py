@@ -79,7 +79,7 @@ def compare(
     allowed: frozenset[str] | None = None
     salt = found[0] if found else challenge.salt or salt_of()
     if challenge.fresh:
-        allowed = _rehearsed(challenge, apart, jobs, console)
+        allowed = _find_opened_files(challenge, apart, jobs, console)
         digests = [hashlib.sha256(Path(each).read_bytes()).hexdigest() for each in sorted(allowed)]
         salt = salt_of(*digests, secrets.token_hex(16))
     seeds = challenge.seeds or seeds_of_contests(salt, challenge.episodes)
@@ -91,7 +91,7 @@ def compare(
     return Comparison(challenge, "" if challenge.seeds else salt, bool(found), every)
 
 
-def _rehearsed(
+def _find_opened_files(
     challenge: Challenge, cells: Sequence[Cell], jobs: int | None, console: Console | None
 ) -> frozenset[str]:
     """Find the files that contestants open, theirs included, by a drive on tuning seeds."""

@@ -132,7 +132,7 @@ class Child:
             self._log.read().decode(errors="replace").partition("(most recent call first)")
         )
         if late:
-            return f"no end within {self._limit:g} s{place_of(self._texts, stack)}"
+            return f"no end within {self._limit:g} s{find_place(self._texts, stack)}"
         last = (text.strip().splitlines() or [""])[-1]
         return f"its process ended with status {status}; {last}".rstrip("; ")
 
@@ -149,7 +149,7 @@ class Child:
         return max(spent - self._started, 0.0)
 
 
-def place_of(texts: Sequence[str], stack: str) -> str:
+def find_place(texts: Sequence[str], stack: str) -> str:
     """Say where a user's file was, from a stack whose innermost frame comes first."""
     for file, line in re.findall(r'File "(.*)", line (\d+)', stack):
         if any(Path(file).name in text for text in texts):

@@ -28,12 +28,12 @@ def one_line() -> Iterator[None]:
         yield
     except _OF_USERS as error:
         Console(stderr=True, soft_wrap=True).print(
-            "[bold red]error:[/]", escape(_shortened(str(error))), highlight=False
+            "[bold red]error:[/]", escape(_shorten(str(error))), highlight=False
         )
         sys.exit(2)
 
 
-def _shortened(text: str) -> str:
+def _shorten(text: str) -> str:
     """A message of which the middle is left out where it is long."""
     if len(text) <= _LONGEST:
         return text

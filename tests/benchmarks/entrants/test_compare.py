@@ -173,7 +173,7 @@ def test_fresh_seeds_are_nobodys_to_foresee_and_can_be_driven_again(
 ) -> None:
     """Other ones each time; with the bytes that the driver drew, others for another file."""
     rehearsed = frozenset({str((tmp_path / "pd.py").resolve())})
-    monkeypatch.setattr(compare, "_rehearsed", lambda *_: rehearsed)
+    monkeypatch.setattr(compare, "_find_opened_files", lambda *_: rehearsed)
     found = [compare.compare(challenge(tmp_path, fresh=True)) for _ in range(2)]
     assert found[0].salt != found[1].salt
     again = compare.compare(challenge(tmp_path, salt=found[0].salt))

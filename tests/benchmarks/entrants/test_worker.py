@@ -9,7 +9,7 @@ import pytest
 from sideslip.benchmarks.control.cells import Cell
 from sideslip.benchmarks.control.contests import Contest
 from sideslip.benchmarks.control.episodes import Chunk
-from sideslip.benchmarks.entrants.process import place_of
+from sideslip.benchmarks.entrants.process import find_place
 from sideslip.benchmarks.entrants.worker import drive_apart, drive_users
 
 SHORT = {"scenario": {"base": "gust", "duration": 0.05}}
@@ -81,8 +81,8 @@ def test_what_it_does_to_its_process_is_its_result(
 
 def test_a_hang_is_found_in_the_users_file() -> None:
     stack = 'File "/lib/time.py", line 9 in sleep\n  File "/home/mine.py", line 12'
-    assert place_of(("/home/mine.py:Mine", ""), stack) == ", still in mine.py, line 12"
-    assert place_of(("pd", ""), stack) == ""
+    assert find_place(("/home/mine.py:Mine", ""), stack) == ", still in mine.py, line 12"
+    assert find_place(("pd", ""), stack) == ""
 
 
 FILTER = """
