@@ -1,5 +1,6 @@
 """`sideslip lane`: the lane in a picture or a film, and a camera's intrinsics from chessboards."""
 
+import os
 import time
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -21,6 +22,9 @@ if TYPE_CHECKING:
     from ...envs.sensors.camera.road_image import Image
 
 TRIES = 60  # frames in which a lane is looked for that shows how the camera is mounted
+
+LARGEST = 2**26
+"""Pixels of a picture; a small file may hold many more."""
 
 
 def lane_command(
@@ -45,6 +49,7 @@ def lane_command(
     Without height and tilt among the intrinsics they are estimated from a picture, for a straight
     lane of the width stated; without intrinsics a lens of usual width is assumed.
     """
+    os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(LARGEST))  # read where it is loaded
     with extra("vision", "the lane finder needs {}"):
         import cv2
     from ...envs.sensors.camera.films import PICTURES, Film, read_picture
@@ -63,7 +68,10 @@ def lane_command(
     still = source.suffix.lower() in PICTURES
     check_files(**{"image" if still else "film": out})
     if still:
-        picture = read_picture(source)
+        try:
+            picture = read_picture(source)
+        except cv2.error:
+            raise ValueError(f"{source}: expected a picture of at most {LARGEST} pixels") from None
         finder = _finder([picture], intrinsics, lane_width, source)
         lanes, seconds = _still(picture, finder, out)
     else:
@@ -115,7 +123,10 @@ def _finder(
     if intrinsics is None:
         camera = default_camera((width, height))
     else:
-        camera, known = Pinhole.read(intrinsics), read_document(intrinsics, "camera")
+        try:
+            camera, known = Pinhole.read(intrinsics), read_document(intrinsics, "camera")
+        except OverflowError as error:
+            raise ValueError(f"{intrinsics}: {error}") from None
     if camera.size != (width, height):
         raise ValueError(
             f"{intrinsics}: the camera's pictures are {camera.size[0]} x {camera.size[1]} pixels, "

@@ -1,6 +1,11 @@
 """`sideslip lane` on rendered pictures and films, whole and broken."""
 
 import json
+import os
+import struct
+import subprocess
+import sys
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -116,3 +121,29 @@ def test_what_cannot_be_read_is_one_line_and_nothing_is_written(
         assert status == 2 and said in " ".join(err.split()), arguments
         assert not out.exists() and not (tmp_path / "c.json").exists()
     broken.write_bytes(whole)
+
+
+def chunk(kind: bytes, data: bytes) -> bytes:
+    """A part of a PNG."""
+    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+
+def test_a_small_file_with_a_huge_picture_is_refused(tmp_path: Path) -> None:
+    """Before it takes memory, by a fresh process: the limit is read where OpenCV is loaded."""
+    size, path = 20_000, tmp_path / "huge.png"
+    head = struct.pack(">IIBBBBB", size, size, 1, 0, 0, 0, 0)
+    rows = zlib.compress(bytes(1 + size // 8) * size, 9)
+    parts = ((b"IHDR", head), (b"IDAT", rows), (b"IEND", b""))
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(chunk(*each) for each in parts))
+    command = [sys.executable, "-m", "sideslip", "lane", str(path)]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert done.returncode == 2 and "at most 67108864 pixels" in " ".join(done.stderr.split())
+
+
+def test_a_number_of_400_digits_is_a_line(run: Run, tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "road.png"), PAINTER.picture(Scene()))
+    path = tmp_path / "camera.json"
+    path.write_text('{"K": [[1' + 400 * "0" + ", 0, 1], [0, 1, 1], [0, 0, 1]]}")
+    status, _, error = run("lane", tmp_path / "road.png", "--intrinsics", path)
+    assert status == 2 and "camera.json: int too large" in " ".join(error.split())
