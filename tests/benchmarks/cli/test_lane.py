@@ -144,6 +144,7 @@ def test_a_small_file_with_a_huge_picture_is_refused(tmp_path: Path) -> None:
 def test_a_number_of_400_digits_is_a_line(run: Run, tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "road.png"), PAINTER.picture(Scene()))
     path = tmp_path / "camera.json"
-    path.write_text('{"K": [[1' + 400 * "0" + ", 0, 1], [0, 1, 1], [0, 0, 1]]}")
+    K = f"[[1{400 * '0'}, 0, 1], [0, 1, 1], [0, 0, 1]]"
+    path.write_text(f'{{"K": {K}, "dist": [0, 0, 0, 0, 0], "size": [1280, 720]}}')
     status, _, error = run("lane", tmp_path / "road.png", "--intrinsics", path)
     assert status == 2 and "camera.json: int too large" in " ".join(error.split())
