@@ -142,7 +142,7 @@ def run_estimators(drives: Sequence[Log], vehicle: Vehicle, how: Settings) -> Re
         if how.estimators is not None and name not in (GYRO_ONLY, *how.estimators):
             continue
         slow = next((sensor for sensor in serves if sensor in log.slow), None)
-        if serves and slow is None:
+        if serves and slow is None and name != OWN_NOISE:  # which inertial sensors serve too
             result.remarks[name] = f"left out: needs {' or '.join(serves)}"
             continue
         try:
@@ -183,7 +183,7 @@ def _estimator(name: str, slow: str | None, log: Log, vehicle: Vehicle, how: Set
     if slow is not None:
         options |= {"slow": slow, "q_psi": how.q_psi}
     if name == OWN_NOISE:
-        options = {"slow": slow}
+        options = {"slow": slow} if slow is not None else {}
     if slow == "gps":
         options["course_noise"] = math.radians(max(how.course_noise_deg, LEAST_NOISE))
         options |= {key: how.noise[key] for key in ("course_noise",) if key in how.noise}

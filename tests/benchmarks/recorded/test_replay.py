@@ -219,6 +219,16 @@ def test_no_course_is_emulated_in_a_part_that_lacks_the_logs_own(tmp_path: Path)
     assert "Part 2 has no sample of gps." in suite.text and "emulated" not in suite.text
 
 
+def test_without_gps_and_truth_the_inertial_sensors_serve_more_than_one_filter(
+    tmp_path: Path,
+) -> None:
+    rows = read_csv(saved(tmp_path))
+    rows = rows.drop(columns=[name for name in ("course_rad", "sideslip_rad") if name in rows])
+    rows.assign(accel_y_mps2=0.0).to_csv(tmp_path / "bare.csv", index=False)
+    suite = replay_file(tmp_path / "bare.csv", PASSENGER_CAR, figures=False)
+    assert {row.estimator for row in suite.rows} == {GYRO_ONLY, "joint-robust"}
+
+
 def test_that_most_rows_were_dropped_is_the_first_line(tmp_path: Path) -> None:
     rows = read_csv(saved(tmp_path))
     rows.loc[: 0.6 * len(rows), "yaw_rate_radps"] = math.nan
