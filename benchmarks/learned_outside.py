@@ -5,6 +5,7 @@ sensors and references. Controllers, filters and references are designed from th
 our `Vehicle` describes it; the policies, trained on another one, learn nothing of it.
 """
 
+import json
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -61,6 +62,11 @@ class OutsideContest(Contest):
     def kind(self) -> str:
         """The class whose tuned options everybody has."""
         return f"car-{'steering' if self.like == STEERING else 'yaw'}"
+
+    @property
+    def seed_text(self) -> str:
+        """That of a contest, with the model and the id whose actuators it has."""
+        return json.dumps(json.loads(super().seed_text) | {"model": self.model, "like": self.like})
 
     @property
     def env_options(self) -> dict[str, Any]:

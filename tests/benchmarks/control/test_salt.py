@@ -1,5 +1,6 @@
 """The salt: it follows whoever could have tuned on the test seeds, and its seeds are driven."""
 
+import hashlib
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from sideslip.agents.rollout import rollout
 from sideslip.benchmarks import recovery
 from sideslip.benchmarks.control import calibration, ladder, run, seeds
 from sideslip.benchmarks.control.cells import Cell
-from sideslip.benchmarks.control.contests import Contest, contests
+from sideslip.benchmarks.control.contests import Contest, candidates, contests
 from sideslip.benchmarks.control.episodes import NUMBERS, Driven
 from sideslip.benchmarks.control.run import measure
 from sideslip.benchmarks.control.seeds import (
@@ -22,6 +23,8 @@ from sideslip.benchmarks.control.seeds import (
     seeds_of_contests,
     tuning_seeds,
 )
+from sideslip.benchmarks.learned_outside import KINDS, outside
+from sideslip.envs.outside.plants import OUTSIDE_PLANTS
 
 ONE, OTHER = "0123456789abcdef", "fedcba9876543210"
 SHORT = {"base": "gust", "duration": 0.5}
@@ -139,6 +142,22 @@ def test_seeds_follow_the_salt_and_only_grow() -> None:
     assert salted_seeds(salt_of("more"), 10) != salted_seeds(salt, 10)
     assert len(set(salted_seeds(salt, 1000))) == 1000
     assert not set(salted_seeds(salt, 1000)) & set(tuning_seeds(64))
+
+
+def digest(seeds: list[list[int]]) -> str:
+    """A hash of seeds with their type and shape."""
+    array = np.array(seeds, np.uint32)
+    typed = f"{array.dtype.str}{array.shape}".encode() + array.tobytes()
+    return hashlib.sha256(typed).hexdigest()[:16]
+
+
+def test_seeds_stay_whatever_the_fields_of_a_contest_are_called() -> None:
+    """The files of calibrations and baselines hold costs on these seeds."""
+    every = [Contest(), *candidates()]
+    every += [outside(kind, model) for kind in KINDS for model in OUTSIDE_PLANTS]
+    drawn = [seeds_of_contests(ONE, 4)(each) for each in every]
+    assert digest(drawn) == "609de1ab608afa91"
+    assert digest([calibration.seeds_of(each, 4) for each in every]) == "ed882dd353bfd184"
 
 
 def test_tuning_seeds_are_nobody_elses() -> None:
