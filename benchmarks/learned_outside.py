@@ -111,11 +111,12 @@ def run(
     console: Console | None = None,
     keep: Path | None = None,
     quick: bool = False,
+    salt: str = "",
 ) -> Suite:
     """Every class of `KINDS` on every model.
 
-    episodes: of each. quick: the drift model alone. The rest is of `control.run.measure`. Raises
-    ValueError with the reason where somebody cannot drive.
+    episodes: of each. quick: the drift model alone. salt: of the seeds, "" for `salt_of`'s. The
+    rest is of `control.run.measure`. Raises ValueError with the reason where somebody cannot drive.
     """
     suite = Suite(NAME, "Learned policies in cars that are not ours", _TEXT)
     if find_spec("vehiclemodels") is None:
@@ -128,10 +129,13 @@ def run(
         for kind in KINDS
         for who in contestants(kind)
     ]
-    seeds = seeds_of_contests(salt_of(), episodes)
+    salt = salt or salt_of()
+    seeds = seeds_of_contests(salt, episodes)
     results = measure(cells, seeds, jobs=jobs, console=console, keep=keep, by=drive, title=NAME)
     found = [
-        Found(kind, {each: [everybody(results, outside(kind, each), each)] for each in models})
+        Found(
+            kind, {each: [everybody(results, outside(kind, each), each)] for each in models}, salt
+        )
         for kind in KINDS
     ]
     note = "Other seeds on each model. No training met any."

@@ -1,6 +1,7 @@
 """The salt: it follows whoever could have tuned on the test seeds, and its seeds are driven."""
 
 import hashlib
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import pytest
 import sideslip
 from sideslip.agents.learned.files import ENDING
 from sideslip.agents.rollout import rollout
-from sideslip.benchmarks import recovery
+from sideslip.benchmarks import readme, recovery
 from sideslip.benchmarks.control import calibration, ladder, run, seeds
 from sideslip.benchmarks.control.cells import Cell
 from sideslip.benchmarks.control.contests import Contest, candidates, contests
@@ -24,6 +25,7 @@ from sideslip.benchmarks.control.seeds import (
     tuning_seeds,
 )
 from sideslip.benchmarks.learned_outside import KINDS, outside
+from sideslip.benchmarks.suites import SALTED, SUITES, Request, run_suite
 from sideslip.envs.outside.plants import OUTSIDE_PLANTS
 
 ONE, OTHER = "0123456789abcdef", "fedcba9876543210"
@@ -93,6 +95,31 @@ def test_the_price_of_delay_is_taken_on_the_salts_seeds(monkeypatch: pytest.Monk
     ladder.price_of_delay(salted_seeds(OTHER, 4))
     assert len(cases) == len(ladder.DELAYS) * len(ladder.CONTESTANTS)
     assert {chunk.seeds for _, chunk in cases} == {tuple(salted_seeds(OTHER, 4))}
+
+
+@pytest.mark.parametrize("name", [*SALTED, "readme"])
+def test_a_suite_drives_the_salt_that_it_is_given(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Rows from before and after a change of the sources compare; without one it follows them."""
+    found: list[list[int]] = []
+
+    def stand_in(cells: list[Cell], seeds: Any, **_: Any) -> None:
+        found.append(seeds(GUST)[:4])
+        raise StopIteration
+
+    module = import_module(SUITES.get(name, (".readme",))[0], "sideslip.benchmarks")
+    monkeypatch.setattr(module, "measure", stand_in)
+    monkeypatch.setattr(module, "find_spec", lambda _: True, raising=False)
+    monkeypatch.setattr(module, "check_fresh", lambda *_: None, raising=False)
+    for salt in (ONE, OTHER, ""):
+        with pytest.raises(StopIteration):
+            if module is readme:
+                readme.drive_first(salt=salt)
+            run_suite(name, Request(quick=True, episodes=4, salt=salt))
+    assert found == [
+        salted_seeds(salt or salt_of(), 4, GUST.seed_text) for salt in (ONE, OTHER, "")
+    ]
 
 
 def test_the_salt_follows_every_file_of_the_contestants(
