@@ -87,6 +87,9 @@ def drive_first(
         console: Where progress is shown.
         salt: Of the seeds, "" for the one of the contestants' sources.
 
+    Returns:
+        Cost and failures of each entry in each tier.
+
     Raises:
         ValueError: An entry could not drive.
     """
