@@ -48,9 +48,10 @@ coverage: .venv/ready-all ## lines reached by the tests marked plain, without co
 	NUMBA_DISABLE_JIT=1 $(BIN)/coverage run -m pytest --confcutdir=tests -m "plain and not compiled"
 	$(BIN)/coverage report
 
-lint: .venv/ready-all ## style, format, direction of imports
+lint: .venv/ready-all ## style, format, docstrings' sections, direction of imports
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
+	$(BIN)/pydoclint --quiet envs estimators agents benchmarks
 	$(BIN)/lint-imports
 
 types: .venv/ready-all ## mypy, strict

@@ -1,9 +1,8 @@
 """What `sideslip distill` learns from, the contests of a class with their teacher, what goes on
 from it, and what came of it in each of them."""
 
-import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -186,7 +185,7 @@ def judge(path: Path, kind: str, episodes: int) -> JsonMap:
 
 def _judged(path: Path, contest: Contest, episodes: int) -> JsonMap:
     policy = load_policy(path)
-    seeds = tuple(salted_seeds(policy.salt, episodes, json.dumps(asdict(contest))))
+    seeds = tuple(salted_seeds(policy.salt, episodes, contest.seed_text))
     cells = {
         "policy": Cell(contest, policy.card.estimator, str(path)),
         NOMINAL: Cell(contest, "", NOMINAL),

@@ -95,10 +95,12 @@ def chosen(kind: str) -> list[Contest]:
 
 @dataclass
 class Found:
-    """A class's episodes: of each condition, of each contest in the order of `chosen`."""
+    """A class's episodes: of each condition, of each contest in the order of `chosen`. salt: of
+    their seeds."""
 
     kind: str
     driven: dict[str, list[dict[str, Driven]]] = field(default_factory=dict)
+    salt: str = ""
 
     def shared(self, name: str, condition: str) -> Estimate:
         """A contestant's share of the gap in a condition; NaN of one below `LEAST`."""
@@ -133,14 +135,17 @@ def run(
     console: Console | None = None,
     keep: Path | None = None,
     quick: bool = False,
+    salt: str = "",
 ) -> Suite:
     """Every class that has a policy, in every condition.
 
-    episodes: of each contest and condition. quick: in a few conditions. The rest is of
-    `control.run.measure`. Raises ValueError with the reason where somebody cannot drive.
+    episodes: of each contest and condition. quick: in a few conditions. salt: of the seeds, ""
+    for `salt_of`'s. The rest is of `control.run.measure`. Raises ValueError with the reason where
+    somebody cannot drive.
     """
     suite = Suite(NAME, "Learned policies where contests never are", _TEXT)
-    seeds, results = seeds_of_contests(salt_of(), episodes), dict[str, Results]()
+    salt = salt or salt_of()
+    seeds, results = seeds_of_contests(salt, episodes), dict[str, Results]()
     everyone = [contest for kind in LEARNED for contest in chosen(kind)]
     for condition in QUICK_CONDITIONS if quick else CONDITIONS:
         cells = [
@@ -158,6 +163,7 @@ def run(
                 condition: [everybody(those, contest, condition) for contest in chosen(kind)]
                 for condition, those in results.items()
             },
+            salt,
         )
         for kind in LEARNED
     ]
@@ -221,7 +227,7 @@ def tabled(suite: Suite, found: Found, title: str, env_id: str, driven: str, mor
         ]
         fails = share(found.failed(who)).value
         all_in_all.append([who, *beaten, f"{100.0 * fails:.1f} %", f"{ratio:.2f}"])
-        who_and_how = {"controller": who, "n": episodes, "salt": salt_of()}
+        who_and_how = {"controller": who, "n": episodes, "salt": found.salt}
         for condition, each in mine.items():
             if not np.isfinite(each.value):
                 continue  # there is no gap

@@ -5,6 +5,7 @@ sensors and references. Controllers, filters and references are designed from th
 our `Vehicle` describes it; the policies, trained on another one, learn nothing of it.
 """
 
+import json
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -63,6 +64,11 @@ class OutsideContest(Contest):
         return f"car-{'steering' if self.like == STEERING else 'yaw'}"
 
     @property
+    def seed_text(self) -> str:
+        """That of a contest, with the model and the id whose actuators it has."""
+        return json.dumps(json.loads(super().seed_text) | {"model": self.model, "like": self.like})
+
+    @property
     def env_options(self) -> dict[str, Any]:
         """Options of the env; of the contest's cars only the friction that a designer expects."""
         friction = dict(scenario_from(self.scenario).nominal)["friction"]
@@ -105,11 +111,12 @@ def run(
     console: Console | None = None,
     keep: Path | None = None,
     quick: bool = False,
+    salt: str = "",
 ) -> Suite:
     """Every class of `KINDS` on every model.
 
-    episodes: of each. quick: the drift model alone. The rest is of `control.run.measure`. Raises
-    ValueError with the reason where somebody cannot drive.
+    episodes: of each. quick: the drift model alone. salt: of the seeds, "" for `salt_of`'s. The
+    rest is of `control.run.measure`. Raises ValueError with the reason where somebody cannot drive.
     """
     suite = Suite(NAME, "Learned policies in cars that are not ours", _TEXT)
     if find_spec("vehiclemodels") is None:
@@ -122,10 +129,13 @@ def run(
         for kind in KINDS
         for who in contestants(kind)
     ]
-    seeds = seeds_of_contests(salt_of(), episodes)
+    salt = salt or salt_of()
+    seeds = seeds_of_contests(salt, episodes)
     results = measure(cells, seeds, jobs=jobs, console=console, keep=keep, by=drive, title=NAME)
     found = [
-        Found(kind, {each: [everybody(results, outside(kind, each), each)] for each in models})
+        Found(
+            kind, {each: [everybody(results, outside(kind, each), each)] for each in models}, salt
+        )
         for kind in KINDS
     ]
     note = "Other seeds on each model. No training met any."

@@ -77,8 +77,18 @@ FIRST: Mapping[str, Sequence[tuple[str, str]]] = {
 EPISODES = 32  # a contest, of README's table
 
 
-def drive_first(jobs: int | None = None, console: Console | None = None) -> list[Row]:
+def drive_first(
+    jobs: int | None = None, console: Console | None = None, salt: str = ""
+) -> list[Row]:
     """Drive README's entries in every scored contest with steering; return the tiers' rows.
+
+    Args:
+        jobs: Processes, None for all processors.
+        console: Where progress is shown.
+        salt: Of the seeds, "" for the one of the contestants' sources.
+
+    Returns:
+        Cost and failures of each entry in each tier.
 
     Raises:
         ValueError: An entry could not drive.
@@ -92,7 +102,7 @@ def drive_first(jobs: int | None = None, console: Console | None = None) -> list
         for controller, estimator in entries
         if policies.get(controller, contest.kind) == contest.kind
     ]
-    salt = salt_of()
+    salt = salt or salt_of()
     seeds = seeds_of_contests(salt, EPISODES)
     results = measure(asked, seeds, jobs=jobs, console=console, title="README")
     rows: list[Row] = []
@@ -231,11 +241,12 @@ def main(
     rows: Annotated[Path | None, typer.Argument(help="Of sideslip bench control --json.")] = None,
     add: Annotated[list[str] | None, typer.Option(help="A policy that came later.")] = None,
     first: Annotated[bool, typer.Option("--first", help="Drive README's entries.")] = False,
+    salt: Annotated[str, typer.Option(help="Of the seeds of --first, hexadecimal.")] = "",
 ) -> None:
     """Write rows and the tables made of them, in the repository's root."""
     console = Console(stderr=True)
     if first:
-        found = drive_first(console=console)
+        found = drive_first(console=console, salt=salt)
         _write(FIRST_ROWS, found, README, first_table(found))
     if rows is not None:
         found = tier_rows(rows)

@@ -22,7 +22,8 @@ class Request:
     quick: few seeds. jobs: processes, None for all processors. episodes: of a cell of the matrix,
     or seeds of estimation, unknown and papers; None for the suite's own number. keep: a folder for
     finished cases. clairvoyant: a file of `sideslip calibrate`, None for the package's. challenge:
-    a user's contestants, who drive instead of the matrix.
+    a user's contestants, who drive instead of the matrix. salt: of the seeds of `SALTED`, "" for
+    the one of the contestants' sources.
     """
 
     quick: bool = False
@@ -32,6 +33,7 @@ class Request:
     keep: Path | None = None
     clairvoyant: Path | None = None
     challenge: "Challenge | None" = None
+    salt: str = ""
 
 
 _Run = Callable[[Any, Request], Suite]
@@ -50,12 +52,12 @@ def _control(suite: Any, r: Request) -> Any:
 
         return run_challenge(r.challenge, r.jobs, r.console, r.keep)
     usual = QUICK_EPISODES if r.quick else EPISODES
-    return suite.run(r.episodes or usual, r.jobs, r.console, r.keep, r.quick, r.clairvoyant)
+    return suite.run(r.episodes or usual, r.jobs, r.console, r.keep, r.quick, r.clairvoyant, r.salt)
 
 
 def _learned(suite: Any, r: Request) -> Any:
     usual = suite.QUICK_EPISODES if r.quick else suite.EPISODES
-    return suite.run(r.episodes or usual, r.jobs, r.console, r.keep, r.quick)
+    return suite.run(r.episodes or usual, r.jobs, r.console, r.keep, r.quick, r.salt)
 
 
 def _following(suite: Any, r: Request) -> Any:
@@ -86,6 +88,18 @@ SUITES: dict[str, tuple[str, _Run]] = {
     "speed": (".speed.suite", lambda suite, r: suite.run(r.quick, r.console)),
 }
 """The module of each suite, and how a request runs it."""
+SALTED = ("control", "learned", "learned-outside")
+"""The suites whose test seeds follow the contestants' sources."""
+
+
+def check_salt(salt: str, names: Sequence[str]) -> None:
+    """Raise ValueError for a salt that is not hexadecimal, or that no suite takes."""
+    if salt and not {*SALTED} & {*names}:
+        raise ValueError(f"--salt goes with {', '.join(SALTED)}, got {', '.join(names)}")
+    if salt:
+        from .control.seeds import salted_seeds
+
+        salted_seeds(salt, 1)
 
 
 def run_suites(names: Sequence[str], request: Request) -> list[Suite]:

@@ -133,6 +133,9 @@ def is_ours(host: str, origin: str | None) -> bool:
     Args:
         host: The request's Host, "name:port".
         origin: Its Origin, None where it has none.
+
+    Returns:
+        Whether both are of this server.
     """
     name = host.rpartition(":")[0].strip("[]") or host
     with suppress(ValueError):

@@ -29,7 +29,6 @@ EnvId = Annotated[str, typer.Option("--env", help="The contests of this id alone
 Fresh = Annotated[
     bool, typer.Option("--fresh", help="Seeds drawn after your files are hashed: publishable.")
 ]
-Salt = Annotated[str, typer.Option(help="Of a fresh run, whose seeds are driven again.")]
 Limit = Annotated[float, typer.Option(help="s of wall time for a contestant in a contest.")]
 
 
@@ -50,8 +49,8 @@ def challenge_of(
     """The challenge of a command line, None without contestants; ValueError for options that go
     with them alone, or with the suite `control` alone."""
     if not (agents or estimators):
-        if scenarios or env_id or fresh or salt:
-            raise ValueError("--scenario, --env, --fresh and --salt go with --agent or --estimator")
+        if scenarios or env_id or fresh:
+            raise ValueError("--scenario, --env and --fresh go with --agent or --estimator")
         return None
     if list(suites) not in ([], ["control"]):
         raise ValueError("--agent and --estimator go with the suite control alone")

@@ -13,15 +13,15 @@ from ...envs.arguments import check_choice
 from ..harness.engines import PROCESSES, engine
 from ..harness.errors import one_line
 from ..report.page import check_page, write_page
-from ..suites import SUITES, Request, run_suites
+from ..suites import SUITES, Request, check_salt, run_suites
 from .calibrate import calibrate_command
-from .challenge import Agents, EnvId, Estimators, Fresh, Limit, Salt, Scenarios, challenge_of
+from .challenge import Agents, EnvId, Estimators, Fresh, Limit, Scenarios, challenge_of
 from .enjoy import enjoy_command
 from .export import Trust, export_command
 from .lane import lane_command
 from .live import live_command
 from .names import KINDS, complete
-from .options import Address, EngineName, options_of
+from .options import Address, EngineName, Salt, options_of
 from .output import check_files, explain_interrupt, show_episode, write_output, wrote
 from .recorded import Mapping, identify_command, replay_command
 from .train import distill_command, train_command, train_estimator_command
@@ -224,6 +224,7 @@ def bench(
     names = suites or (["control"] if challenge else list(SUITES))
     for name in names:
         check_choice("suite", name, SUITES)
+    check_salt(salt, names)
     check_files(html=html, json=json, parquet=parquet, picture=picture, page=page)
     check_page(page, names)
     done = []
@@ -231,7 +232,7 @@ def bench(
         from ..recorded.replay_file import replay_file
 
         done.append(replay_file(log, vehicle, mapping=mapping))
-    request = Request(quick, jobs, console, episodes, keep, clairvoyant, challenge)
+    request = Request(quick, jobs, console, episodes, keep, clairvoyant, challenge, salt)
     how = "the same command" if keep else "add --keep FOLDER, which keeps finished cases"
     with engine(engine_name, address), explain_interrupt(how):
         done += run_suites(names, request)

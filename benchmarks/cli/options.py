@@ -1,4 +1,4 @@
-"""Options of commands: NAME=VALUE, those of cases on a cluster, and the line as it was said."""
+"""Options of commands: NAME=VALUE, those of several commands, and the line as it was said."""
 
 import json
 import shlex
@@ -12,6 +12,9 @@ EngineName = Annotated[
     str, typer.Option("--engine", help="What runs the cases: processes, or ray, a cluster.")
 ]
 Address = Annotated[str, typer.Option(help="HOST:PORT of the cluster; default: this machine's.")]
+Salt = Annotated[
+    str, typer.Option(help="Of the test seeds, hexadecimal; default: of the contestants' sources.")
+]
 
 
 def option_of(text: str) -> tuple[str, Any]:

@@ -90,7 +90,7 @@ class Entry:
 
 def seeds_of(contest: Contest, count: int = SEEDS) -> list[int]:
     """The first `count` seeds of a contest's calibration; more seeds begin with the same ones."""
-    texts = [f"clairvoyant {__version__} {json.dumps(asdict(contest))} {i}" for i in range(count)]
+    texts = [f"clairvoyant {__version__} {contest.seed_text} {i}" for i in range(count)]
     digests = [hashlib.sha256(text.encode()).digest() for text in texts]
     return [_FIRST + int.from_bytes(digest[:4]) % _FIRST for digest in digests]
 

@@ -68,6 +68,18 @@ class Contest:
         return f"car-{'steering' if self.env_id == STEERING else 'yaw'}"
 
     @property
+    def seed_text(self) -> str:
+        """JSON from which the seeds are drawn. Its keys stay when a field gets another name."""
+        parts = {
+            "tier": self.tier,
+            "env_id": self.env_id,
+            "vehicle": self.vehicle,
+            "reference": self.reference,
+            "scenario": self.scenario,
+        }
+        return json.dumps(parts)
+
+    @property
     def env_options(self) -> dict[str, Any]:
         """Options of the env."""
         car = {"vehicle": self.vehicle, "nominal": self.vehicle} if self.vehicle else {}

@@ -50,15 +50,16 @@ def run(
     keep: Path | None = None,
     quick: bool = False,
     clairvoyant: Path | None = None,
+    salt: str = "",
 ) -> Suite:
     """All tiers, the ladder, the price of delay, and pictures.
 
     episodes: a cell (slow controllers have at most 64). keep: a folder in which finished cases
     stay, so that a run that was stopped goes on. quick: a few contests, without the slow
     contestants and the price of delay. clairvoyant: a file of `sideslip calibrate`, None: the
-    package's, if there is one.
+    package's, if there is one. salt: of the seeds, "" for `salt_of`'s.
     """
-    salt = salt_of()
+    salt = salt or salt_of()
     played = some_of(contests()) if quick else list(contests())
     asked = list(cells(played, quick))
     entries = _calibrated(clairvoyant, played)

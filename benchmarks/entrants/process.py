@@ -82,6 +82,9 @@ class Child:
             message: A method of `Contestant` by name, and its arguments.
             length: Bytes of the answer, where they are known.
 
+        Returns:
+            The answer's bytes.
+
         Raises:
             ContestantError: The contestant failed, ended, was too slow or sent something else.
         """

@@ -143,6 +143,9 @@ def drive_apart(chunk: Chunk, limit: float = LIMIT, allowed: Iterable[str] | Non
         chunk: Whose contestants are names and files.
         limit: Seconds of wall time.
         allowed: Files that a child may open, of `Start`.
+
+    Returns:
+        The episodes.
     """
     return _drive_apart(chunk, limit, allowed)[0]
 

@@ -20,7 +20,11 @@ Tensor = torch.Tensor
 
 
 class Observer:
-    """Observations and reports of a batch: `sensors` are the slow ones present."""
+    """Observations and reports of a batch.
+
+    sensors: the slow ones present. bounds: (2, k), of the observation's entries. obs_dtype: of the
+    observations.
+    """
 
     def __init__(
         self,
@@ -30,7 +34,6 @@ class Observer:
         dtype: torch.dtype,
         obs_dtype: torch.dtype,
     ) -> None:
-        """bounds: (2, k), of the observation's entries. obs_dtype: of the observations."""
         self._obs_dtype = obs_dtype
         self._sensors, self._switches = sensors, switches
         self._bounds = bounds[:, :, None]

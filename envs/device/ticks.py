@@ -54,10 +54,10 @@ class Now(NamedTuple):
 
 
 class Ticks:
-    """The ticks of rows of one kind."""
+    """The ticks of rows of one kind. compile: a tick, and the chances of all ticks, are one call of
+    `torch.compile` each."""
 
     def __init__(self, kind: Kind, dtype: torch.dtype, compile: bool) -> None:
-        """compile: a tick, and the chances of all ticks, are one call of `torch.compile` each."""
         self.kind = kind
         self._normals, self._steering_at = on_tensors(dtype, normals, steering_at)
         self._fixed, self._advance, self._changed = on_tensors(dtype, fixed_of, advance, changed)

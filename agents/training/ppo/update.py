@@ -141,12 +141,14 @@ def parts_of(policy: Any) -> Parts | None:
 
 
 class Surrogate:
-    """PPO's clipped objective of a minibatch, and its slopes to all that is learned."""
+    """PPO's clipped objective of a minibatch, and its slopes to all that is learned.
+
+    rows: the most of a minibatch. value, entropy: the weights of these losses.
+    """
 
     def __init__(
         self, adam: Adam, parts: Parts, rows: int, clip_range: float, value: float, entropy: float
     ) -> None:
-        """rows: the most of a minibatch. value, entropy: the weights of these losses."""
         self._clip_range, self._value, self._entropy = clip_range, value, entropy
         activation, pairs = (
             ACTIVATIONS[parts.activation],

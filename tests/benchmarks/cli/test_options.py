@@ -61,6 +61,7 @@ CASES = [
          ("--control-period 20", "options.control_period", 20)),
     *_of("bench control", f"{CLI}.main.run_suites",
          ("--episodes 8", "request.episodes", 8),
+         ("--salt ab12", "request.salt", "ab12"),
          ("--keep cases", "request.keep", Path("cases")),
          ("--jobs 3", "request.jobs", 3)),
     *_of("bench control", f"{CLI}.main.engine", *CLUSTER),

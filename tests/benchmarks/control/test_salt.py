@@ -1,5 +1,7 @@
 """The salt: it follows whoever could have tuned on the test seeds, and its seeds are driven."""
 
+import hashlib
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +12,10 @@ import pytest
 import sideslip
 from sideslip.agents.learned.files import ENDING
 from sideslip.agents.rollout import rollout
-from sideslip.benchmarks import recovery
+from sideslip.benchmarks import readme, recovery
 from sideslip.benchmarks.control import calibration, ladder, run, seeds
 from sideslip.benchmarks.control.cells import Cell
-from sideslip.benchmarks.control.contests import Contest, contests
+from sideslip.benchmarks.control.contests import Contest, candidates, contests
 from sideslip.benchmarks.control.episodes import NUMBERS, Driven
 from sideslip.benchmarks.control.run import measure
 from sideslip.benchmarks.control.seeds import (
@@ -22,6 +24,9 @@ from sideslip.benchmarks.control.seeds import (
     seeds_of_contests,
     tuning_seeds,
 )
+from sideslip.benchmarks.learned_outside import KINDS, outside
+from sideslip.benchmarks.suites import SALTED, SUITES, Request, run_suite
+from sideslip.envs.outside.plants import OUTSIDE_PLANTS
 
 ONE, OTHER = "0123456789abcdef", "fedcba9876543210"
 SHORT = {"base": "gust", "duration": 0.5}
@@ -92,6 +97,31 @@ def test_the_price_of_delay_is_taken_on_the_salts_seeds(monkeypatch: pytest.Monk
     assert {chunk.seeds for _, chunk in cases} == {tuple(salted_seeds(OTHER, 4))}
 
 
+@pytest.mark.parametrize("name", [*SALTED, "readme"])
+def test_a_suite_drives_the_salt_that_it_is_given(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Rows from before and after a change of the sources compare; without one it follows them."""
+    found: list[list[int]] = []
+
+    def stand_in(cells: list[Cell], seeds: Any, **_: Any) -> None:
+        found.append(seeds(GUST)[:4])
+        raise StopIteration
+
+    module = import_module(SUITES.get(name, (".readme",))[0], "sideslip.benchmarks")
+    monkeypatch.setattr(module, "measure", stand_in)
+    monkeypatch.setattr(module, "find_spec", lambda _: True, raising=False)
+    monkeypatch.setattr(module, "check_fresh", lambda *_: None, raising=False)
+    for salt in (ONE, OTHER, ""):
+        with pytest.raises(StopIteration):
+            if module is readme:
+                readme.drive_first(salt=salt)
+            run_suite(name, Request(quick=True, episodes=4, salt=salt))
+    assert found == [
+        salted_seeds(salt or salt_of(), 4, GUST.seed_text) for salt in (ONE, OTHER, "")
+    ]
+
+
 def test_the_salt_follows_every_file_of_the_contestants(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -139,6 +169,22 @@ def test_seeds_follow_the_salt_and_only_grow() -> None:
     assert salted_seeds(salt_of("more"), 10) != salted_seeds(salt, 10)
     assert len(set(salted_seeds(salt, 1000))) == 1000
     assert not set(salted_seeds(salt, 1000)) & set(tuning_seeds(64))
+
+
+def digest(seeds: list[list[int]]) -> str:
+    """A hash of seeds with their type and shape."""
+    array = np.array(seeds, np.uint32)
+    typed = f"{array.dtype.str}{array.shape}".encode() + array.tobytes()
+    return hashlib.sha256(typed).hexdigest()[:16]
+
+
+def test_seeds_stay_whatever_the_fields_of_a_contest_are_called() -> None:
+    """The files of calibrations and baselines hold costs on these seeds."""
+    every = [Contest(), *candidates()]
+    every += [outside(kind, model) for kind in KINDS for model in OUTSIDE_PLANTS]
+    drawn = [seeds_of_contests(ONE, 4)(each) for each in every]
+    assert digest(drawn) == "609de1ab608afa91"
+    assert digest([calibration.seeds_of(each, 4) for each in every]) == "ed882dd353bfd184"
 
 
 def test_tuning_seeds_are_nobody_elses() -> None:
