@@ -68,7 +68,7 @@ class Algorithm:
 
 
 ALGORITHMS = {
-    "ppo": Algorithm(f"{__package__}.ppo.update:PPO", "ppo"),
+    "ppo": Algorithm("stable_baselines3:PPO", "ppo"),
     "sac": Algorithm("stable_baselines3:SAC", "sac"),
     "tqc": Algorithm("sb3_contrib:TQC", "tqc"),
     "recurrent-ppo": Algorithm("sb3_contrib:RecurrentPPO", "ppo_lstm"),

@@ -2,7 +2,7 @@
 
 All learn as they go: a call is one rollout and the gradient steps on it. All have the same number
 of environments and the same settings; those of Pendulum-v1 step in stable-baselines3's own vector
-environment. `sideslip train` has the same PPO with an update by NumPy.
+environment.
 """
 
 from dataclasses import replace
@@ -16,7 +16,6 @@ from .timing import Contestant, Effort, Taken
 
 YAW, PENDULUM_ID = "sideslip/YawFusion-v0", "Pendulum-v1"
 OURS = "PPO, YawFusion-v0"
-UPDATED = f"{OURS}, update by NumPy"
 PENDULUM = f"PPO, {PENDULUM_ID}"
 
 COUNT = 256  # environments
@@ -24,16 +23,14 @@ ROUNDS = 5  # at most: a round takes long
 
 
 def _learner(name: str) -> Contestant:
-    """One of the three; a call is a rollout and its update."""
+    """One of the two; a call is a rollout and its update."""
     from stable_baselines3 import PPO
     from stable_baselines3.common.env_util import make_vec_env
 
-    from ...agents.training.ppo import update
     from ...agents.vec_env import env as bridge
 
     make, env_id = (make_vec_env, PENDULUM_ID) if name == PENDULUM else (bridge.make_vec_env, YAW)
-    kind: Any = update.PPO if name == UPDATED else PPO
-    model = kind("MlpPolicy", make(env_id, COUNT, seed=0), seed=0, device="cpu", **_settings())
+    model = PPO("MlpPolicy", make(env_id, COUNT, seed=0), seed=0, device="cpu", **_settings())
     steps = COUNT * model.n_steps
 
     def work() -> None:
@@ -53,15 +50,14 @@ def _settings() -> dict[str, Any]:
 def add(suite: Suite, effort: Effort) -> tuple[dict[str, Taken], dict[str, str]]:
     """Rows and a table; what each contestant took, and why others are absent."""
     field = Field()
-    for name in (OURS, UPDATED, PENDULUM):
+    for name in (OURS, PENDULUM):
         field.add(name, partial(_learner, name), "stable-baselines3")
     settings = ", ".join(
         f"{name} = {value}" for name, value in (_settings() if field.contestants else {}).items()
     )
     note = (
         "PPO of stable-baselines3, rollout and gradient steps, on as many environments each: "
-        f"{COUNT}, YawFusion-v0 through the bridge; {settings}, the rest is its default. "
-        "Update by NumPy: the same minibatches, losses and steps to rounding, as in sideslip train."
+        f"{COUNT}, YawFusion-v0 through the bridge; {settings}, the rest is its default."
     )
     fewer = replace(effort, rounds=max(1, min(effort.rounds // 2, ROUNDS)))
     return field.measure(suite, "Cost of a learned env-step", "step", fewer, note)

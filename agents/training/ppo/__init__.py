@@ -1,1 +1,0 @@
-"""PPO whose update is taken by NumPy."""
