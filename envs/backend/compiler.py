@@ -16,25 +16,30 @@ import hashlib
 import logging
 import time
 from collections.abc import Iterator
+from inspect import iscode
 from pathlib import Path
 from typing import Any
 
 from llvmlite import binding
-from numba.core import types
+from numba.core import typed_passes, types, untyped_passes
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler
+from numba.core.compiler_machinery import PassManager
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.dispatcher import _FunctionCompiler
 from numba.core.environment import lookup_environment
 from numba.core.funcdesc import default_mangler
 from numba.core.registry import CPUDispatcher
 from numba.core.sigutils import normalize_signature
+from numba.core.targetconfig import ConfigStack
 from numba.core.typing import make_concrete_template
 
 from . import kernel_file
 from .cache import notice
 
 _logger = logging.getLogger("sideslip.compiler")
+_resolve = types.Function.get_call_type
+_found: dict[Any, Any] = {}
 _spent = [0.0]  # CPU-s on kernels so far, to tell a kernel's own from those it waited for
 
 
@@ -89,7 +94,45 @@ class _Apart:
         return binding.parse_assembly("")
 
 
+_PASSES = {
+    untyped_passes.TranslateByteCode: None,
+    untyped_passes.FixupArgs: None,
+    untyped_passes.IRProcessing: None,
+    untyped_passes.InlineClosureLikes: "closures",
+    untyped_passes.RewriteSemanticConstants: None,
+    untyped_passes.DeadBranchPrune: None,
+    untyped_passes.GenericRewrites: None,
+    untyped_passes.RewriteDynamicRaises: None,
+    untyped_passes.ReconstructSSA: None,
+    typed_passes.NopythonTypeInference: None,
+    typed_passes.PreLowerStripPhis: None,
+    typed_passes.NopythonRewrites: "counted",
+    typed_passes.IRLegalization: "counted",
+    typed_passes.NativeLowering: None,
+    typed_passes.NoPythonBackend: None,
+}
+
+
+class _Passes(PassManager):
+    """Passes without numba's report of each, for which it writes out all types."""
+
+    def _runPass(self, index: int, step: Any, state: Any) -> None:
+        step.analysis = self._analysis
+        step.run_pass(state)
+
+
 class _PartPipeline(Compiler):
+    def define_pipelines(self) -> list[_Passes]:
+        """numba's own, without those that have nothing to do in our functions: there are no
+        closures in most, and no arrays to count where there is no `_nrt`."""
+        counted, codes = self.state.flags.nrt, self.state.func_id.code.co_consts
+        passes = _Passes("part")
+        for each, needed in _PASSES.items():
+            if needed is None or (counted if needed == "counted" else any(map(iscode, codes))):
+                passes.add_pass(each, each.__name__)
+        passes.finalize()
+        return [passes]
+
     def compile_extra(self, func: Any) -> Any:
         self.state.library = Part(self.state.targetctx.codegen(), func.__qualname__)
         return super().compile_extra(func)
@@ -210,7 +253,7 @@ class Kernel(CPUDispatcher):
             logging.INFO,
         )
         start, nested = time.process_time(), _spent[0]
-        with _without_collection():
+        with _quickly():
             result = _linked(
                 self._part_compiler.compile(args, None) if self.apart else self.part(args)
             )
@@ -220,14 +263,26 @@ class Kernel(CPUDispatcher):
         return result
 
 
+def _resolved(function: Any, context: Any, args: Any, kws: Any) -> Any:
+    """What numba finds for an operator or a function of its own: once, not at each place, twice."""
+    if kws:
+        return _resolve(function, context, args, kws)
+    key = function, context, args, ConfigStack.top_or_none().nrt
+    if key not in _found:
+        _found[key] = _resolve(function, context, args, kws)
+    return _found[key]
+
+
 @contextlib.contextmanager
-def _without_collection() -> Iterator[None]:
+def _quickly() -> Iterator[None]:
     """No search for cycles among a compiler's millions of objects: a fifth of its time."""
-    enabled = gc.isenabled()
+    enabled, resolve = gc.isenabled(), types.Function.get_call_type
     gc.disable()
+    types.Function.get_call_type = _resolved
     try:
         yield
     finally:
+        types.Function.get_call_type = resolve
         if enabled:
             gc.enable()
 
