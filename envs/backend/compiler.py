@@ -66,6 +66,18 @@ class Part(JITCodeLibrary):
         return module
 
 
+class Whole(JITCodeLibrary):
+    """A kernel's own library, into which all parts are linked."""
+
+    def _optimize_functions(self, module: Any) -> None:
+        """Nothing: parts are optimised, and what is around them is optimised with the whole."""
+
+    def _optimize_final_module(self) -> None:
+        """Once: numba's first run only prepares the counting of references."""
+        passes, options = self.codegen._module_pass_manager()
+        passes.run(self._final_module, options)
+
+
 class _Bare:
     """A part as a kernel of ours links it, which links each part itself."""
 
@@ -291,7 +303,7 @@ def _linked(part: Any) -> tuple[Any, dict[str, Any], list[Path | None]]:
     """A part with everything below it, optimised and emitted; all their environments; the files of
     the kernels apart that it calls."""
     target = part.target_context
-    library = target.codegen().create_library(part.library.name)
+    library = Whole(target.codegen(), part.library.name)
     library.enable_object_caching()
     own, *callees = _with_callees(part.library)
     library.add_llvm_module(own._final_module.clone())  # where others find the function by name
