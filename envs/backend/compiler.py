@@ -10,36 +10,30 @@ and emitted then; that alone is cached on disk.
 All this uses numba's insides, which change: `decorators` does without where they are others.
 """
 
-import contextlib
-import gc
 import hashlib
 import logging
 import time
-from collections.abc import Iterator
 from inspect import iscode
 from pathlib import Path
 from typing import Any
 
 from llvmlite import binding
-from numba.core import typed_passes, types, untyped_passes
+from numba.core import types
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler
-from numba.core.compiler_machinery import PassManager
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.dispatcher import _FunctionCompiler
 from numba.core.environment import lookup_environment
 from numba.core.funcdesc import default_mangler
 from numba.core.registry import CPUDispatcher
 from numba.core.sigutils import normalize_signature
-from numba.core.targetconfig import ConfigStack
 from numba.core.typing import make_concrete_template
 
 from . import kernel_file
 from .cache import notice
+from .passes import lean_passes, quickly
 
 _logger = logging.getLogger("sideslip.compiler")
-_resolve = types.Function.get_call_type
-_found: dict[Any, Any] = {}
 _spent = [0.0]  # CPU-s on kernels so far, to tell a kernel's own from those it waited for
 
 
@@ -106,44 +100,13 @@ class _Apart:
         return binding.parse_assembly("")
 
 
-_PASSES = {
-    untyped_passes.TranslateByteCode: None,
-    untyped_passes.FixupArgs: None,
-    untyped_passes.IRProcessing: None,
-    untyped_passes.InlineClosureLikes: "closures",
-    untyped_passes.RewriteSemanticConstants: None,
-    untyped_passes.DeadBranchPrune: None,
-    untyped_passes.GenericRewrites: None,
-    untyped_passes.RewriteDynamicRaises: None,
-    untyped_passes.ReconstructSSA: None,
-    typed_passes.NopythonTypeInference: None,
-    typed_passes.PreLowerStripPhis: None,
-    typed_passes.NopythonRewrites: "counted",
-    typed_passes.IRLegalization: "counted",
-    typed_passes.NativeLowering: None,
-    typed_passes.NoPythonBackend: None,
-}
-
-
-class _Passes(PassManager):
-    """Passes without numba's report of each, for which it writes out all types."""
-
-    def _runPass(self, index: int, step: Any, state: Any) -> None:
-        step.analysis = self._analysis
-        step.run_pass(state)
-
-
 class _PartPipeline(Compiler):
-    def define_pipelines(self) -> list[_Passes]:
-        """numba's own, without those that have nothing to do in our functions: there are no
-        closures in most, and no arrays to count where there is no `_nrt`."""
-        counted, codes = self.state.flags.nrt, self.state.func_id.code.co_consts
-        passes = _Passes("part")
-        for each, needed in _PASSES.items():
-            if needed is None or (counted if needed == "counted" else any(map(iscode, codes))):
-                passes.add_pass(each, each.__name__)
-        passes.finalize()
-        return [passes]
+    def define_pipelines(self) -> Any:
+        """numba's own, but only the passes that find something to do in a function that neither
+        counts references nor holds another one."""
+        if self.state.flags.nrt or any(map(iscode, self.state.func_id.code.co_consts)):
+            return super().define_pipelines()
+        return [lean_passes()]
 
     def compile_extra(self, func: Any) -> Any:
         self.state.library = Part(self.state.targetctx.codegen(), func.__qualname__)
@@ -261,11 +224,11 @@ class Kernel(CPUDispatcher):
         where = f"cached in {self.folder.parent}" if self.folder else "not cached"
         notice(
             "compiling",
-            f"compiling kernels for this machine, half a minute or more ({where}) ...",
+            f"compiling kernels for this machine, 10 s to a minute ({where}) ...",
             logging.INFO,
         )
         start, nested = time.process_time(), _spent[0]
-        with _quickly():
+        with quickly():
             result = _linked(
                 self._part_compiler.compile(args, None) if self.apart else self.part(args)
             )
@@ -273,30 +236,6 @@ class Kernel(CPUDispatcher):
         own, _spent[0] = spent - (_spent[0] - nested), nested + spent
         _logger.info("compiled %s in %.1f CPU-s", self.py_func.__qualname__, own)
         return result
-
-
-def _resolved(function: Any, context: Any, args: Any, kws: Any) -> Any:
-    """What numba finds for an operator or a function of its own: once, not at each place, twice."""
-    if kws:
-        return _resolve(function, context, args, kws)
-    key = function, context, args, ConfigStack.top_or_none().nrt
-    if key not in _found:
-        _found[key] = _resolve(function, context, args, kws)
-    return _found[key]
-
-
-@contextlib.contextmanager
-def _quickly() -> Iterator[None]:
-    """No search for cycles among a compiler's millions of objects: a fifth of its time."""
-    enabled, resolve = gc.isenabled(), types.Function.get_call_type
-    gc.disable()
-    types.Function.get_call_type = _resolved
-    try:
-        yield
-    finally:
-        types.Function.get_call_type = resolve
-        if enabled:
-            gc.enable()
 
 
 def _linked(part: Any) -> tuple[Any, dict[str, Any], list[Path | None]]:
