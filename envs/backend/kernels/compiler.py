@@ -29,8 +29,8 @@ from numba.core.registry import CPUDispatcher
 from numba.core.sigutils import normalize_signature
 from numba.core.typing import make_concrete_template
 
+from ..cache import notice
 from . import kernel_file
-from .cache import notice
 from .passes import lean_passes, quickly
 
 _logger = logging.getLogger("sideslip.compiler")
