@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ...envs.backend.decorators import jit
+from ...envs.backend.decorators import copied, jit
 from ...envs.backend.primitives import absolute
 from ...envs.task.reference import REFERENCES
 from ...envs.ticks import TICK
@@ -37,8 +37,8 @@ def predicted_state(x: Any, share: Any, z: Any) -> None:
     """
     z[0], z[1] = x[IN.beta_hat], x[IN.gamma_hat]
     z[2] = share * (x[IN.torque_right] - x[IN.torque_left])
-    z[3:7] = x[IN.steer : IN.beta_hat]
-    z[7:] = x[IN.disturbance_1 : IN.disturbance_1 + len(z) - 7]
+    copied(x[IN.steer : IN.beta_hat], z[3:7])
+    copied(x[IN.disturbance_1 : IN.disturbance_1 + len(z) - 7], z[7:])
 
 
 @jit

@@ -95,7 +95,7 @@ def _kernel() -> Any:
         reason = f"our compiler is made for {_SUPPORTED}"
     else:
         try:
-            from .compiler import Kernel
+            from .kernels.compiler import Kernel
 
             return Kernel
         except (ImportError, AttributeError) as error:

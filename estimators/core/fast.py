@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from ...envs.backend.arrays import at, put
-from ...envs.backend.decorators import jit
+from ...envs.backend.decorators import apart, jit
 from ...envs.backend.eights import eight, put_eight, scratch, span
 from ...envs.backend.primitives import absolute, maximum, minimum
 from ...envs.record import FAST
@@ -150,7 +150,7 @@ def _change_speed(f: Memory) -> None:
     f.stretch = 1.0
 
 
-@jit
+@apart
 def advance_state(f: Memory, u: Row) -> None:
     """`propagate` with the model of now, and what else is carried along."""
     if f.stretch != 1.0:
@@ -190,7 +190,7 @@ def _correct_joint(f: Memory, gains: Gains) -> None:
             f.x[j] += K[j] * f.eps[i]
 
 
-@jit
+@apart
 def correct_fast(f: Memory, gains: Gains) -> None:
     """Correct by the fast measurements in f.y; what is not finite is counted and skipped."""
     for i in range(f.fasts):

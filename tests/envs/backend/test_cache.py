@@ -10,8 +10,8 @@ import numba
 import numpy as np
 import pytest
 
-from sideslip.envs.backend import kernel_file
-from sideslip.envs.backend.compiler import Kernel
+from sideslip.envs.backend.kernels import kernel_file
+from sideslip.envs.backend.kernels.compiler import Kernel
 
 MODULE = '''
 """Kernels in a folder named by the first argument."""
@@ -26,7 +26,7 @@ import numpy as np
 for name in ("sideslip", "sideslip.envs"):  # without what they import, which takes as long as numba
     sys.modules[name] = importlib.util.module_from_spec(importlib.util.find_spec(name))
 
-from sideslip.envs.backend.compiler import Kernel
+from sideslip.envs.backend.kernels.compiler import Kernel
 
 FOLDER = Path(sys.argv[1])
 

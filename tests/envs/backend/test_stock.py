@@ -11,7 +11,7 @@ SOURCE = Path(__file__).resolve().parents[3] / "src"
 USE = """
 from sideslip.envs.scenarios.tracks import Path, path_offset
 print(path_offset(Path(1.0, 0.3, 1.0, 0.7, 0.1, 1.0), 0.85).hex(), path_offset.signatures != [])
-print("sideslip.envs.backend.compiler" in sys.modules)
+print("sideslip.envs.backend.kernels.compiler" in sys.modules)
 """
 
 

@@ -11,8 +11,9 @@ from typing import Any
 
 import pytest
 
-from sideslip.envs.backend import cache, kernel_file
-from sideslip.envs.backend.compiler import Kernel
+from sideslip.envs.backend import cache
+from sideslip.envs.backend.kernels import kernel_file
+from sideslip.envs.backend.kernels.compiler import Kernel
 
 kernel_folder = cache.kernel_folder.__wrapped__  # asked anew each time
 LEVELS = ("", "sideslip", "sideslip/kernels", f"sideslip/kernels/{cache.source_stamp('envs')}")

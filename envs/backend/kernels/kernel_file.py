@@ -24,8 +24,8 @@ from numba.core.itanium_mangler import prepend_namespace
 from numba.core.runtime import rtsys
 from numba.core.typing import signature
 
-from .cache import notice, read
-from .files import replaced
+from ..cache import notice, read
+from ..files import replaced
 
 RETURNS = {str(kind): kind for kind in (types.none, types.float64, types.int64, types.boolean)}
 """What a function may return that callers find by name."""

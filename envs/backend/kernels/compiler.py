@@ -10,12 +10,10 @@ and emitted then; that alone is cached on disk.
 All this uses numba's insides, which change: `decorators` does without where they are others.
 """
 
-import contextlib
-import gc
 import hashlib
 import logging
 import time
-from collections.abc import Iterator
+from inspect import iscode
 from pathlib import Path
 from typing import Any
 
@@ -31,8 +29,9 @@ from numba.core.registry import CPUDispatcher
 from numba.core.sigutils import normalize_signature
 from numba.core.typing import make_concrete_template
 
+from ..cache import notice
 from . import kernel_file
-from .cache import notice
+from .passes import lean_passes, quickly
 
 _logger = logging.getLogger("sideslip.compiler")
 _spent = [0.0]  # CPU-s on kernels so far, to tell a kernel's own from those it waited for
@@ -59,6 +58,18 @@ class Part(JITCodeLibrary):
                 below = each.bare() if isinstance(each, Part) else each._get_module_for_linking()
                 module.link_in(below, preserve=True)
         return module
+
+
+class Whole(JITCodeLibrary):
+    """A kernel's own library, into which all parts are linked."""
+
+    def _optimize_functions(self, module: Any) -> None:
+        """Nothing: parts are optimised, and what is around them is optimised with the whole."""
+
+    def _optimize_final_module(self) -> None:
+        """Once: numba's first run only prepares the counting of references."""
+        passes, options = self.codegen._module_pass_manager()
+        passes.run(self._final_module, options)
 
 
 class _Bare:
@@ -90,6 +101,13 @@ class _Apart:
 
 
 class _PartPipeline(Compiler):
+    def define_pipelines(self) -> Any:
+        """numba's own, but only the passes that find something to do in a function that neither
+        counts references nor holds another one."""
+        if self.state.flags.nrt or any(map(iscode, self.state.func_id.code.co_consts)):
+            return super().define_pipelines()
+        return [lean_passes()]
+
     def compile_extra(self, func: Any) -> Any:
         self.state.library = Part(self.state.targetctx.codegen(), func.__qualname__)
         return super().compile_extra(func)
@@ -206,11 +224,11 @@ class Kernel(CPUDispatcher):
         where = f"cached in {self.folder.parent}" if self.folder else "not cached"
         notice(
             "compiling",
-            f"compiling kernels for this machine, half a minute or more ({where}) ...",
+            f"compiling kernels for this machine, 10 s to a minute ({where}) ...",
             logging.INFO,
         )
         start, nested = time.process_time(), _spent[0]
-        with _without_collection():
+        with quickly():
             result = _linked(
                 self._part_compiler.compile(args, None) if self.apart else self.part(args)
             )
@@ -220,23 +238,11 @@ class Kernel(CPUDispatcher):
         return result
 
 
-@contextlib.contextmanager
-def _without_collection() -> Iterator[None]:
-    """No search for cycles among a compiler's millions of objects: a fifth of its time."""
-    enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if enabled:
-            gc.enable()
-
-
 def _linked(part: Any) -> tuple[Any, dict[str, Any], list[Path | None]]:
     """A part with everything below it, optimised and emitted; all their environments; the files of
     the kernels apart that it calls."""
     target = part.target_context
-    library = target.codegen().create_library(part.library.name)
+    library = Whole(target.codegen(), part.library.name)
     library.enable_object_caching()
     own, *callees = _with_callees(part.library)
     library.add_llvm_module(own._final_module.clone())  # where others find the function by name
