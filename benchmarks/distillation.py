@@ -4,6 +4,7 @@ from it, and what came of it in each of them."""
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +23,7 @@ from .control.contests import NOMINAL, ORACLES, PARAMETERS, Contest, changed, co
 from .control.episodes import Chunk, drive
 from .control.scores import gains
 from .control.seeds import salted_seeds
+from .harness.parallel import run_cases
 from .harness.stats import Estimate, geometric_mean, won
 from .policies import enjoy, evaluation
 
@@ -178,13 +180,15 @@ def judge(path: Path, kind: str, episodes: int) -> JsonMap:
     """Drive a policy, `nominal`, the rival and oracle-parameters on seeds made from its weights,
     and write into its card what it costs; what is written."""
     policy, found = load_policy(path), enjoy(str(path), episodes)
-    driven = {each.scenario: _judged(path, each, episodes) for each in contests_of(kind)}
-    own = evaluation(found) | {"cost in % of nominal": driven}
+    those = contests_of(kind)
+    driven = run_cases(partial(_judged, path, episodes), those, "contests", jobs=1)
+    costs = {each.scenario: numbers for each, numbers in zip(those, driven, strict=True)}
+    own = evaluation(found) | {"cost in % of nominal": costs}
     save_policy(path, policy.network, replace(policy.card, evaluation=own))
     return own
 
 
-def _judged(path: Path, contest: Contest, episodes: int) -> JsonMap:
+def _judged(path: Path, episodes: int, contest: Contest) -> JsonMap:
     policy = load_policy(path)
     seeds = tuple(salted_seeds(policy.salt, episodes, json.dumps(asdict(contest))))
     cells = {

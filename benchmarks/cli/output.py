@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from ... import __version__
 from ...envs.backend.files import whole
+from ..harness.parallel import Bar
 from ..harness.results import (
     Row,
     Suite,
@@ -91,6 +92,7 @@ def show_episode(
         f"{drive.log.name}: {drive['t'][-1]:.2f} s, cost {drive.cost:.4g}, "
         f"RMS slip {1e3 * np.sqrt(np.mean(slip**2)):.2f} mrad, "
         f"peak {1e3 * np.max(np.abs(slip)):.2f} mrad" + (", FAILED" if drive.failed else ""),
+        soft_wrap=True,
         markup=False,
         highlight=False,
     )
@@ -167,7 +169,7 @@ def folder_of(task: "Task", start: str, out: Path | None, logs: Path | None) -> 
     return Path("-".join(["train", *filter(None, words), str(task.seed)]))
 
 
-class TrainingBar(Progress):
+class TrainingBar(Bar):
     """Steps, the cost of the newest episodes, and the newest and the best evaluation."""
 
     def __init__(self, console: Console, steps: int, disable: bool) -> None:
@@ -178,8 +180,8 @@ class TrainingBar(Progress):
             TimeElapsedColumn(),
             TimeRemainingColumn(),
         )
-        super().__init__(*columns, console=console, disable=disable)
-        self._task = self.add_task("", total=steps)
+        super().__init__(*columns, console=None if disable else console)
+        self._task = self.add_task("", total=steps, unit="steps")
 
     def show(self, now: "Now") -> None:
         """Show where the training stands."""

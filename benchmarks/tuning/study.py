@@ -129,7 +129,7 @@ def search_on(
     }
     with _quiet(), _storage_errors(study.study_name), progress(console) as bar:
         done = _finished(study, task)
-        shown = bar.add_task(_best_text(study), total=trials, completed=len(done))
+        shown = bar.add_task(_best_text(study), total=trials, completed=len(done), unit="trials")
         while len(done) < trials:
             batch = [study.ask(space) for _ in range(min(BATCH, trials - len(done)))]
             judged = judge([trial.params for trial in batch])
