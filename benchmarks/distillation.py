@@ -182,7 +182,7 @@ def judge(path: Path, kind: str, episodes: int) -> JsonMap:
     policy, found = load_policy(path), enjoy(str(path), episodes)
     those = contests_of(kind)
     driven = run_cases(partial(_judged, path, episodes), those, "contests", jobs=1)
-    costs = {each.scenario: numbers for each, numbers in zip(those, driven, strict=True)}
+    costs = dict(zip((each.scenario for each in those), driven, strict=True))
     own = evaluation(found) | {"cost in % of nominal": costs}
     save_policy(path, policy.network, replace(policy.card, evaluation=own))
     return own

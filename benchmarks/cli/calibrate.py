@@ -41,11 +41,8 @@ def calibrate_command(
     asked = [known[name] for name in contest or known]
     console, folder = Console(), Path(f".{path.name}.cases").absolute()
     left = sum(not each.path.exists() for each in cases_of(asked, folder, seeds))
-    console.print(
-        f"{left} of {len(asked) * seeds} episodes are left. Ctrl-C stops; the same command goes "
-        "on.",
-        highlight=False,
-    )
+    text = f"{left} of {len(asked) * seeds} episodes are left; the same command goes on if stopped."
+    console.print(text, highlight=False)
     with engine(engine_name, address), explain_interrupt("run the same command in the same folder"):
         made = calibrate(asked, folder, seeds, command_line(), jobs, console)
     update(path, made)

@@ -5,6 +5,7 @@
 import shlex
 import shutil
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -18,7 +19,7 @@ from .enjoy import judged
 from .export import Trust
 from .names import check_env, complete
 from .options import command_line, options_of
-from .output import TrainingBar, check_files, folder_of, words_of, wrote
+from .output import check_files, folder_of, show_training, words_of, wrote
 
 if TYPE_CHECKING:
     from ...agents.training.train import Trained
@@ -137,15 +138,15 @@ def train_command(
     steps = aim.steps if steps is None else steps
     eval_freq = aim.eval_freq if eval_freq is None else eval_freq
     more = {"--eval-freq": eval_freq, "--conf-file": conf_file, "--trained-agent": trained_agent}
-    more |= {"--varied": varied}
+    more["--varied"] = varied
     given = [str(word) for pair in more.items() if pair[1] for word in pair]
     named = replace(task, scenarios=[]) if varied else task
     command = shlex.join([*words_of(named, steps), *given])
     command = f"{aim.command}; sideslip train --resume --steps {steps}" if resume else command
     console = Console()
-    with TrainingBar(console, steps, disable=not progress) as bar:
-        project = wandb_project_name if track else ""
-        means = Means(eval_freq, device, tensorboard_log, bar.show, command, project)
+    with one_bar(console if progress else None, "train", "steps", steps) as bar:
+        project, shown = wandb_project_name if track else "", partial(show_training, bar)
+        means = Means(eval_freq, device, tensorboard_log, shown, command, project)
         if log_folder is not None:
             task.describe_for_zoo(folder, steps, eval_freq)
         try:

@@ -56,8 +56,8 @@ def illustrate(
         return
     asked = (
         ("Which controller holds the car?", {"All contests": costs(found)}),
-        ("Which controller holds it in each tier?", _controllers(found)),
-        ("Which estimator does a controller drive best with?", _estimators(found)),
+        ("Which controller holds it in each tier?", _groups(found, _controller)),
+        ("Which estimator does a controller drive best with?", _groups(found, _estimator)),
         ("What would knowing more save?", _ladder(found, ahead)),
     )
     suite.answers += [
@@ -93,28 +93,19 @@ def _groups(found: Mapping[str, Sequence[Standing]], name: Any) -> dict[str, dic
     return {title: costs for title, costs in groups.items() if costs}
 
 
-def _estimators(found: Mapping[str, Sequence[Standing]]) -> dict[str, dict[str, Estimate]]:
-    def name(cell: Cell) -> str:
-        return cell.estimator if cell.controller == REFERENCE_CONTROLLER else ""
-
-    return _groups(found, name)
+def _estimator(cell: Cell) -> str:
+    return cell.estimator if cell.controller == REFERENCE_CONTROLLER else ""
 
 
-def _controllers(found: Mapping[str, Sequence[Standing]]) -> dict[str, dict[str, Estimate]]:
-    def name(cell: Cell) -> str:
-        own = on_its_own(cell.controller, cell.estimator) and cell.controller != NOMINAL
-        return cell.controller if own and cell.estimator != TRUTH else ""
-
-    return _groups(found, name)
+def _controller(cell: Cell) -> str:
+    own = on_its_own(cell.controller, cell.estimator) and cell.controller != NOMINAL
+    return cell.controller if own and cell.estimator != TRUTH else ""
 
 
 def _ladder(
     found: Mapping[str, Sequence[Standing]], ahead: Mapping[Contest, Array]
 ) -> dict[str, dict[str, Estimate]]:
-    def name(cell: Cell) -> str:
-        return cell.controller if cell.controller in RUNGS else ""
-
-    groups = _groups(found, name)
+    groups = _groups(found, lambda cell: cell.controller if cell.controller in RUNGS else "")
     for tier in found:
         title = f"Tier {tier}: {TITLES[tier]}"
         mine = [each for contest, each in ahead.items() if contest.tier == tier]

@@ -6,16 +6,8 @@ from contextvars import ContextVar
 from threading import Event, Thread
 from typing import Any, TypeVar
 
+from rich import progress
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    ProgressColumn,
-    TaskID,
-    TextColumn,
-    TimeElapsedColumn,
-)
 
 from .engines import completed
 
@@ -30,17 +22,20 @@ def chunked(seeds: int, size: int) -> list[tuple[int, ...]]:
     return [tuple(range(k, min(k + size, seeds))) for k in range(0, seeds, size)]
 
 
-class Bar(Progress):
-    """A progress bar; where none can be drawn, a line on standard error at once for each task and
-    every 15 s, with the time that is left as the task went so far."""
+class Bar(progress.Progress):
+    """A progress bar, none without a console; where none can be drawn, a line on standard error for
+    each task and every 15 s, with the time that is left as the task went so far."""
 
-    def __init__(self, *columns: ProgressColumn, console: Console | None) -> None:
+    def __init__(self, console: Console | None) -> None:
         shown = console is not None and console.is_interactive
-        super().__init__(*columns, console=console, disable=not shown)
+        text, count = progress.TextColumn("{task.description}"), progress.MofNCompleteColumn()
+        columns = (text, progress.BarColumn(20), count)
+        times = (progress.TimeElapsedColumn(), progress.TimeRemainingColumn())
+        super().__init__(*columns, *times, console=console, disable=not shown)
         self._speaks, self._over = console is not None and not shown, Event()
-        self._before = (TaskID(-1), 0.0, 0.0)  # task, s and what was done when it was first seen
+        self._before = progress.TaskID(-1), 0.0, 0.0  # the newest task as it was first seen
 
-    def add_task(self, *args: Any, **options: Any) -> TaskID:
+    def add_task(self, *args: Any, **options: Any) -> progress.TaskID:
         """Add a task; the newest one is spoken of. unit: of what it counts."""
         made = super().add_task(*args, **options)
         self._say()
@@ -65,22 +60,15 @@ class Bar(Progress):
         for task in self.tasks[-1:] if self._speaks else ():
             passed, text = task.elapsed or 0.0, ""
             told, since, done = self._before
+            if task.total is not None:
+                text = f"{task.completed:,.0f} of {task.total:,.0f} {task.fields['unit']}, "
             if task.id != told or not done:  # what a stopped run has done took no time in this one
                 self._before = task.id, passed, task.completed
             elif task.total is not None and task.completed > done:
                 pace = (passed - since) / (task.completed - done)
-                text = f"{pace * (task.total - task.completed):.0f} s left, "
-            if task.total is not None:
-                count = f"{task.completed:,.0f} of {task.total:,.0f} {task.fields['unit']}"
-                text = f"{count}, {text}"
+                text += f"{pace * (task.total - task.completed):.0f} s left, "
             line = f"{task.description}: {text}{passed:.0f} s".lstrip(": ")
             Console(stderr=True, soft_wrap=True).print(line, highlight=False, markup=False)
-
-
-def progress(console: Console | None) -> Bar:
-    """A progress bar on a console, nothing without one."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
-    return Bar(*columns, TimeElapsedColumn(), console=console)
 
 
 _SHARED: ContextVar[Bar | None] = ContextVar("shared", default=None)
@@ -92,7 +80,7 @@ def one_bar(
 ) -> Iterator[Bar]:
     """One progress bar for what is done inside, at first under a title; every `run_cases` shows
     its own cases in it."""
-    with progress(console) as bar:
+    with Bar(console) as bar:
         bar.add_task(title, total=total, unit=unit)
         token = _SHARED.set(bar)
         try:
@@ -115,7 +103,7 @@ def run_cases(
     `one_bar`; None shows none. Where it is no terminal, standard error gets a line every 15 s.
     """
     shared, found = _SHARED.get(), dict[int, Result]()
-    with progress(console) if shared is None else nullcontext(shared) as bar:
+    with Bar(console) if shared is None else nullcontext(shared) as bar:
         for before in bar.task_ids:
             bar.remove_task(before)
         task = bar.add_task(title, total=len(cases), unit="cases")

@@ -27,7 +27,6 @@ from .tables import inline, table_html
 POINTS = 250
 """Samples of a cell in a figure with menus."""
 _FEW = 4  # figures of a suite; more are folded
-_SENTENCES = 3  # of a verdict, which the page opens with
 
 
 def write_report(
@@ -60,7 +59,7 @@ def write_report(
         contents="\n".join(
             f'<li><a href="#{link}">{escape(suite.title)}</a></li>' for link, suite in linked
         ),
-        answer=" ".join(inline(line) for line in lead.headlines[:_SENTENCES]),
+        answer=" ".join(inline(line) for line in lead.headlines[:3]),
         picture="".join(_picture(*each) for each in lead.answers[:1]),
         sections="\n".join(_section(*each, int(each[1] is lead)) for each in linked),
     )

@@ -102,30 +102,25 @@ def draw_road(canvas: Canvas, box: Box, cars: list[Driven]) -> None:
 def _names(canvas: Canvas, box: Box, cars: list[Driven], poses: list[Array], scale: float) -> None:
     """The names of cars in the box: a ghost's on its side of the last car, whose own is on the
     other; each as near as it covers no car and no other name."""
-    taken = [_outline(car, pose, cars[-1], scale) for car, pose in zip(cars, poses, strict=True)]
+    taken = []  # the middle, the half width and the half height of what is not to be covered
+    for car, (x, y) in zip(cars, poses, strict=True):
+        front, rear, half = scale * np.array(body(car.scene.vehicle))
+        heading = car.scene.motion.psi - cars[-1].scene.motion.theta
+        cos, sin, long, ahead = np.cos(heading), np.sin(heading), front - rear, front + rear
+        size = np.abs([[cos, sin], [sin, cos]]) @ (0.5 * long, half)
+        taken.append((x + 0.5 * ahead * cos, y - 0.5 * ahead * sin, *size))
     for i, car in enumerate(cars):
         x, y, _, tall = taken[i]
         below = poses[i % (len(cars) - 1 or 1)][1] > poses[-1][1]
-        side = 1.0 if below != (car is cars[-1]) else -1.0
-        half = 3.5 * len(car.name)
-        tries = (y + sign * (tall + 10.0 + k) for sign in (side, -side) for k in range(99))
-        seen = 0.0 < x - box[0] < box[2] and 0.0 < y - box[1] < box[3]
-        for row in tries if car.name and seen else ():
+        side, half = 1.0 if below != (car is cars[-1]) else -1.0, 3.5 * len(car.name)
+        seen = car.name and 0.0 < x - box[0] < box[2] and 0.0 < y - box[1] < box[3]
+        tries = [y + sign * (tall + 10.0 + k) for sign in (side, -side) for k in range(99)]
+        for row in tries if seen else ():
             clear = all(abs(x - a) > half + c or abs(row - b) > 7.0 + d for a, b, c, d in taken)
             if clear and box[1] + 8.0 < row < box[1] + box[3] - 24.0:
                 canvas.text((x, row), car.name, mixed(car.colour, INK, 0.6), 12, 0.5)
                 taken.append((x, row, half, 7.0))
                 break
-
-
-def _outline(car: Driven, pose: Array, main: Driven, scale: float) -> tuple[float, ...]:
-    """The middle, the half width and the half height in pixels of the box around a car."""
-    front, rear, half = scale * np.array(body(car.scene.vehicle))
-    heading = car.scene.motion.psi - main.scene.motion.theta
-    cos, sin, long = np.cos(heading), np.sin(heading), 0.5 * (front - rear)
-    middle = pose + 0.5 * (front + rear) * np.array([cos, -sin])
-    width, height = long * abs(cos) + half * abs(sin), long * abs(sin) + half * abs(cos)
-    return (*middle, width, height)
 
 
 def _band(road: Road, view: View, s: Array, right: float, left: float) -> Array:
