@@ -181,14 +181,14 @@ def judge(path: Path, kind: str, episodes: int) -> JsonMap:
     and write into its card what it costs; what is written."""
     policy, found = load_policy(path), enjoy(str(path), episodes)
     those = contests_of(kind)
-    driven = run_cases(partial(_judged, path, episodes), those, "contests", jobs=1)
+    driven = run_cases(partial(_judged, path, episodes=episodes), those, "contests", jobs=1)
     costs = dict(zip((each.scenario for each in those), driven, strict=True))
     own = evaluation(found) | {"cost in % of nominal": costs}
     save_policy(path, policy.network, replace(policy.card, evaluation=own))
     return own
 
 
-def _judged(path: Path, episodes: int, contest: Contest) -> JsonMap:
+def _judged(path: Path, contest: Contest, episodes: int) -> JsonMap:
     policy = load_policy(path)
     seeds = tuple(salted_seeds(policy.salt, episodes, json.dumps(asdict(contest))))
     cells = {

@@ -145,8 +145,8 @@ def train_command(
     command = f"{aim.command}; sideslip train --resume --steps {steps}" if resume else command
     console = Console()
     with one_bar(console if progress else None, "train", "steps", steps) as bar:
-        project, shown = wandb_project_name if track else "", partial(show_training, bar)
-        means = Means(eval_freq, device, tensorboard_log, shown, command, project)
+        project, show = wandb_project_name if track else "", partial(show_training, bar)
+        means = Means(eval_freq, device, tensorboard_log, show, command, project)
         if log_folder is not None:
             task.describe_for_zoo(folder, steps, eval_freq)
         try:
