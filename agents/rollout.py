@@ -191,7 +191,7 @@ class Rollout:
                 axis.fill_between(t, low, high, color=_ESTIMATE["color"], alpha=0.3, lw=0)
             axis.set_ylabel(label)
             axis.grid(alpha=0.3)
-            axis.legend(loc="upper right", fontsize="small")
+            axis.legend(loc="best", fontsize="small")
         axes[-1].set_xlabel("time / s")
         figure.suptitle(f"{self.log.name}: cost {self.cost:.3g}")
         return figure

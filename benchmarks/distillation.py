@@ -3,6 +3,7 @@ from it, and what came of it in each of them."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +22,7 @@ from .control.contests import NOMINAL, ORACLES, PARAMETERS, Contest, changed, co
 from .control.episodes import Chunk, drive
 from .control.scores import gains
 from .control.seeds import salted_seeds
+from .harness.parallel import run_cases
 from .harness.stats import Estimate, geometric_mean, won
 from .policies import enjoy, evaluation
 
@@ -177,8 +179,10 @@ def judge(path: Path, kind: str, episodes: int) -> JsonMap:
     """Drive a policy, `nominal`, the rival and oracle-parameters on seeds made from its weights,
     and write into its card what it costs; what is written."""
     policy, found = load_policy(path), enjoy(str(path), episodes)
-    driven = {each.scenario: _judged(path, each, episodes) for each in contests_of(kind)}
-    own = evaluation(found) | {"cost in % of nominal": driven}
+    those = contests_of(kind)
+    driven = run_cases(partial(_judged, path, episodes=episodes), those, "contests", jobs=1)
+    costs = dict(zip((each.scenario for each in those), driven, strict=True))
+    own = evaluation(found) | {"cost in % of nominal": costs}
     save_policy(path, policy.network, replace(policy.card, evaluation=own))
     return own
 

@@ -163,15 +163,15 @@ def answer(found: Sequence[tuple[Array, Array]]) -> str:
         rivals = sorted((n for n in of if n != TRUE_MODEL), key=lambda name: of[name].mean())
         over = {other: interval(of[rivals[0]], ratio_of_roots, of[other]) for other in rivals[1:]}
         least = float(ratio_of_roots(of[rivals[0]], best))
-        first = leader(rivals[0], over, "error")
+        first = leader(rivals[0], over, "err")
         firsts.append(f"{experiment.brief}: {first}, {least:.2f} times the least possible.")
-        unaided.append(f"x{ratio_of_roots(of[UNAIDED], of[rivals[0]]):.1f}")
-        known.append(f"x{ratio_of_roots(of[TRUE_MODEL], of[rivals[0]]):.2f}")
+        unaided.append(f"{ratio_of_roots(of[UNAIDED], of[rivals[0]]):.1f}")
+        known.append(f"{ratio_of_roots(of[TRUE_MODEL], of[rivals[0]]):.2f}")
     return verdict(
         "An estimator infers the sideslip angle: between where the car points and where it goes.",
         *firsts,
-        f"Why: without the slow sensor the error is {' and '.join(unaided)}; "
-        f"knowing the true car it is {' and '.join(known)}.",
+        f"Without the slow sensor the error is {' and '.join(unaided)} times as large, "
+        f"with the true car known {' and '.join(known)} times.",
         "Not covered: other manoeuvres, and what an estimate is worth to a controller.",
     )
 
@@ -234,8 +234,8 @@ def _draw(
         groups[title] = dict(sorted(over.items(), key=lambda pair: pair[1].value))
     ratio = "error / the least possible: less is better"
     bars = groups_with_interval(groups, ratio, {1.0: "the bound"})
-    firsts = " ".join(suite.verdict.splitlines()[1:-2])
-    suite.answers.append(("Which estimator comes closest to the sideslip angle?", bars, firsts))
+    text = "Root mean square error over what the optimal filter has; whiskers: 95 % intervals."
+    suite.answers.append(("Which estimator comes closest to the sideslip angle?", bars, text))
     for experiment, (drive, traces) in zip(EXPERIMENTS, examples, strict=True):
         t, beta = drive.log.time, drive.log.truth["beta"]
         lines = {"truth": 1e3 * beta} | {label: 1e3 * each for label, each in traces.items()}

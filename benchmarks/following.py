@@ -149,7 +149,7 @@ def answer(found: Array, lanes: Sequence[Array]) -> str:
     return verdict(
         "Steering and the motors' yaw moment, by one controller; bandwidth: how fast it corrects.",
         follows + (f" Runs fail at {', '.join(lost)}." if lost and sure else ""),
-        f"Lanes: {leader(first, ratio, 'offset')}.",
+        f"Lanes: {leader(first, ratio, 'stray')}.",
         f"Why: yaw moment beside steering changes the {offset[first].mean():.2f} m by {change}; "
         f"nobody steering: {lanes[0][:, 0].mean():.1f} m.",
         "Not covered: sharper bends, faster cars, and drivers who steer themselves.",

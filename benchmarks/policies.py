@@ -20,6 +20,7 @@ from .control.contests import Contest
 from .control.episodes import Array, Chunk, Driven, drive
 from .control.seeds import salted_seeds
 from .control.tables import spec_of
+from .harness.parallel import run_cases
 from .harness.results import Row, Suite, Table
 from .harness.stats import geometric_mean, interval, won
 from .harness.verdict import percent, verdict
@@ -76,7 +77,8 @@ def enjoy(
         name: Cell(Contest(env_id=home, scenario=shown), estimator, who, options)
         for name, (estimator, who) in contestants.items()
     }
-    driven = {name: drive(Chunk(cell, tuple(seeds), keep=True)) for name, cell in cells.items()}
+    chunks = [Chunk(cell, tuple(seeds), keep=True) for cell in cells.values()]
+    driven = dict(zip(cells, run_cases(drive, chunks, loaded.name, jobs=1), strict=True))
     errors = {name: each.error for name, each in driven.items() if each.error}
     for needed in (loaded.name, "none"):
         if needed in errors:

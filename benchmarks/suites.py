@@ -104,7 +104,7 @@ def check_salt(salt: str, names: Sequence[str]) -> None:
 
 def run_suites(names: Sequence[str], request: Request) -> list[Suite]:
     """Run suites of `SUITES` one after the other, with one progress bar for all of them."""
-    with one_bar(request.console):
+    with one_bar(request.console, f"bench {' '.join(names)}"):
         return [run_suite(name, request) for name in names]
 
 

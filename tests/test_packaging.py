@@ -39,6 +39,10 @@ SLOW = ("control", "cv2", "matplotlib", "pandas", "plotly", "scipy.signal", "sci
 """Modules that a command without a drive does not load."""
 
 
+DRIVEN = (*SLOW, "scipy.optimize")
+"""Modules that `sideslip run` does not load."""
+
+
 def python(code: str, cwd: Path) -> str:
     """Run code in a fresh interpreter that finds the same `sideslip`, and return what it prints."""
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
@@ -100,6 +104,20 @@ def test_a_command_that_drives_nothing_loads_nothing_slow(command: str, tmp_path
         "from sideslip.__main__ import main\n"
         "try:\n    main()\nexcept SystemExit:\n    pass\n"
         f"print('loaded', [name for name in {SLOW!r} if name in sys.modules])"
+    )
+    assert python(code, tmp_path).splitlines()[-1] == "loaded []"
+
+
+@pytest.mark.parametrize(
+    "agent", ["none", "lqr --estimator exact-kf", "two-dof --estimator multirate-kf"]
+)
+def test_a_drive_loads_nothing_slow_that_it_does_not_use(agent: str, tmp_path: Path) -> None:
+    code = (
+        "import sys\n"
+        f"sys.argv = ['sideslip', 'run', '--agent', *{agent.split()!r}]\n"
+        "from sideslip.__main__ import main\n"
+        "try:\n    main()\nexcept SystemExit as end:\n    assert not end.code\n"
+        f"print('loaded', [name for name in {DRIVEN!r} if name in sys.modules])"
     )
     assert python(code, tmp_path).splitlines()[-1] == "loaded []"
 

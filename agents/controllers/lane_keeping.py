@@ -146,7 +146,7 @@ class LaneKeeping(Controller):
     moment: also by the yaw moment, else by steering alone. haste: of `lane_model`.
 
     Raises ValueError for an env whose action does not steer, a missing entry or an option out of
-    range, ModuleNotFoundError without python-control.
+    range.
     """
 
     needs = Inputs._fields

@@ -97,8 +97,7 @@ class Lqr(Controller):
     cost's: the rate limit, which the design does not know, punishes haste. grip: of `Controller`;
     with it no steering is added that only slides the front tyres either.
 
-    Raises ValueError for a missing entry or an option out of range, ModuleNotFoundError without
-    python-control.
+    Raises ValueError for a missing entry or an option out of range.
     """
 
     shortest = 1  # ticks, of the period that the gains are designed for

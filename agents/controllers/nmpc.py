@@ -154,7 +154,7 @@ class Nmpc(Lqr):
     finite the action is NaN.
 
     Raises ValueError for a missing entry or an option out of range, or where the rows of a vector
-    env have different plants; ModuleNotFoundError without python-control.
+    env have different plants.
     """
 
     shortest = STEP

@@ -13,9 +13,9 @@ import numpy as np
 from ...envs.backend.decorators import jit
 from ...envs.backend.primitives import absolute, maximum, select
 from ...envs.ticks import TICK
-from ...envs.vehicle.vehicle import COMS, Vehicle
+from ...envs.vehicle.vehicle import Vehicle
 from ..design.nominal_car import CAR, nominal_car, plant_at
-from ..design.pi import COMS_PI, PLACEMENTS, POLE, design_pi, sample_pi
+from ..design.pi import PLACEMENTS, POLE, design_pi, sample_pi
 from ..env_facts import AnyEnv
 from .base import Array, Controller, integrated, not_negative
 
@@ -73,19 +73,11 @@ def feedforward_gain(vehicle: Vehicle, speed: float) -> float:
 def _pi_table(
     vehicle: Vehicle, gain: float, pole: float, placement: str, period: float | None
 ) -> Array:
-    """(len(SPEEDS), 2) of k_p and k_i; one row's gains everywhere without python-control."""
-    try:
-        if period is None:
-            gains = [design_pi(vehicle, float(v), pole, placement) for v in SPEEDS]
-        else:
-            gains = [sample_pi(vehicle, float(v), period, pole, placement) for v in SPEEDS]
-    except ModuleNotFoundError:
-        if vehicle.name != COMS.name or pole != POLE or placement != PLACEMENTS[0]:
-            raise ModuleNotFoundError(
-                "designing two-dof for another car or pole than the shipped one needs "
-                "python-control: pip install 'sideslip[design]'"
-            ) from None
-        gains = [COMS_PI] * len(SPEEDS)
+    """(len(SPEEDS), 2) of k_p and k_i."""
+    if period is None:
+        gains = [design_pi(vehicle, float(v), pole, placement) for v in SPEEDS]
+    else:
+        gains = [sample_pi(vehicle, float(v), period, pole, placement) for v in SPEEDS]
     return gain * np.array([(each.k_p, each.k_i) for each in gains])
 
 

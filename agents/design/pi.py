@@ -4,7 +4,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import brentq
 
 from ...envs.vehicle.linear import bicycle
 from ...envs.vehicle.vehicle import Vehicle
@@ -32,17 +31,13 @@ def design_pi(vehicle: Vehicle, speed: float, pole: float = POLE, placement: str
     yaw moment for 0.01 rad (near the speed where the yaw moment does not move beta, k is nearly
     zero).
 
-    Raises ValueError for another placement or pole, ModuleNotFoundError without python-control
-    (the extra `design`).
+    Raises ValueError for another placement or pole.
     """
     _check(pole, placement)
-    import control
-
     model = bicycle(vehicle, speed)
-    plant = control.StateSpace(model.A, model.B[:, 1:], [[1.0, 0.0]], 0.0)
-    transfer = control.tf(plant)
-    k = float(transfer.num[0][0][-1] / transfer.den[0][0][0])
-    slow_first = sorted(-float(p.real) for p in plant.poles())
+    closed = model.A - model.B[:, 1:] @ [[1.0, 0.0]]  # its polynomial less the plant's is G's upper
+    k = float((np.poly(closed) - np.poly(model.A))[-1])
+    slow_first = sorted(-float(p.real) for p in np.linalg.eigvals(model.A))
     p_1, p_2 = max(slow_first[0], 0.0), slow_first[1]
     if placement == "radius":
         product = min(pole, p_2) ** 2
@@ -72,7 +67,7 @@ def sample_pi(
     The PI is k_p + k_i T / (z - 1), its zero lies on the plant's slow pole a_1, and the poles of
     (z - a_2)(z - 1) + k_p (b_1 z + b_0) are placed: with ln z = s T, "radius" makes the product of
     the two s pole^2, "real" puts one s at -pole. It tends to `design_pi` for a short period and
-    raises as that does, without needing python-control.
+    raises as that does.
     """
     _check(pole, placement)
     model = bicycle(vehicle, speed)
@@ -95,12 +90,10 @@ def sample_pi(
             poles = np.roots([1.0, k_p * b_1 - 1.0 - a_2, a_2 + k_p * b_0]).astype(complex)
             return float(np.prod(np.log(poles)).real - (radius * period) ** 2)
 
+        from scipy.optimize import brentq  # slow to load
+
         factors = np.linspace(0.0, 4.0, 81)  # the first of them, before a pole leaves z > 0
         beyond = next((f for f in factors[1:] if excess(f) > 0.0), None)
         k_p = continuous * (4.0 if beyond is None else brentq(excess, beyond - 0.05, beyond))
     k_p = _capped(vehicle, float(k_p))
     return PI(k_p, k_p * (1.0 - a_1) / period)
-
-
-COMS_PI = PI(-19000.506, -115535.531)
-"""`design_pi` of the COMS at 25 km/h, used where python-control is not installed."""

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...envs.backend.extras import extra
 from ...envs.record import Array
 from ...envs.task.cost import BETA_SCALE, EFFORT_WEIGHT, GAMMA_SCALE, STEER_SCALE
 from ...envs.task.reference import ZERO_SLIP
@@ -171,9 +170,7 @@ def input_cost(model: DesignModel, V: Array) -> Array:
 
 def cost_to_go(model: DesignModel) -> tuple[Array, Array]:
     """K (m, n) of u = -K x, which minimises the sum of the model's cost, and V (n, n): what is
-    to come costs x'Vx, but for a part that no input changes. By python-control.
-
-    See `optimal`, which raises too.
+    to come costs x'Vx, but for a part that no input changes. See `optimal`.
     """
     return optimal(model.G, model.H, model.Q, model.R, model.N, len(DYNAMIC))
 
@@ -181,16 +178,16 @@ def cost_to_go(model: DesignModel) -> tuple[Array, Array]:
 def optimal(G: Array, H: Array, Q: Array, R: Array, N: Array, moved: int) -> tuple[Array, Array]:
     """`cost_to_go` of any model whose inputs move its first `moved` states alone.
 
-    These are regulated by `control.dlqr`; to the others, which move by themselves and need not
+    These have the gains of `control.dlqr`; to the others, which move by themselves and need not
     decay, the optimal answer follows from a linear equation for their part of the cost to go.
-
-    Raises ModuleNotFoundError, naming the extra, without python-control.
     """
-    with extra("design", "designing this controller needs python-control"):
-        import control
+    from scipy.linalg import solve, solve_discrete_are
+
     d = moved
     A, B, W = G[:d, :d], H[:d], G[d:, d:]
-    K, P, _ = control.dlqr(A, B, Q[:d, :d], R, N[:d])
+    P = solve_discrete_are(A, B, Q[:d, :d], R, s=N[:d])
+    whole = np.array(B)  # a view's products differ in the last bit
+    K = solve(whole.T @ P @ whole + R, whole.T @ P @ np.array(A) + N[:d].T)
     A12, N2 = G[:d, d:], N[d:]
     closed = A - B @ K
     # P12 = Q12 - K'N2' + (A - BK)'(P A12 + P12 W), stacked by columns

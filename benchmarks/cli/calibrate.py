@@ -30,7 +30,7 @@ def calibrate_command(
     A stopped run goes on where it was when the same command runs again in the same folder. `bench
     control --clairvoyant FILE` reads the file.
     """
-    from ..control.calibration import FILE, USUAL, calibrate, cases_of, forget, update
+    from ..control.calibration import FILE, calibrate, cases_of, forget, update
     from ..control.contests import contests
 
     path = FILE if write else out
@@ -41,11 +41,8 @@ def calibrate_command(
     asked = [known[name] for name in contest or known]
     console, folder = Console(), Path(f".{path.name}.cases").absolute()
     left = sum(not each.path.exists() for each in cases_of(asked, folder, seeds))
-    console.print(
-        f"{left} of {len(asked) * seeds} episodes are left, about {USUAL} s of CPU time each "
-        f"({left * USUAL / 3600:.1f} h in all). Ctrl-C stops; the same command goes on.",
-        highlight=False,
-    )
+    text = f"{left} of {len(asked) * seeds} episodes are left; the same command goes on if stopped."
+    console.print(text, highlight=False)
     with engine(engine_name, address), explain_interrupt("run the same command in the same folder"):
         made = calibrate(asked, folder, seeds, command_line(), jobs, console)
     update(path, made)

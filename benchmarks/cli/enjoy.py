@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from ..harness.parallel import one_bar
 from .export import Trust, as_policy, sizes_of
 from .output import check_files, show_episode, write_output, wrote
 
@@ -55,7 +56,8 @@ def enjoy_command(
         if card:
             _show_card(console, load_policy(path))
             return
-        found = enjoy(path, episodes, env_id=env, scenario=scenario, seed=seed)
+        with one_bar(console, f"enjoy {policy}"):
+            found = enjoy(path, episodes, env_id=env, scenario=scenario, seed=seed)
         write_output(console, [suite_of(found)], html, json, parquet)
         first = found.cells[found.policy.name]
         show_episode(console, run_of(first, found.seeds[0]), found.policy.name, plot)
@@ -92,7 +94,9 @@ def judged(file: Path, kind: str, episodes: int) -> Table:
     from ..distillation import judge
 
     table = Table("contest", "in % of nominal", "adaptive-nmpc", "better", "fails")
-    for contest, found in judge(file, kind, episodes)["cost in % of nominal"].items():
+    with one_bar(Console(), f"judge {file}"):
+        written = judge(file, kind, episodes)
+    for contest, found in written["cost in % of nominal"].items():
         own, rival = found["policy"], found["adaptive-nmpc"]
         better, fails = found["better than adaptive-nmpc"][0], found["fails"]
         numbers = f"{own[0]:.0f} [{own[1]:.0f}, {own[2]:.0f}]", f"{rival[0]:.0f}"

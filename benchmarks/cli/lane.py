@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 from rich.console import Console
-from rich.progress import track
 
 from ...envs.backend.extras import extra
 from ...envs.backend.files import whole, write_whole
 from ...envs.documents import read_document, write_document
+from ..harness.parallel import one_bar
 from .output import check_files, wrote
 
 if TYPE_CHECKING:
@@ -170,13 +170,13 @@ def _film(
     from ...envs.sensors.camera.films import drawn
 
     lanes, times = [], []
-    with TemporaryDirectory() as folder:
+    with TemporaryDirectory() as folder, one_bar(console, "lane", "pictures") as bar:
         part = Path(folder, f"lane{out.suffix.lower() if out else '.avi'}")
         writer = None
         if out is not None:
             code = cv2.VideoWriter.fourcc(*("mp4v" if part.suffix == ".mp4" else "MJPG"))
             writer = cv2.VideoWriter(str(part), code, film.rate, finder.camera.size)
-        for picture in track(film, "lane", film.promised or None, console=console):
+        for picture in bar.track(film, film.promised or None, task_id=bar.task_ids[0]):
             began = time.thread_time()
             lanes.append(finder.find(picture))
             times.append(time.thread_time() - began)

@@ -92,7 +92,7 @@ def list_names(
     for kind in kinds or KINDS:
         table = Table(box=None, show_header=False, padding=(0, 2, 0, 0))
         table.add_column(no_wrap=True)
-        table.add_column()
+        table.add_column(overflow="fold")  # a long word goes on in the next line
         for name, line in KINDS[kind]().items():
             table.add_row(name, escape(line))
         console.print(f"[bold]{kind}[/]")

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from ... import __version__
 from ...envs.backend.files import whole
+from ..harness.parallel import Bar
 from ..harness.results import (
     Row,
     Suite,
@@ -91,6 +91,7 @@ def show_episode(
         f"{drive.log.name}: {drive['t'][-1]:.2f} s, cost {drive.cost:.4g}, "
         f"RMS slip {1e3 * np.sqrt(np.mean(slip**2)):.2f} mrad, "
         f"peak {1e3 * np.max(np.abs(slip)):.2f} mrad" + (", FAILED" if drive.failed else ""),
+        soft_wrap=True,
         markup=False,
         highlight=False,
     )
@@ -167,29 +168,15 @@ def folder_of(task: "Task", start: str, out: Path | None, logs: Path | None) -> 
     return Path("-".join(["train", *filter(None, words), str(task.seed)]))
 
 
-class TrainingBar(Progress):
-    """Steps, the cost of the newest episodes, and the newest and the best evaluation."""
-
-    def __init__(self, console: Console, steps: int, disable: bool) -> None:
-        columns = (
-            TextColumn("{task.completed:,.0f} steps"),
-            BarColumn(20),
-            TextColumn("{task.description}"),
-            TimeElapsedColumn(),
-            TimeRemainingColumn(),
-        )
-        super().__init__(*columns, console=console, disable=disable)
-        self._task = self.add_task("", total=steps)
-
-    def show(self, now: "Now") -> None:
-        """Show where the training stands."""
-        text = "" if now.cost is None else f"cost {now.cost:.3g} exploring, "
-        last, best = now.evaluations[-1], min(now.evaluations, key=lambda each: each.judged)
-        if last.of_start is None:
-            text += f"of none's {last.of_none:.3f}, best {best.of_none:.3f}"
-        else:
-            text += f"of its start's {last.of_start:.3f}, best {best.of_start:.3f}"
-        self.update(self._task, completed=now.steps, description=text)
+def show_training(bar: Bar, now: "Now") -> None:
+    """Show where a training stands: its newest episodes, the newest and the best evaluation."""
+    text = "" if now.cost is None else f"cost {now.cost:.3g} exploring, "
+    last, best = now.evaluations[-1], min(now.evaluations, key=lambda each: each.judged)
+    if last.of_start is None:
+        text += f"of none's {last.of_none:.3f}, best {best.of_none:.3f}"
+    else:
+        text += f"of its start's {last.of_start:.3f}, best {best.of_start:.3f}"
+    bar.update(bar.task_ids[0], completed=now.steps, description=text)
 
 
 def environment() -> dict[str, str]:

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
+from ..harness.parallel import one_bar
 from ..report.terminal import print_suite
 from .names import complete
 from .options import option_of, options_of
@@ -106,7 +107,8 @@ def replay_command(
     if is_nmea(log):
         from ..recorded.receiver_suite import draw, receiver_suite, replay_nmea, write_kml
 
-        received = replay_nmea(log, vehicle, mapping)
+        with one_bar(console, f"replay {log}"):
+            received = replay_nmea(log, vehicle, mapping)
         write_output(console, [receiver_suite(received)], html, json, parquet)
         for path, write in ((plot, draw), (kml, write_kml)):
             if path is not None:
@@ -115,27 +117,24 @@ def replay_command(
         return
     if plot or kml:
         raise ValueError(f"{log}: --plot and --kml are for a receiver's log (NMEA); see --html")
-    suite = replay_file(
-        log,
-        vehicle,
-        mapping=mapping,
-        wires=_wires(
+    offset = None if steering_offset is None else math.radians(steering_offset)
+    wires = _wires(vehicle, latency, ratio=steering_ratio, sign=steering_sign, offset=offset)
+    with one_bar(console, f"replay {log}"):
+        suite = replay_file(
+            log,
             vehicle,
-            latency,
-            ratio=steering_ratio,
-            sign=steering_sign,
-            offset=None if steering_offset is None else math.radians(steering_offset),
-        ),
-        nominal=nominal,
-        until=until,
-        estimators=estimator,
-        options=estimator_options(estimator_option),
-        course_rate=course_rate,
-        course_noise_deg=course_noise,
-        delay=course_delay,
-        bias_deg=course_bias,
-        gyro_bias_degps=gyro_bias,
-    )
+            mapping=mapping,
+            wires=wires,
+            nominal=nominal,
+            until=until,
+            estimators=estimator,
+            options=estimator_options(estimator_option),
+            course_rate=course_rate,
+            course_noise_deg=course_noise,
+            delay=course_delay,
+            bias_deg=course_bias,
+            gyro_bias_degps=gyro_bias,
+        )
     write_output(console, [suite], html, json, parquet)
 
 
@@ -174,7 +173,8 @@ def identify_command(
     check_files(toml=out)
     offset = None if steering_offset is None else math.radians(steering_offset)
     wires = _wires(vehicle, None, ratio=steering_ratio, sign=steering_sign, offset=offset)
-    found, suite = identify_file(log, vehicle, mapping or (), wires, tyres, until)
+    with one_bar(console, f"identify {log}"):
+        found, suite = identify_file(log, vehicle, mapping or (), wires, tyres, until)
     print_suite(console, suite)
     if found.reason:
         raise typer.Exit(1)

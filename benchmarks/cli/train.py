@@ -5,6 +5,7 @@
 import shlex
 import shutil
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,11 +14,12 @@ from rich.console import Console
 from rich.table import Table
 
 from ... import __version__
+from ..harness.parallel import one_bar
 from .enjoy import judged
 from .export import Trust
 from .names import check_env, complete
 from .options import command_line, options_of
-from .output import TrainingBar, check_files, folder_of, words_of, wrote
+from .output import check_files, folder_of, show_training, words_of, wrote
 
 if TYPE_CHECKING:
     from ...agents.training.train import Trained
@@ -98,6 +100,7 @@ def train_command(
 
     With --resume the options left out are those of the training in the folder.
     """
+    from ...agents.learned.files import Policy, load_policy
     from ...agents.training.starts import settings_in
     from ...agents.training.train import CURVE, POLICY, Aim, Means, aim_in, start_in, task_in, train
     from ..distillation import start_and_task
@@ -123,8 +126,6 @@ def train_command(
     if varied and resume:
         raise ValueError(f"--varied {varied} is for a new training: an old one keeps its contests")
     agent, new = start_and_task(trained_agent, varied)
-    from ...agents.learned.files import Policy
-
     if log_folder is not None and isinstance(agent, Policy) and agent.network.memory:
         raise ValueError(f"the zoo's `enjoy` drives nothing that remembers as {agent.name}: --out")
     task = task_in(out) if resume and out else new(**options)
@@ -137,15 +138,15 @@ def train_command(
     steps = aim.steps if steps is None else steps
     eval_freq = aim.eval_freq if eval_freq is None else eval_freq
     more = {"--eval-freq": eval_freq, "--conf-file": conf_file, "--trained-agent": trained_agent}
-    more |= {"--varied": varied}
+    more["--varied"] = varied
     given = [str(word) for pair in more.items() if pair[1] for word in pair]
     named = replace(task, scenarios=[]) if varied else task
     command = shlex.join([*words_of(named, steps), *given])
     command = f"{aim.command}; sideslip train --resume --steps {steps}" if resume else command
     console = Console()
-    with TrainingBar(console, steps, disable=not progress) as bar:
-        project = wandb_project_name if track else ""
-        means = Means(eval_freq, device, tensorboard_log, bar.show, command, project)
+    with one_bar(console if progress else None, "train", "steps", steps) as bar:
+        project, show = wandb_project_name if track else "", partial(show_training, bar)
+        means = Means(eval_freq, device, tensorboard_log, show, command, project)
         if log_folder is not None:
             task.describe_for_zoo(folder, steps, eval_freq)
         try:
@@ -155,8 +156,6 @@ def train_command(
                 shutil.rmtree(folder)  # it has nothing but the zoo's description
             raise
     console.print(_table(trained))
-    from ...agents.learned.files import load_policy
-
     kind = load_policy(folder / POLICY).card.algorithm_options.get("class")
     if kind is not None:
         console.print(judged(folder / POLICY, kind, CONTESTS))
@@ -237,13 +236,14 @@ def distill_command(
     seen = options_of(option)
     card = card_of(kind, estimator, teacher, seen, command=command_line(), **options)
 
-    lessons = lessons_of(kind, teacher, estimator, cars, varied, seed, seen)
-
     def show(now: Round) -> None:
         text = f"{now.steps:,} steps, mean cost {now.cost:.4g}, loss {now.loss:.3g}"
         console.print(text, highlight=False)
+        bar.advance(bar.task_ids[0])
 
-    distill(card, lessons, course, target, show)
+    with one_bar(console, f"distill {name}", "rounds", rounds) as bar:
+        lessons = lessons_of(kind, teacher, estimator, cars, varied, seed, seen)
+        distill(card, lessons, course, target, show)
     console.print(judged(target, kind, episodes))
     wrote(console, target)
 
@@ -272,9 +272,9 @@ def train_estimator_command(
 
     target, console = out or Path(f"{name}.safetensors"), Console()
     check_files(correction=target)
-    wanted = dict.fromkeys(scenarios or [each.scenario for each in contests()])
+    known = [each.scenario for each in contests()]
+    wanted = dict.fromkeys(scenarios or known)
     drives = [(c.env_id, c.env_options) for c in contests() if c.scenario in wanted]
-    known = {c.scenario for c in contests()}
     drives += [(YAW, {"scenario": each}) for each in wanted if each not in known]
     from ...envs.sensors.slow import SENSOR_SETS
 
@@ -289,8 +289,11 @@ def train_estimator_command(
         command=command_line(),
         sideslip=__version__,
     )
-    with console.status("") as status:
-        found = train_correction(card, drives, episodes, epochs, status.update)
+    with one_bar(console, f"train-estimator {name}") as bar:
+        task = bar.task_ids[0]
+        found = train_correction(
+            card, drives, episodes, epochs, lambda text: bar.update(task, description=text)
+        )
     save_correction(target, found)
     for what, number in found.card.evaluation.items():
         console.print(f"{what} on held-out seeds: {number:.4g}", highlight=False)

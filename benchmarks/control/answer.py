@@ -1,4 +1,4 @@
-"""The matrix's verdict: the best estimator, the best controller, and why."""
+"""The matrix's verdict: the best controller, the best estimator, and why."""
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any, TypeVar
@@ -25,7 +25,7 @@ def answer(
     prices: Sequence[Price] = (),
     ahead: Mapping[Contest, Array] | None = None,
 ) -> str:
-    """The verdict over all tiers: the best estimator, the best controller, and why.
+    """The verdict over all tiers: the best controller, the best estimator, and why.
 
     ahead: (n,) log(J_oracle-state / J_clairvoyant) of calibrated contests.
     """
@@ -33,16 +33,26 @@ def answer(
     others, none = everywhere(drivers), drivers.get("none", {})
     best = best_controller(found)
     over = _over(others[best], none) if best not in ("", "none") and none else None
-    text = f", {100.0 * over.value:.0f} % of no control's" if over else ""
+    text = f", and {100.0 * over.value:.0f} % as much as no control" if over else ""
     episodes = max((len(r) for each in drivers.values() for r in each.values()), default=0)
     return verdict(
-        "Estimators infer how the car slides, controllers make torque of it; cost: squared error.",
-        f"Best estimator: {_first(filters)}.",
-        f"Best controller: {_first(others)}{text}.",
+        "Controllers drive on what estimators infer; cost: squared error of slip and yaw rate.",
+        f"Of the controllers {_first(others)}{text}.",
+        f"Of the estimators, under one controller, {_first(filters)}.",
         _why(found, prices, ahead or {}),
-        f"{_elsewhere(found)}Not covered: other cars and roads, and less than {episodes} "
-        "episodes a contest can tell.",
+        f"{_elsewhere(found)}Not covered: other cars and roads, and what {episodes} episodes a "
+        "contest are too few to show.",
     )
+
+
+def costs(found: Mapping[str, Sequence[Standing]]) -> dict[str, Estimate]:
+    """The cost over nominal's in % of who drives everywhere, the best first."""
+    drivers = everywhere(_controllers(found))
+    logs = {name: [-r for r in drivers[name].values()] for name in _ranked(drivers)}
+    return {
+        name: Estimate(*(100.0 * each for each in geometric_mean(*mine)))
+        for name, mine in logs.items()
+    }
 
 
 def on_its_own(controller: str, estimator: str) -> bool:
@@ -135,7 +145,7 @@ def _elsewhere(found: Mapping[str, Sequence[Standing]]) -> str:
     cheaper = (name for name in ahead if ahead[name].high < 1.0)
     ordered = sorted(cheaper, key=lambda who: ahead[who].value)
     parts += [f"{name} on its own manoeuvres" for name in ordered]
-    return f"Cheaper there: {some(parts)}. " if parts else ""
+    return f"It costs less with {some(parts)}. " if parts else ""
 
 
 def _why(
@@ -161,4 +171,4 @@ def _why(
     if late and np.isfinite(late[0][-1].value):
         grown = 100.0 * (late[0][-1].value / late[0][0].value - 1.0)
         delay = f"; {DELAYS[-1]:g} s of delay costs {grown:.0f} %"
-    return f"Why: knowing {', then '.join(texts)} of the cost{delay}." if rung else ""
+    return f"Knowing {', then '.join(texts)} of the cost{delay}." if rung else ""

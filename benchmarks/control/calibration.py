@@ -30,7 +30,6 @@ from .scores import gains, survived
 
 FILE = Path(__file__).with_name("clairvoyant.json")
 SEEDS = 64
-USUAL = 5  # s of CPU time an episode, the mean of the file
 _FIRST = 2**30  # tests and tunings count their seeds from 0
 _SAME = 1e-9  # of a cost
 
@@ -229,12 +228,9 @@ def driven_there(
     entries: Mapping[Contest, Entry], cells: Sequence[Cell], **options: Any
 ) -> Results:
     """The cells of calibrated contests on the clairvoyant's seeds; options: of `measure`."""
-    found = Results()
-    for contest, entry in entries.items():
-        mine = [cell for cell in cells if cell.contest == contest]
-        seeds = [episode.seed for episode in entry.episodes]
-        found.found |= measure(mine, seeds, **options).found
-    return found
+    seeds = {contest: [each.seed for each in entry.episodes] for contest, entry in entries.items()}
+    mine = [cell for contest in entries for cell in cells if cell.contest == contest]
+    return measure(mine, seeds.__getitem__, title="control, the clairvoyant's seeds", **options)
 
 
 def leads(entries: Mapping[Contest, Entry], there: Results) -> dict[Cell, Array]:

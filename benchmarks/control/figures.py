@@ -15,7 +15,7 @@ from ..harness.explorer import Explorer, Panel
 from ..harness.results import Suite
 from ..harness.stats import Estimate, geometric_mean
 from ..report.kml import track_kml
-from .answer import best_controller, on_its_own
+from .answer import best_controller, costs, on_its_own
 from .build import agent_options, estimate_options, name_of
 from .cells import REFERENCE_CONTROLLER, RUNGS, TRUTH, Cell
 from .contests import NOMINAL, TITLES, Contest
@@ -33,6 +33,7 @@ _PANELS = (
 _SCALES = {"beta": 1e3, "beta_ref": 1e3, "steer": 1e3}
 _BODY = (1.5, 1.15)  # of a car, over its wheelbase and its track
 _COST = "cost / nominal's, %: less is better"
+_CAPTION = "nominal: an LQG that knows the data sheet. Whiskers: 95 % intervals. Hollow: a variant."
 
 
 def illustrate(
@@ -53,15 +54,17 @@ def illustrate(
         from ..report.figures import curves, groups_with_interval
     except ModuleNotFoundError:
         return
-    _, estimator, controller, why, *_ = [*suite.verdict.splitlines(), "", "", "", ""]
-    marks = {100.0: "nominal"}
     asked = (
-        ("Which estimator does a controller drive best with?", _estimators(found), estimator),
-        ("Which controller holds the car?", _controllers(found), controller),
-        ("What would knowing more save?", _ladder(found, ahead), why),
+        ("Which controller holds the car?", {"All contests": costs(found)}),
+        ("Which controller holds it in each tier?", _groups(found, _controller)),
+        ("Which estimator does a controller drive best with?", _groups(found, _estimator)),
+        ("What would knowing more save?", _ladder(found, ahead)),
     )
-    suite.answers += [(title, groups_with_interval(groups, _COST, marks), text)
-                      for title, groups, text in asked if groups]  # fmt: skip
+    suite.answers += [
+        (title, groups_with_interval(groups, _COST, {100.0: "nominal"}), _CAPTION)
+        for title, groups in asked
+        if any(groups.values())
+    ]
     shown = lines(prices)
     if shown:
         ms, label = 1e3 * np.array(DELAYS), "cost / nominal's with sensors in time"
@@ -90,28 +93,19 @@ def _groups(found: Mapping[str, Sequence[Standing]], name: Any) -> dict[str, dic
     return {title: costs for title, costs in groups.items() if costs}
 
 
-def _estimators(found: Mapping[str, Sequence[Standing]]) -> dict[str, dict[str, Estimate]]:
-    def name(cell: Cell) -> str:
-        return cell.estimator if cell.controller == REFERENCE_CONTROLLER else ""
-
-    return _groups(found, name)
+def _estimator(cell: Cell) -> str:
+    return cell.estimator if cell.controller == REFERENCE_CONTROLLER else ""
 
 
-def _controllers(found: Mapping[str, Sequence[Standing]]) -> dict[str, dict[str, Estimate]]:
-    def name(cell: Cell) -> str:
-        own = on_its_own(cell.controller, cell.estimator) and cell.controller != NOMINAL
-        return cell.controller if own and cell.estimator != TRUTH else ""
-
-    return _groups(found, name)
+def _controller(cell: Cell) -> str:
+    own = on_its_own(cell.controller, cell.estimator) and cell.controller != NOMINAL
+    return cell.controller if own and cell.estimator != TRUTH else ""
 
 
 def _ladder(
     found: Mapping[str, Sequence[Standing]], ahead: Mapping[Contest, Array]
 ) -> dict[str, dict[str, Estimate]]:
-    def name(cell: Cell) -> str:
-        return cell.controller if cell.controller in RUNGS else ""
-
-    groups = _groups(found, name)
+    groups = _groups(found, lambda cell: cell.controller if cell.controller in RUNGS else "")
     for tier in found:
         title = f"Tier {tier}: {TITLES[tier]}"
         mine = [each for contest, each in ahead.items() if contest.tier == tier]

@@ -1,14 +1,13 @@
 """A benchmark's work as a list of independent cases, run side by side with a progress bar."""
 
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from contextvars import ContextVar
 from threading import Event, Thread
-from typing import TypeVar
+from typing import Any, TypeVar
 
+from rich import progress
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from .engines import completed
 
@@ -23,51 +22,71 @@ def chunked(seeds: int, size: int) -> list[tuple[int, ...]]:
     return [tuple(range(k, min(k + size, seeds))) for k in range(0, seeds, size)]
 
 
-def progress(console: Console | None) -> Progress:
-    """A progress bar on a console, hidden without one."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
-    return Progress(*columns, TimeElapsedColumn(), console=console, disable=console is None)
+class Bar(progress.Progress):
+    """A progress bar, none without a console; where none can be drawn, a line on standard error for
+    each task and every 15 s, with the time that is left as the task went so far."""
+
+    def __init__(self, console: Console | None) -> None:
+        shown = console is not None and console.is_interactive
+        text, count = progress.TextColumn("{task.description}"), progress.MofNCompleteColumn()
+        columns = (text, progress.BarColumn(20), count)
+        times = (progress.TimeElapsedColumn(), progress.TimeRemainingColumn())
+        super().__init__(*columns, *times, console=console, disable=not shown)
+        self._speaks, self._over = console is not None and not shown, Event()
+        self._before = progress.TaskID(-1), 0.0, 0.0  # the newest task as it was first seen
+
+    def add_task(self, *args: Any, **options: Any) -> progress.TaskID:
+        """Add a task; the newest one is spoken of. unit: of what it counts."""
+        made = super().add_task(*args, **options)
+        self._say()
+        return made
+
+    def start(self) -> None:
+        """Begin to draw or to speak."""
+        super().start()
+        if self._speaks:
+            Thread(target=self._speak, daemon=True).start()
+
+    def stop(self) -> None:
+        """End it."""
+        self._over.set()
+        super().stop()
+
+    def _speak(self) -> None:
+        while not self._over.wait(_EVERY):
+            self._say()
+
+    def _say(self) -> None:
+        for task in self.tasks[-1:] if self._speaks else ():
+            passed, text = task.elapsed or 0.0, ""
+            told, since, done = self._before
+            if task.total is not None:
+                text = f"{task.completed:,.0f} of {task.total:,.0f} {task.fields['unit']}, "
+            if task.id != told or not done:  # what a stopped run has done took no time in this one
+                self._before = task.id, passed, task.completed
+            elif task.total is not None and task.completed > done:
+                pace = (passed - since) / (task.completed - done)
+                text += f"{pace * (task.total - task.completed):.0f} s left, "
+            line = f"{task.description}: {text}{passed:.0f} s".lstrip(": ")
+            Console(stderr=True, soft_wrap=True).print(line, highlight=False, markup=False)
 
 
-_SHARED: ContextVar[Progress | None] = ContextVar("shared", default=None)
+_SHARED: ContextVar[Bar | None] = ContextVar("shared", default=None)
 
 
 @contextmanager
-def one_bar(console: Console | None) -> Iterator[None]:
-    """One progress bar for every `run_cases` inside, which shows the one that runs."""
-    with progress(console) as bar:
+def one_bar(
+    console: Console | None, title: str, unit: str = "cases", total: int | None = None
+) -> Iterator[Bar]:
+    """One progress bar for what is done inside, at first under a title; every `run_cases` shows
+    its own cases in it."""
+    with Bar(console) as bar:
+        bar.add_task(title, total=total, unit=unit)
         token = _SHARED.set(bar)
         try:
-            yield
+            yield bar
         finally:
             _SHARED.reset(token)
-
-
-@contextmanager
-def _lines(
-    console: Console | None, title: str, count: int, found: Mapping[int, object]
-) -> Iterator[None]:
-    """Say on standard error how many cases are done, at once and every 15 s, without a bar."""
-    if console is None or console.is_terminal or count < 2:
-        yield
-        return
-    ended, begun, speech = Event(), time.monotonic(), Console(stderr=True)
-
-    def speak() -> None:
-        while True:
-            passed = time.monotonic() - begun
-            text = f"{title}: {len(found)} of {count} cases, {passed:.0f} s"
-            speech.print(text.lstrip(": "), highlight=False, markup=False)
-            if ended.wait(_EVERY):
-                return
-
-    speaker = Thread(target=speak, daemon=True)
-    speaker.start()
-    try:
-        yield
-    finally:
-        ended.set()
-        speaker.join()
 
 
 def run_cases(
@@ -84,12 +103,10 @@ def run_cases(
     `one_bar`; None shows none. Where it is no terminal, standard error gets a line every 15 s.
     """
     shared, found = _SHARED.get(), dict[int, Result]()
-    there = console if shared is None else shared.console
-    shown = progress(console) if shared is None else nullcontext(shared)
-    with shown as bar, _lines(None if bar.disable else there, title, len(cases), found):
+    with Bar(console) if shared is None else nullcontext(shared) as bar:
         for before in bar.task_ids:
             bar.remove_task(before)
-        task = bar.add_task(title, total=len(cases))
+        task = bar.add_task(title, total=len(cases), unit="cases")
         for place, result in completed(function, cases, jobs):
             found[place] = result
             bar.advance(task)

@@ -20,25 +20,22 @@ def verdict(*lines: str) -> str:
     return "\n".join(found)
 
 
-def leader(name: str, over: Mapping[str, Estimate], what: str) -> str:
+def leader(name: str, over: Mapping[str, Estimate], verb: str) -> str:
     """Who is first, by how much before the next, or with whom it ties.
 
-    over: what it has over each rival's, 1 for as much, the closest rival first. what: of which
-    little is good, "error". A rival ties whose interval all but
-    reaches 1.
+    over: what it has over each rival's, 1 for as much, the closest rival first. verb: what is
+    better done little, "err". A rival ties whose interval all but reaches 1.
 
     >>> leader("lqr", {"esc": Estimate(0.71, 0.65, 0.77)}, "cost")
-    'lqr, with 71 % [65, 77] of the cost of esc'
+    'lqr costs least, 71 % [65, 77] as much as esc'
     >>> leader("lqr", {"esc": Estimate(0.98, 0.9, 1.05)}, "cost")
-    'a tie of lqr and esc'
+    'lqr and esc cost least, too close to tell apart'
     """
-    if not over:
-        return name
     ties = [rival for rival, ratio in over.items() if not ratio.high < _SURE]
     if ties:
-        return f"a tie of {some([name, *ties])}"
-    second, ratio = next(iter(over.items()))
-    return f"{name}, with {percent(ratio)} of the {what} of {second}"
+        return f"{some([name, *ties])} {verb} least, too close to tell apart"
+    second = [f", {percent(ratio)} as much as {rival}" for rival, ratio in over.items()]
+    return f"{name} {verb}s least{''.join(second[:1])}"
 
 
 def percent(ratio: Estimate) -> str:

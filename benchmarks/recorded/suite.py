@@ -72,7 +72,7 @@ def answer(result: Result, emulated: bool) -> str:
     gain = f"{GYRO_ONLY}, with the gyro alone, errs {DEGREES * result.rmse(GYRO_ONLY)[0]:.2f} deg"
     return verdict(
         "An estimator infers the sideslip angle: between where the car points and where it goes.",
-        f"Closest to the recorded angle: {leader(first, over, 'error')}.",
+        f"From the recorded angle {leader(first, over, 'stray')}.",
         f"Its error: {DEGREES * result.rmse(first)[0]:.2f} deg; brackets: range over noises.",
         f"Why: {gain}; a slow sensor {'helps' if first in slow else 'does not help'} here.",
         "Not covered: other drives and cars"

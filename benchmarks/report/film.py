@@ -9,13 +9,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 from rich.console import Console
-from rich.progress import track
 
 from ...agents import make_agent
 from ...agents.rollout import steps_of
 from ...envs.backend.extras import extra
 from ...envs.backend.files import whole
 from ...envs.ticks import TICK
+from ..harness.parallel import one_bar
 from ..harness.results import check_writable
 
 Frame = npt.NDArray[np.uint8]
@@ -78,11 +78,9 @@ def film(
     base = drivers[0].env.unwrapped
     step = base.control_period * TICK
     every = max(round(1.0 / (RATES[path.suffix.lower()] * step)), 1)
-    frames: Iterable[Frame] = frames_of(drivers, seed, every)
-    if console is not None:
-        total = base.config.base.scenario.duration / (every * step) + 1.0
-        frames = track(frames, str(path), total, console=console, transient=True)
-    with tempfile.TemporaryDirectory() as folder:
+    total = base.config.base.scenario.duration / (every * step) + 1.0
+    with tempfile.TemporaryDirectory() as folder, one_bar(console, str(path), "pictures") as bar:
+        frames = bar.track(frames_of(drivers, seed, every), total, task_id=bar.task_ids[0])
         part = Path(folder, "film").with_suffix(path.suffix.lower())
         write = _write_gif if part.suffix == ".gif" else _write_mp4
         write(part, frames, 1.0 / (every * step))

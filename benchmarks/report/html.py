@@ -32,8 +32,8 @@ _FEW = 4  # figures of a suite; more are folded
 def write_report(
     path: str | Path, suites: list[Suite], command: str, environment: Mapping[str, str]
 ) -> None:
-    """Write one self-contained HTML file: the verdicts, a picture for each question, and every
-    suite's text, figures and tables.
+    """Write one self-contained HTML file: an answer with a picture, the matrix's where it was run,
+    then every suite's verdict, pictures, text and tables.
 
     command: the command line that made it. environment: versions by name. A figure's own title
     and template are left out: the page has its title above it and draws it light or dark.
@@ -46,11 +46,8 @@ def write_report(
     drawn = any(suite.answers or suite.figures or suite.explorers for suite in suites)
     script = _beside("report.js") + "\n\n" + _beside("explorer.js")
     plotly = _plotly() if drawn else ""
+    lead = next((suite for suite in suites if suite.name == "control"), suites[0])
     linked = [(f"suite-{i}", suite) for i, suite in enumerate(suites, 1)]
-    answers = [answer for suite in suites for answer in suite.answers]
-    answers.sort(key=lambda answer: bool(answer[1].layout.meta))  # the wide ones below
-    opening = [_picture(*answer) for answer in answers]
-    opening += [_explorer(each) for suite in suites for each in suite.explorers]
     page = Template(_beside("page.html") + "\n").substitute(
         suites=", ".join(escape(suite.name) for suite in suites),
         css=_beside("report.css"),
@@ -62,21 +59,24 @@ def write_report(
         contents="\n".join(
             f'<li><a href="#{link}">{escape(suite.title)}</a></li>' for link, suite in linked
         ),
-        verdicts="\n".join(_verdict(*each) for each in linked if each[1].verdict),
-        pictures="\n".join(opening),
-        sections="\n".join(_section(*each) for each in linked),
+        answer=" ".join(inline(line) for line in lead.headlines[:3]),
+        picture="".join(_picture(*each) for each in lead.answers[:1]),
+        sections="\n".join(_section(*each, int(each[1] is lead)) for each in linked),
     )
     write_text(path, page)
 
 
-def _verdict(link: str, suite: Suite) -> str:
-    lines = "\n".join(f"<li>{inline(line)}</li>" for line in suite.headlines)
-    title = f'<h3><a href="#{link}">{escape(suite.title)}</a></h3>'
-    return f"<article>\n{title}\n<ul>\n{lines}\n</ul>\n</article>"
-
-
-def _section(link: str, suite: Suite) -> str:
+def _section(link: str, suite: Suite, opened: int) -> str:
+    """All of a suite; opened: how many of its answers' pictures the page opens with."""
     blocks = [f"<h2>{escape(suite.title)}</h2>"]
+    if suite.headlines:
+        lines = "\n".join(f"<li>{inline(line)}</li>" for line in suite.headlines)
+        blocks.append(f'<ul class="verdict">\n{lines}\n</ul>')
+    answers = sorted(suite.answers[opened:], key=lambda each: bool(each[1].layout.meta))
+    pictures = [_picture(*each) for each in answers]  # the wide ones below
+    pictures += [_explorer(each) for each in suite.explorers]
+    if pictures:
+        blocks.append('<div class="pictures">\n' + "\n".join(pictures) + "\n</div>")
     blocks += [f"<p>{inline(part)}</p>" for part in suite.text.split("\n\n") if part.strip()]
     figures = [_picture(*each) for each in suite.figures]
     if len(figures) > _FEW:

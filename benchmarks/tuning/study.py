@@ -19,7 +19,7 @@ from rich.console import Console
 from ...envs.backend.extras import extra
 from ..harness.drives import Drive
 from ..harness.engines import cores
-from ..harness.parallel import progress, run_cases
+from ..harness.parallel import Bar, run_cases
 from .task import SAMPLERS, STORAGE, Task, objective, squares
 
 with extra("tune", "tuning needs optuna"):
@@ -127,9 +127,9 @@ def search_on(
         name: optuna.distributions.FloatDistribution(*limits, log=True)
         for name, limits in task.search.items()
     }
-    with _quiet(), _storage_errors(study.study_name), progress(console) as bar:
+    with _quiet(), _storage_errors(study.study_name), Bar(console) as bar:
         done = _finished(study, task)
-        shown = bar.add_task(_best_text(study), total=trials, completed=len(done))
+        shown = bar.add_task(_best_text(study), total=trials, completed=len(done), unit="trials")
         while len(done) < trials:
             batch = [study.ask(space) for _ in range(min(BATCH, trials - len(done)))]
             judged = judge([trial.params for trial in batch])

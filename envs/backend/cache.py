@@ -127,7 +127,7 @@ def _make(folder: Path, sticky: bool = False) -> None:
     """
     if not folder.parent.exists():
         _make(folder.parent)
-    with contextlib.suppress(OSError):
+    with contextlib.suppress(FileExistsError):
         folder.mkdir(mode=0o700)
     os.close(_opened(folder, stat.S_ISDIR, sticky=sticky))
 

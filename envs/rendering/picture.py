@@ -36,7 +36,7 @@ def draw(shot: Shot, name: str = "true", ghosts: Sequence[tuple[str, Shot]] = ()
     canvas = Canvas(SIZE)
     canvas.area((0.0, 0.0, *SIZE), PAPER)
     if world is None:
-        draw_road(canvas, _ROAD, [*beside, Driven(scene, truth, BLUE)])
+        draw_road(canvas, _ROAD, [*beside, Driven(scene, truth, BLUE, name if ghosts else "")])
     newest = {label: (float(each[-1, 0]), shades[label]) for label, each in estimates.items()}
     known = {label: each for label, each in newest.items() if math.isfinite(each[0])}
     draw_closeup(canvas, _CLOSEUP, scene, now[MOMENT.beta], now[MOMENT.beta_ref], known)

@@ -1,7 +1,6 @@
 """The road from above: the car in true proportion, its lane or cones, its trail, what its camera
 sees. The road's direction at the car is to the right, left of it is up."""
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -92,27 +91,36 @@ def draw_road(canvas: Canvas, box: Box, cars: list[Driven]) -> None:
         trail = view(car.truth[-400:, [MOMENT.X, MOMENT.Y]])
         if len(trail) > 1:
             canvas.line(trail, mixed(car.colour, ASPHALT, 0.55), 2.0)
-    below = motion.Y * view.cos - motion.X * view.sin  # a car to the right has its name there
-    for car in cars:
-        m = car.scene.motion
-        pose = view(np.array([[m.X, m.Y]]))[0]
-        draw_car(canvas, pose, m.psi - motion.theta, scale, car.scene, car.colour)
-        if car.name:
-            side = 1.0 if m.Y * view.cos - m.X * view.sin < below else -1.0
-            _name(canvas, box, car, pose, m.psi - motion.theta, side * scale)
+    poses = [view(np.array([[car.scene.motion.X, car.scene.motion.Y]]))[0] for car in cars]
+    for car, pose in zip(cars, poses, strict=True):
+        heading = car.scene.motion.psi - motion.theta
+        draw_car(canvas, pose, heading, scale, car.scene, car.colour)
+    _names(canvas, box, cars, poses, scale)
     canvas.within(None)
 
 
-def _name(
-    canvas: Canvas, box: Box, car: Driven, place: Array, heading: float, scale: float
-) -> None:
-    """A car's name below it, or above it where the scale is negative, if the car is in the box."""
-    front, rear, half = body(car.scene.vehicle)
-    reach = half * abs(np.cos(heading)) + 0.5 * (front - rear) * abs(np.sin(heading))
-    away = scale * reach + math.copysign(10.0, scale)
-    x, y = place[0], min(max(place[1] + away, box[1] + 10.0), box[1] + box[3] - 10.0)
-    if box[0] < x < box[0] + box[2] and box[1] < place[1] < box[1] + box[3]:
-        canvas.text((x, y), car.name, mixed(car.colour, INK, 0.6), 12, 0.5)
+def _names(canvas: Canvas, box: Box, cars: list[Driven], poses: list[Array], scale: float) -> None:
+    """The names of cars in the box: a ghost's on its side of the last car, whose own is on the
+    other; each as near as it covers no car and no other name."""
+    taken = []  # the middle, the half width and the half height of what is not to be covered
+    for car, (x, y) in zip(cars, poses, strict=True):
+        front, rear, half = scale * np.array(body(car.scene.vehicle))
+        heading = car.scene.motion.psi - cars[-1].scene.motion.theta
+        cos, sin, long, ahead = np.cos(heading), np.sin(heading), front - rear, front + rear
+        size = np.abs([[cos, sin], [sin, cos]]) @ (0.5 * long, half)
+        taken.append((x + 0.5 * ahead * cos, y - 0.5 * ahead * sin, *size))
+    for i, car in enumerate(cars):
+        x, y, _, tall = taken[i]
+        below = poses[i % (len(cars) - 1 or 1)][1] > poses[-1][1]
+        side, half = 1.0 if below != (car is cars[-1]) else -1.0, 3.5 * len(car.name)
+        seen = car.name and 0.0 < x - box[0] < box[2] and 0.0 < y - box[1] < box[3]
+        tries = [y + sign * (tall + 10.0 + k) for sign in (side, -side) for k in range(99)]
+        for row in tries if seen else ():
+            clear = all(abs(x - a) > half + c or abs(row - b) > 7.0 + d for a, b, c, d in taken)
+            if clear and box[1] + 8.0 < row < box[1] + box[3] - 24.0:
+                canvas.text((x, row), car.name, mixed(car.colour, INK, 0.6), 12, 0.5)
+                taken.append((x, row, half, 7.0))
+                break
 
 
 def _band(road: Road, view: View, s: Array, right: float, left: float) -> Array:

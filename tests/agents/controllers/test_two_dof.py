@@ -1,6 +1,5 @@
 """tie-vision's controller: the published formula, the poles where they were placed, the claims."""
 
-import sys
 from typing import Any
 
 import control
@@ -11,7 +10,7 @@ import pytest
 import sideslip
 from sideslip.agents import make_agent
 from sideslip.agents.controllers.two_dof import feedforward_gain
-from sideslip.agents.design.pi import COMS_PI, POLE, design_pi, sample_pi
+from sideslip.agents.design.pi import POLE, design_pi, sample_pi
 from sideslip.envs import COMS, PASSENGER_CAR
 from sideslip.envs.vehicle.linear import bicycle
 from sideslip.estimators import EstimateObservation
@@ -111,22 +110,6 @@ def test_sampling_fast_gives_the_continuous_design() -> None:
         assert (one.k_p, one.k_i) == pytest.approx((other.k_p, other.k_i), rel=1e-3)
     with pytest.raises(ValueError, match="placement is one of radius, real"):
         sample_pi(COMS, 25.0 * KMH, 1e-3, POLE, "both")
-
-
-def test_shipped_gains_are_the_designed_ones() -> None:
-    pi = design_pi(COMS, 25 * KMH)
-    assert (COMS_PI.k_p, COMS_PI.k_i) == pytest.approx((pi.k_p, pi.k_i), rel=1e-6)
-
-
-def test_without_python_control_only_the_coms_has_gains(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "control", None)
-    env = EstimateObservation(gym.make("sideslip/YawVision-v0"), "bicycle-kf")
-    assert np.unique(make_agent("two-dof", env).k_p).size == 1  # type: ignore[attr-defined]
-    other = EstimateObservation(
-        gym.make("sideslip/YawVision-v0", vehicle="passenger-car"), "bicycle-kf"
-    )
-    with pytest.raises(ModuleNotFoundError, match=r"sideslip\[design\]"):
-        make_agent("two-dof", other)
 
 
 def _lane_change(agent: str, estimator: str, scenario: str, **options: Any) -> Any:

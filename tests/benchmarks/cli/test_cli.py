@@ -1,14 +1,18 @@
 """The command line: what a newcomer types, and each way to type it wrong."""
 
+import io
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 from rich.console import Console
 
 from sideslip.benchmarks.cli import main as cli
 from sideslip.benchmarks.cli.names import KINDS, complete
+from sideslip.benchmarks.cli.output import show_episode
 from sideslip.benchmarks.suites import SUITES
 from tests.benchmarks.conftest import Run
 
@@ -57,6 +61,22 @@ def test_list_names_everything(run: Run) -> None:
     assert status == 0
     for name in ("sideslip/YawGps-v0", "tie-vision-fig7", "coms", "dakf", "two-dof", "estimation"):
         assert name in out
+
+
+def test_a_narrow_list_leaves_no_letter_out(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cli, "console", Console(width=40))
+    status, out, _ = run("list")
+    assert status == 0 and "…" not in out and max(map(len, out.splitlines())) <= 40
+
+
+def test_an_episodes_line_stays_one_on_a_narrow_screen() -> None:
+    class Drive(dict[str, Any]):
+        log, cost, failed = SimpleNamespace(name="a-long-name"), 1.0, True
+
+    written = io.StringIO()
+    drive: Any = Drive(beta=np.zeros(2), t=np.ones(2))
+    show_episode(Console(file=written, width=40), drive, "me")
+    assert written.getvalue().splitlines()[0].endswith("mrad, FAILED")
 
 
 def test_run_drives_an_episode_and_draws_it(run: Run, tmp_path: Path) -> None:

@@ -243,7 +243,7 @@ def test_a_small_matrix_from_end_to_end(monkeypatch: pytest.MonkeyPatch) -> None
     assert {row.salt for row in suite.rows} == {salt_of()}
     assert {row.metric for row in suite.rows} >= {"score", "cost_vs_nominal", "failure_rate"}
     assert [row for row in suite.rows if not np.isfinite(row.value)] == []
-    assert suite.verdict.startswith("Estimators infer") and len(suite.verdict.splitlines()) <= 5
+    assert suite.verdict.startswith("Controllers drive on") and len(suite.verdict.splitlines()) <= 5
     tables = {table.title: table for table in suite.tables}
     wrong = tables["Cells that went wrong"].cells
     assert all("nobody-kf" in line[-1] for line in wrong) and len(wrong) == 2
@@ -255,5 +255,7 @@ def test_a_small_matrix_from_end_to_end(monkeypatch: pytest.MonkeyPatch) -> None
     assert len(suite.files) == 2
     titles = " ".join(title for title, *_ in suite.figures)
     assert all(text in titles for text in ("cost vs nominal", "failure rate"))
-    assert [title.split()[0] for title, *_ in suite.answers] == ["Which", "Which", "What"]
+    assert [title.split()[0] for title, *_ in suite.answers] == ["Which", "Which", "Which", "What"]
+    (everywhere,) = suite.answers[0][1].layout.annotations[:1]
+    assert "All contests" in everywhere.text
     assert suite.explorers[0].pair[0] == "none"

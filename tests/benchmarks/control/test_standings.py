@@ -193,11 +193,11 @@ def test_the_ladders_steps_are_ratios_of_costs() -> None:
 
 
 def test_the_answer_names_the_best_and_by_how_much() -> None:
-    _, estimator, controller, why, rest = answer({"1": table(results())}).splitlines()
+    _, controller, estimator, why, rest = answer({"1": table(results())}).splitlines()
     best = REFERENCE_FILTER.replace(", ", " with ")
-    assert f"estimator: {best}, with 6" in estimator and "cost of dakf" in estimator
-    assert "controller: lqr, with 33 % [" in controller and "of the cost of esc" in controller
-    assert ", 16 % of no control's" in controller  # 2 / 12
+    assert f"controller, {best} costs least, 6" in estimator and "as much as dakf" in estimator
+    assert "controllers lqr costs least, 33 % [" in controller and "as much as esc" in controller
+    assert ", and 16 % as much as no control." in controller  # 2 / 12
     assert "true car and road saves 50 %, then its exact motion saves 7" in why
     assert "40 episodes a contest" in rest
 
@@ -208,33 +208,33 @@ def test_the_answer_calls_a_tie_a_tie_and_names_who_leads_elsewhere() -> None:
         found.found[Cell(contest, "dakf", "lqr")] = episodes(2.0)
         other.found[Cell(contest, REFERENCE_FILTER, "esc")] = episodes(1.5)
         found.found[Cell(contest, REFERENCE_FILTER, "esc")] = episodes(60.0)
-    _, estimator, *_ = answer({"1": table(found)}).splitlines()
-    assert "estimator: a tie of" in estimator and "dakf" in estimator
+    _, _, estimator, *_ = answer({"1": table(found)}).splitlines()
+    assert "cost least, too close to tell apart" in estimator and "dakf" in estimator
     two = [replace(each, yards=table(found)[0].yards) for each in table(found)]
     elsewhere = {Contest("2", scenario=c.scenario): c for c in (ONE, TWO)}
     for each, there in zip(two, [{e.label: e for e in table(other)}] * len(two), strict=True):
         each.__dict__["pairs"] = {k: there[each.label].pairs[c] for k, c in elsewhere.items()}
     *_, rest = answer({"1": table(found), "2": two}).splitlines()
-    assert rest.startswith("Cheaper there: esc in tier 2. ")
+    assert rest.startswith("It costs less with esc in tier 2. ")
 
 
 def test_who_drives_a_part_of_the_contests_is_not_the_best_but_is_named() -> None:
     """A policy of one class of contests, however little it costs there."""
     found = results()
     found.found[Cell(TWO, "joint", "distill-car-yaw")] = episodes(1.2)
-    *_, controller, _, rest = answer({"1": table(found)}).splitlines()
-    assert "controller: lqr, with 33 % [" in controller
-    assert rest.startswith("Cheaper there: distill-car-yaw on its own manoeuvres. ")
+    _, controller, *_, rest = answer({"1": table(found)}).splitlines()
+    assert "controllers lqr costs least, 33 % [" in controller
+    assert rest.startswith("It costs less with distill-car-yaw on its own manoeuvres. ")
     found.found[Cell(ONE, "joint", "distill-car-yaw")] = episodes(1.2)
-    *_, controller, _, rest = answer({"1": table(found)}).splitlines()
-    assert "controller: distill-car-yaw, with" in controller and not rest.startswith("But")
+    _, controller, *_, rest = answer({"1": table(found)}).splitlines()
+    assert "controllers distill-car-yaw costs" in controller and rest.startswith("Not covered")
 
 
 def test_without_an_episode_that_counts_nobody_wins() -> None:
     found = results()
     for contest in (ONE, TWO):
         found.found[Cell(contest, "", STATE)] = episodes(9.0, 40)
-    _, estimator, controller, *_ = answer({"1": table(found)}).splitlines()
+    _, controller, estimator, *_ = answer({"1": table(found)}).splitlines()
     assert "nobody has a score" in estimator and "nobody has a score" in controller
 
 

@@ -181,7 +181,7 @@ def test_a_run_has_one_progress_bar() -> None:
     """It shows what runs; nothing of the phases before it stays."""
     written = io.StringIO()
     console = Console(file=written, width=80, force_terminal=True)
-    with one_bar(console):
+    with one_bar(console, "bench"):
         for phase in ("first", "second", "third"):
             assert run_cases(abs, [-1, -2], phase, jobs=1, console=console) == [1, 2]
     last = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", written.getvalue()).splitlines()[-1]
@@ -200,3 +200,31 @@ def test_off_a_terminal_a_line_says_how_far_it_is(
     assert lines[0] == "mine: 0 of 2 cases, 0 s" and "mine: 1 of 2 cases, 0 s" in lines
     run_cases(lambda _: wait(), [1, 2], "mine", jobs=1)
     assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize("term", ["dumb", "xterm"])
+def test_a_terminal_that_draws_nothing_has_lines_too(
+    capsys: pytest.CaptureFixture[str], term: str
+) -> None:
+    screen = Console(file=io.StringIO(), force_terminal=True, _environ={"TERM": term})
+    run_cases(abs, [1, 2], "mine", jobs=1, console=screen)
+    assert ("mine: 0 of 2 cases" in capsys.readouterr().err) == (term == "dumb")
+
+
+def test_a_line_says_what_is_done_and_how_long_it_takes_still(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As long for each as the last ones took, without those before the first line."""
+    monkeypatch.setattr(parallel, "_EVERY", 0.05)
+    with one_bar(Console(file=io.StringIO()), "work", "rounds", 400) as bar:
+        time.sleep(0.1)
+        bar.advance(bar.task_ids[0], 100)  # an earlier run's
+        time.sleep(0.2)
+        bar.advance(bar.task_ids[0], 4)
+        time.sleep(0.2)
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0] == "work: 0 of 400 rounds, 0 s"
+    first = next(line for line in lines if line.startswith("work: 100 of 400 rounds"))
+    assert "left" not in first
+    left = re.fullmatch(r"work: 104 of 400 rounds, (\d+) s left, \d+ s", lines[-1])
+    assert left is not None and int(left[1]) > 5  # 296, of which four took 0.1 s or more

@@ -41,11 +41,12 @@ def test_a_verdict_has_five_lines_at_most() -> None:
 
 def test_an_interval_that_reaches_one_is_a_tie() -> None:
     sure, unsure = Estimate(0.7, 0.6, 0.8), Estimate(0.9, 0.8, 1.01)
-    assert leader("a", {"b": sure}, "cost") == "a, with 70 % [60, 80] of the cost of b"
-    assert leader("a", {"b": unsure, "c": sure}, "cost") == "a tie of a and b"
-    assert leader("a", {"b": sure, "c": Estimate(0.9)}, "cost") == "a tie of a and c"
-    assert leader("a", {"b": Estimate(0.999, 0.998, 0.9995)}, "cost") == "a tie of a and b"
-    assert leader("a", {}, "cost") == "a"
+    assert leader("a", {"b": sure}, "cost") == "a costs least, 70 % [60, 80] as much as b"
+    tie = "a and {} cost least, too close to tell apart"
+    assert leader("a", {"b": unsure, "c": sure}, "cost") == tie.format("b")
+    assert leader("a", {"b": sure, "c": Estimate(0.9)}, "cost") == tie.format("c")
+    assert leader("a", {"b": Estimate(0.999, 0.998, 0.9995)}, "cost") == tie.format("b")
+    assert leader("a", {}, "cost") == "a costs least"
 
 
 def errors(levels: dict[str, float], experiment: estimation.Experiment) -> Any:
@@ -65,10 +66,10 @@ def test_the_best_estimator_is_named_for_each_experiment() -> None:
         errors({"dakf": 4.0, "course-kf": 4.0} | true, estimation.EXPERIMENTS[1]),
     ]
     _, camera, gps, why, _ = fits(estimation.answer(found))
-    assert camera.startswith("Late camera: multirate-kf, with 50 % [")
+    assert camera.startswith("Late camera: multirate-kf errs least, 50 % [")
     assert "2.00 times the least possible" in camera
-    assert "a tie of" in gps and "dakf" in gps and "course-kf" in gps
-    assert "x4.0 and x2.0" in why
+    assert "err least, too close to tell apart" in gps and "dakf" in gps and "course-kf" in gps
+    assert "4.0 and 2.0 times as large" in why
 
 
 def shares(level: float) -> Any:
@@ -99,7 +100,7 @@ def test_following_takes_the_bandwidth_that_errs_least_and_never_fails() -> None
         lanes.append(np.column_stack([RNG.normal(1.0 if i != 4 else 0.5, 0.05, 30)] * 3))
     _, follows, lane, why, _ = fits(following.answer(found, lanes))
     assert "K = 20 rad/s errs least, 10 %" in follows and "fail at 50, 100" in follows
-    assert lane.startswith("Lanes: both on multirate-residual-kf, with 5")
+    assert lane.startswith("Lanes: both on multirate-residual-kf strays least, 5")
     assert "m by -4" in why and "5.0 m" in why
     found[..., 3] = 1.0
     assert "every bandwidth" in following.answer(found, lanes)
@@ -142,7 +143,7 @@ def test_a_replay_without_truth_has_no_winner() -> None:
     assert fits(recorded.answer(Replayed(traces=traces), False))[0].startswith("Nobody wins")
     squares = {"bicycle-kf": np.full(3, 4e-4), "exact-kf": np.array([0.9, 1.0, 1.1]) * 1e-4}
     lines = fits(recorded.answer(Replayed(squares=squares, traces=traces), True))
-    assert "exact-kf, with 50 % [47, 52] of the error of bicycle-kf" in lines[1]
+    assert "exact-kf strays least, 50 % [47, 52] as much as bicycle-kf" in lines[1]
     assert "0.57 deg" in lines[2] and "1.15 deg" in lines[3] and "drawn noise" in lines[4]
 
 

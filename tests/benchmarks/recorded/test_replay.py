@@ -114,7 +114,7 @@ def test_all_estimators_are_scored_tabled_and_drawn(log: Log) -> None:
     assert "cannot see" in table.note  # dakf's unobservable direction
     ((question, bars, closest),) = suite.answers
     assert log.name in question and len(bars.data) > 0
-    assert closest.startswith("Closest to the recorded angle: ")
+    assert closest.startswith("From the recorded angle ")
     assert len(suite.figures) == 4
     for title, figure, text in suite.figures:
         assert title.startswith(log.name)

@@ -19,7 +19,7 @@ from sideslip.benchmarks.report import html as report
 from sideslip.benchmarks.report.html import write_report
 from sideslip.benchmarks.report.tables import inline, number
 
-from .demo import COMMAND, HOSTILE, VERSIONS, control, estimation, matrix
+from .demo import COMMAND, HOSTILE, VERSIONS, answered, control, estimation, matrix
 
 
 def written(path: Path, suites: list[Suite] | None = None) -> str:
@@ -63,19 +63,29 @@ def test_every_text_is_there_and_escaped(tmp_path: Path) -> None:
     assert "<code>exact-kf</code>" in page
 
 
-def test_the_verdicts_come_first_then_pictures_then_all_of_it(tmp_path: Path) -> None:
+def test_one_answer_with_one_picture_comes_first_and_each_verdict_with_its_suite(
+    tmp_path: Path,
+) -> None:
+    """The matrix's answer where it was run, in three sentences, though another suite was first."""
     suites = [estimation(), control()]
+    suites[1].verdict = "First. It is so. \nSecond, `lqr`.\nThird.\nFourth."
+    suites[1].answers = [answered(), answered()]
     page = written(tmp_path, suites)
-    order = ['<section id="verdicts">', '<section id="pictures">', "<nav", '<section id="suite-1">']
-    places = [page.index(text) for text in order]
+    marks = ['<section id="answer">', "<nav", '<section id="suite-1">', '<section id="suite-2">']
+    places = [page.index(text) for text in marks]
     assert places == sorted(places)
-    verdicts = page[places[0] : places[1]]
-    for suite in suites:
-        for each in suite.verdict.splitlines():
-            assert inline(each) in verdicts
-    assert [title for title, *_ in suites[0].answers] == re.findall(
-        "<figure.*?<h3>(.*?)</h3>", page[places[1] : places[2]], flags=re.DOTALL
+    opening, _, first, second = (
+        page[start:end] for start, end in zip(places, [*places[1:], None], strict=True)
     )
+    assert re.findall("<p class=.lead.>(.*?)</p>", opening) == [
+        "First. It is so.  Second, <code>lqr</code>. Third."
+    ]
+    assert opening.count("<figure") == 1 and "Fourth." not in opening
+    assert all(inline(line) in first for line in suites[0].verdict.splitlines())
+    assert all(inline(line) in second for line in suites[1].verdict.splitlines())
+    assert second.count("<figure") == 1  # the other one
+    asked = [title for title, *_ in suites[0].answers]
+    assert asked == re.findall("<h3>(.*?)</h3>", first)[: len(asked)]
     for link in re.findall('href="#(.*?)"', page):
         assert page.count(f'id="{link}"') == 1
 

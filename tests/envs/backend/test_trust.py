@@ -1,6 +1,7 @@
 """What somebody else could have written is not run: kernels are compiled in memory, and one line
 says so."""
 
+import errno
 import hashlib
 import json
 import os
@@ -188,6 +189,17 @@ def test_a_folder_that_others_could_write_is_not_used(
     message = capsys.readouterr().err
     assert "not cached" in message and str(tmp_path) in message and message.count("\n") == 1
     assert kernel_folder("envs") is None and capsys.readouterr().err == ""
+
+
+def test_where_no_folder_can_be_made_the_reason_is_said(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def refuse(*_: Any, **__: Any) -> None:
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    monkeypatch.setattr(Path, "mkdir", refuse)
+    assert kernel_folder("envs") is None
+    assert "are not cached: [Errno 30] Read-only file system" in capsys.readouterr().err
 
 
 def test_a_kernels_folder_is_checked_whenever_it_is_read(planted: Path) -> None:

@@ -9,7 +9,7 @@ import pytest
 pytest.importorskip("pygame")
 from sideslip.envs import StabilityEnv
 from sideslip.envs.engine.step import kind_of
-from sideslip.envs.rendering.palette import GREY, INK, colour
+from sideslip.envs.rendering.palette import GREY, INK, colour, mixed
 from sideslip.envs.rendering.picture import _CLOSEUP, _ROAD, _STRIPS, SIZE, draw
 from sideslip.envs.rendering.road import BLUE, ORANGE
 from sideslip.envs.rendering.scene import scene_of
@@ -191,3 +191,20 @@ def test_a_ghost_drives_beside() -> None:
     both = painted(pixels(picture), GREY, _ROAD)
     assert len(both) > len(alone) + 500
     assert both[:, 1].mean() < 0.5 * _ROAD[3]
+
+
+@pytest.mark.parametrize("y", [0.0, 0.4, -0.9, 2.0, -2.0, 3.0])
+@pytest.mark.parametrize("psi", [0.0, 1.2])
+def test_both_cars_are_named_and_no_name_covers_a_car_or_the_other_name(
+    y: float, psi: float
+) -> None:
+    from sideslip.envs.rendering.canvas import pixels
+
+    one, other = started().shot(), started(y=y, Y=y, psi=psi).shot()
+    bare = pixels(draw(one, "", [("", other)]))
+    named = pixels(draw(one, "lqr", [("no control", other)]))
+    lines = np.unique(np.nonzero((named != bare).any(2)[: int(_ROAD[1] + _ROAD[3])])[0])
+    assert (np.diff(lines) > 2).sum() == 1  # two names, one below the other
+    for shade in (BLUE, GREY):
+        assert len(painted(named, mixed(shade, INK, 0.6), _ROAD)) > 0
+        assert np.array_equal(painted(named, shade, _ROAD), painted(bare, shade, _ROAD))
